@@ -1,0 +1,79 @@
+"""Checks of arguments: conversion to float leaves once, at construction, and clear errors."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+
+def as_float(value: Any, shape: tuple[int, ...] | None, what: str) -> Array:
+    """`value` as a strongly typed float array of `shape` (None: any shape).
+
+    Conversion happens here, once, with an explicit dtype: a weakly typed leaf would recompile
+    after the first update of an optimizer.
+    """
+    if isinstance(value, jax.Array) and value.dtype == jnp.result_type(float) and not value.weak_type:
+        array = value
+    else:
+        try:
+            array = jnp.asarray(value, dtype=jnp.result_type(float))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{what} must be a number or an array of numbers, got {value!r}.") from error
+    if shape is not None and array.shape != shape:
+        raise ValueError(f"{what} must have shape {shape}, got shape {array.shape}.")
+    return array
+
+
+def is_concrete(*values: Any) -> bool:
+    """Whether every array in `values` has values that Python can look at now."""
+    leaves = jax.tree.leaves(values)
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves) and all(
+        isinstance(leaf, jax.Array | np.ndarray | float | int) for leaf in leaves
+    )
+
+
+def require(condition: Any, message: str, *values: Any) -> None:
+    """Raise `ValueError(message)` unless `condition()` holds; skipped while `values` are traced."""
+    if is_concrete(*values) and not bool(condition()):
+        raise ValueError(message)
+
+
+def suggestion(name: str, known: Any) -> str:
+    """The known names, for a message about an unknown one."""
+    return f"{name!r} is not one of {sorted(known)}"
+
+
+def number_field(name: str, **kwargs: Any) -> Any:
+    """A keyword-only scalar leaf of an element; with `default=None` it may be left out."""
+    return eqx.field(
+        converter=lambda value: None if value is None else as_float(value, (), f"`{name}`"),
+        kw_only=True,
+        **kwargs,
+    )
+
+
+def point_field(name: str, **kwargs: Any) -> Any:
+    """A keyword-only leaf of shape (3,): a point, a vector or a direction."""
+    return eqx.field(
+        converter=lambda value: None if value is None else as_float(value, (3,), f"`{name}`"),
+        kw_only=True,
+        **kwargs,
+    )
+
+
+def axis_field(name: str) -> Any:
+    """A keyword-only direction of shape (3,): any length but zero, kept as given so that it stays a leaf."""
+
+    def convert(value: Any) -> Array:
+        axis = as_float(value, (3,), f"`{name}`")
+        require(
+            lambda: jnp.linalg.norm(axis) > 0,
+            f"`{name}` has zero length; give a direction, e.g. (0, 0, 1).",
+            axis,
+        )
+        return axis
+
+    return eqx.field(converter=convert, kw_only=True)

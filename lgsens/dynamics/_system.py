@@ -1,0 +1,88 @@
+"""The abstract constrained mechanical system on a Lie group, eqs. (15)–(17)."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens.dynamics._state import Tangents
+from lgsens.liegroups import AbstractLieGroup
+
+
+class AbstractSystem(eqx.Module):
+    """A constrained mechanical system on a matrix Lie group G.
+
+        q̇ = q ṽ
+        r(q, v, v̇, λ, t) = M v̇ − ad(v)ᵀ M v + f(q, v, t) + B(q)ᵀ λ = 0
+        Φ(q) = 0
+
+    The integrator, the sensitivities and the initial state know this interface only, so a
+    subclass on any group has all of them. Every number that the motion depends on is a float
+    leaf of the module; everything else is static.
+
+    Source: Sonneville & Brüls (2014), eqs. (15)–(17).
+    """
+
+    @property
+    @abc.abstractmethod
+    def group(self) -> AbstractLieGroup:
+        """The configuration space G, of dimension k."""
+
+    @property
+    @abc.abstractmethod
+    def constraint_names(self) -> tuple[str, ...]:
+        """A name for each of the m constraint equations, used in messages."""
+
+    @property
+    @abc.abstractmethod
+    def assembled(self) -> bool:
+        """Whether the reference configuration satisfies Φ = 0 by construction (static)."""
+
+    @abc.abstractmethod
+    def reference(self) -> tuple[Any, Float[Array, " k"]]:
+        """Reference configuration q and velocity v, from which the initial state is computed."""
+
+    @abc.abstractmethod
+    def coordinate_scale(self) -> Float[Array, " k"]:
+        """The size of a large change of each coordinate: 1 rad, or the length of the scene [m]."""
+
+    @abc.abstractmethod
+    def mass_matrix(self) -> Float[Array, "k k"]:
+        """The constant mass matrix M."""
+
+    @abc.abstractmethod
+    def residual(self, q, v, vdot, lam, t) -> Float[Array, " k"]:
+        """The residual r of the dynamic equilibrium, eq. (16)."""
+
+    @abc.abstractmethod
+    def constraint(self, q) -> Float[Array, " m"]:
+        """The constraint Φ(q), eq. (17)."""
+
+    @abc.abstractmethod
+    def constraint_jacobian(self, q) -> Float[Array, "m k"]:
+        """The constraint gradient B with DΦ·(q w̃) = B w."""
+
+    @abc.abstractmethod
+    def tangents(self, q, v, vdot, lam, t) -> Tangents:
+        """The exact tangents K_t, C_t and B. `autodiff_tangents` is a ready implementation."""
+
+
+def autodiff_tangents(system: AbstractSystem, q, v, vdot, lam, t) -> Tangents:
+    """K_t, C_t and B of a system by forward-mode autodiff of its residual and constraint.
+
+    K_t w = D_q r · (q w̃), the derivative of r(q exp(w̃ s)) at s = 0; C_t = ∂r/∂v.
+    For systems without hand-derived tangents, and the reference for those that have them.
+    """
+    zero = jnp.zeros_like(v)
+    k = jax.jacfwd(lambda w: system.residual(system.group.retract(q, w), v, vdot, lam, t))(zero)
+    c = jax.jacfwd(lambda v: system.residual(q, v, vdot, lam, t))(v)
+    return Tangents(k, c, autodiff_constraint_jacobian(system, q))
+
+
+def autodiff_constraint_jacobian(system: AbstractSystem, q) -> Float[Array, "m k"]:
+    """B of a system by forward-mode autodiff of its constraint, B w = DΦ·(q w̃)."""
+    _, v = system.reference()
+    return jax.jacfwd(lambda w: system.constraint(system.group.retract(q, w)))(jnp.zeros_like(v))

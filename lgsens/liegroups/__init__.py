@@ -1,0 +1,9 @@
+"""Matrix Lie groups: exponential, logarithm, tangent operator, and the linear maps the sensitivities need (paper, §2).
+
+Everything acts on one unbatched element; `jax.vmap` batches it.
+"""
+
+from ._base import AbstractLieGroup as AbstractLieGroup
+from ._groups import Pose as Pose, R3xSO3 as R3xSO3, Rn as Rn
+from ._products import Power as Power, Product as Product
+from ._rotation import SO3 as SO3, cross as cross, skew as skew, unskew as unskew

@@ -1,0 +1,155 @@
+"""The rotation group SO(3)."""
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from ._base import AbstractLieGroup
+from ._coefficients import c1, c2, c3, horner, inverse_tangent_coefficient
+
+# arctan(√m)/√m = Σ_j (-m)^j / (2j+1). `_log` calls it with m ≤ tan²(π/16) = 0.0396, where the first term left out of
+# the second derivative, n (n-1) m^(n-2) / (2n+1), is 9e-17 for n = 14, against 2/5 for the derivative itself.
+_ARCTAN = tuple((-1) ** j / (2 * j + 1) for j in range(14))
+
+
+def _components(x):
+    return tuple(lax.index_in_dim(x, i, keepdims=False) for i in range(3))
+
+
+def cross(x: Float[Array, "3"], y: Float[Array, "3"]) -> Float[Array, "3"]:
+    """The cross product `x × y = x~ y`, shape (3,)."""
+    (x1, x2, x3), (y1, y2, y3) = _components(x), _components(y)
+    return jnp.stack([x2 * y3 - x3 * y2, x3 * y1 - x1 * y3, x1 * y2 - x2 * y1])
+
+
+def skew(x: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """The skew-symmetric matrix `x~` with `x~ y = x × y` (§3.2). `x`: shape (3,)."""
+    x1, x2, x3 = _components(x)
+    o = jnp.zeros_like(x1)
+    return jnp.stack([o, -x3, x2, x3, o, -x1, -x2, x1, o]).reshape(3, 3)
+
+
+def unskew(X: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """The vector `x`, shape (3,), whose `x~` is the skew-symmetric part of `X`, shape (3, 3)."""
+    return 0.5 * jnp.stack([X[2, 1] - X[1, 2], X[0, 2] - X[2, 0], X[1, 0] - X[0, 1]])
+
+
+# On a GPU the default precision of float32 products is TF32, three digits: a rotation would not stay one.
+def _matmul(A, B):
+    return jnp.matmul(A, B, precision=lax.Precision.HIGHEST)
+
+
+def _dot(x, y):
+    return jnp.sum(x * y)
+
+
+def _exp(x):
+    # I + c_1 x~ + c_2 x~² with x~² = x xᵀ - s I: no matrix product.
+    s = _dot(x, x)
+    a, b = c1(s), c2(s)
+    return (1.0 - b * s) * jnp.eye(3, dtype=x.dtype) + skew(a * x) + (b * x)[:, None] * x[None, :]
+
+
+def _quaternion(R):
+    # 4 p pᵀ for the unit quaternion p = (cos θ/2, sin θ/2 n) is linear in R. Its row with the largest diagonal entry
+    # (≥ 1, Shepperd 1978) is p up to a factor, free of cancellation; normalizing it needs no other branch.
+    r = [[R[i, j] for j in range(3)] for i in range(3)]
+    u, v, w = r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]
+    d, e, f = r[0][1] + r[1][0], r[0][2] + r[2][0], r[1][2] + r[2][1]
+    a, b, c = r[0][0], r[1][1], r[2][2]
+    rows = jnp.stack(
+        [1 + a + b + c, u, v, w, u, 1 + a - b - c, d, e, v, d, 1 - a + b - c, f, w, e, f, 1 - a - b + c]
+    ).reshape(4, 4)
+    row = lax.dynamic_index_in_dim(rows, jnp.argmax(jnp.diagonal(rows)), keepdims=False)
+    # Of the two quaternions ±p, the one with θ ≤ π. At θ = π both have cos θ/2 = 0 and this picks one.
+    return row * lax.rsqrt(_dot(row, row)) * jnp.where(row[0] < 0.0, -1.0, 1.0).astype(R.dtype)
+
+
+def _log(R):
+    # tan(φ/2) = tan φ / (1 + √(1 + tan² φ)), along the axis n: from the quaternion to tan(θ/4) n, tan(θ/8) n and
+    # tan(θ/16) n. There one short series serves all angles up to π: no switch, no singular square root.
+    p = _quaternion(R)
+    y = p[1:] / (1.0 + p[0])
+    for _ in range(2):
+        y = y / (1.0 + jnp.sqrt(1.0 + _dot(y, y)))
+    return 16.0 * horner(_ARCTAN, _dot(y, y)) * y
+
+
+class SO3(AbstractLieGroup):
+    """The group of rotations: orthogonal matrices `R`, shape (3, 3), of determinant 1, `k = 3`.
+
+    `R` maps body-frame components to inertial-frame components; coordinates are rotation vectors and angular
+    velocities in the body frame, `Ω~ = R^T Ṙ`.
+
+    Source: paper, §3.2; Brüls & Cardona 2010, appendix; Iserles et al. 2000, appendix B.
+    """
+
+    @property
+    def dim(self):
+        return 3
+
+    def identity(self, dtype=None):
+        return jnp.eye(3, dtype=dtype)
+
+    def compose(self, p, q):
+        return _matmul(p, q)
+
+    def inverse(self, q):
+        return q.T
+
+    def exp(self, x):
+        """`R = I + sin θ/θ x~ + (1 - cos θ)/θ² x~²`, `θ = |x|` (Rodrigues). `x`: rotation vector [rad], shape (3,)."""
+        return _exp(x)
+
+    def log(self, q):
+        """The rotation vector [rad], shape (3,), `|x| ≤ π`, with `exp(x~) = q`.
+
+        To round-off (absolute near `π`, relative near 0). At an angle of exactly `π` both `x` and `-x` are right; this
+        is one of the two, and there the map jumps from one to the other.
+        """
+        return _log(q)
+
+    def wedge(self, x):
+        return skew(x)
+
+    def vee(self, X):
+        return unskew(X)
+
+    def matrix(self, q):
+        return q
+
+    def ad(self, x):
+        return skew(x)
+
+    def Ad_inv_mv(self, q, w):
+        """`D(R) w = R^T w`: inertial-frame components to body-frame components."""
+        return _matmul(w, q)
+
+    def Ad_inv_rmv(self, q, w):
+        return _matmul(q, w)
+
+    def tangent_mv(self, x, y):
+        """`T(x) = I - (1 - cos θ)/θ² x~ + (θ - sin θ)/θ³ x~²`, applied to `y`."""
+        # With x~² y = x (x·y) - s y, and 1 - s c_3 = c_1.
+        s = _dot(x, x)
+        return c1(s) * y - c2(s) * cross(x, y) + (c3(s) * _dot(x, y)) * x
+
+    def tangent_rmv(self, x, y):
+        """`T(x)^T = T(-x)`, applied to `y`."""
+        return self.tangent_mv(-x, y)
+
+    def tangent_inv_mv(self, x, y):
+        """`T(x)^{-1} = I + x~/2 + (1 - (θ/2) cot(θ/2))/θ² x~²`, applied to `y`.
+
+        Singular at `θ = 2π`, where `T(x)` itself loses rank: take increments shorter than that.
+        """
+        s = _dot(x, x)
+        e = inverse_tangent_coefficient(s)
+        return (1.0 - s * e) * y + 0.5 * cross(x, y) + (e * _dot(x, y)) * x
+
+    def to_ambient(self, q, w):
+        return _matmul(q, skew(w))
+
+    def from_ambient(self, q, dq):
+        """`w = unskew(R^T dR)`: the skew-symmetric part, hence the orthogonal projection on the tangent space."""
+        return unskew(_matmul(q.T, dq))

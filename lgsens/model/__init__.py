@@ -1,0 +1,46 @@
+"""Rigid bodies, joints and forces: one implementation of the abstract system (paper, §3 and §9)."""
+
+from lgsens.model._body import RigidBody as RigidBody
+from lgsens.model._constraints import (
+    AbstractClosedFormConstraint as AbstractClosedFormConstraint,
+    AbstractConstraint as AbstractConstraint,
+    Coincidence as Coincidence,
+    Distance as Distance,
+    InPlane as InPlane,
+    Orthogonality as Orthogonality,
+)
+from lgsens.model._forces import (
+    AbstractForce as AbstractForce,
+    AppliedForce as AppliedForce,
+    Attached as Attached,
+    Gravity as Gravity,
+    SpringDamper as SpringDamper,
+    TyreSpring as TyreSpring,
+)
+from lgsens.model._frames import Frame as Frame
+from lgsens.model._joints import (
+    AbstractJoint as AbstractJoint,
+    CylindricalJoint as CylindricalJoint,
+    DistanceJoint as DistanceJoint,
+    FixedJoint as FixedJoint,
+    PrismaticJoint as PrismaticJoint,
+    RevoluteJoint as RevoluteJoint,
+    SphericalJoint as SphericalJoint,
+    UniversalJoint as UniversalJoint,
+)
+from lgsens.model._loads import (
+    AbstractClosedFormLoad as AbstractClosedFormLoad,
+    AbstractLoad as AbstractLoad,
+    LineForce as LineForce,
+    LoadTangents as LoadTangents,
+    SpringDamperLoad as SpringDamperLoad,
+    TyreLoad as TyreLoad,
+)
+from lgsens.model._model import Model as Model
+from lgsens.model._roads import (
+    AbstractSignal as AbstractSignal,
+    BumpRoad as BumpRoad,
+    FlatRoad as FlatRoad,
+    SampledRoad as SampledRoad,
+)
+from lgsens.model._system import MultibodySystem as MultibodySystem

@@ -1,0 +1,174 @@
+"""The basic constraints from which joints are made, with closed-form tangents.
+
+Haug's basic constraints (Computer Aided Kinematics and Dynamics of Mechanical Systems, 1989, §9.4):
+coincidence of points, orthogonality of two body-fixed axes (dot-1), orthogonality of an axis and the
+line between two points (dot-2), and distance of points. Every joint is a sum of these, so a scene
+with joints of many types still has at most four kernels.
+
+An element holds numbers only (no names): elements of one type are stacked and evaluated together.
+"""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens.liegroups import skew
+from lgsens.model._frames import (
+    ROTATION_A,
+    ROTATION_B,
+    Frame,
+    separation,
+    separation_stiffness,
+)
+
+
+class AbstractConstraint(eqx.Module):
+    """A constraint between the frames of two bodies; its tangents come from autodiff."""
+
+    @property
+    @abc.abstractmethod
+    def num_rows(self) -> int:
+        """Number of scalar equations."""
+
+    @abc.abstractmethod
+    def value(self, a: Frame, b: Frame) -> Float[Array, " rows"]:
+        """Φ at the given poses, zero when satisfied."""
+
+
+class AbstractClosedFormConstraint(AbstractConstraint):
+    """A constraint that brings its own tangents."""
+
+    @abc.abstractmethod
+    def jacobian(self, a: Frame, b: Frame) -> Float[Array, "rows 12"]:
+        """B with δΦ = B [δx_a, δθ_a, δx_b, δθ_b]."""
+
+    @abc.abstractmethod
+    def geometric_stiffness(self, a: Frame, b: Frame, lam) -> Float[Array, "12 12"]:
+        """D_q(Bᵀ λ) at fixed λ: what the constraint adds to K_t."""
+
+
+class Coincidence(AbstractClosedFormConstraint):
+    """Two body-fixed points coincide: Φ = x_b + R_b X_b − x_a − R_a X_a; λ is the force of b on a [N]."""
+
+    point_a: Float[Array, "3"]
+    point_b: Float[Array, "3"]
+
+    @property
+    def num_rows(self):
+        return 3
+
+    def value(self, a, b):
+        return b.point(self.point_b) - a.point(self.point_a)
+
+    def jacobian(self, a, b):
+        return separation(a, b, self.point_a, self.point_b)[1]
+
+    def geometric_stiffness(self, a, b, lam):
+        return separation_stiffness(a, b, self.point_a, self.point_b, lam)
+
+
+class Orthogonality(AbstractClosedFormConstraint):
+    """Two body-fixed axes stay orthogonal: Φ = α·β with α = R_a e_a, β = R_b e_b; λ is a moment [N m].
+
+    δα = −R_a ẽ_a δθ_a gives B = [0, −βᵀR_a ẽ_a, 0, −αᵀR_b ẽ_b], that is Bᵀλ = λ [0, ẽ_a R_aᵀβ, 0, ẽ_b R_bᵀα].
+    With δ(R_aᵀβ) = (R_aᵀβ)~ δθ_a − R_aᵀR_b ẽ_b δθ_b the geometric stiffness is
+    λ [[ẽ_a (R_aᵀβ)~, −ẽ_a R_aᵀR_b ẽ_b], [−ẽ_b R_bᵀR_a ẽ_a, ẽ_b (R_bᵀα)~]] on the rotations.
+    """
+
+    axis_a: Float[Array, "3"]
+    axis_b: Float[Array, "3"]
+
+    @property
+    def num_rows(self):
+        return 1
+
+    def value(self, a, b):
+        return jnp.dot(a.axis(self.axis_a), b.axis(self.axis_b))[None]
+
+    def jacobian(self, a, b):
+        zero = jnp.zeros(3, self.axis_a.dtype)
+        row_a = jnp.cross(self.axis_a, a.local_axis(b.axis(self.axis_b)))
+        row_b = jnp.cross(self.axis_b, b.local_axis(a.axis(self.axis_a)))
+        return jnp.concatenate([zero, row_a, zero, row_b])[None, :]
+
+    def geometric_stiffness(self, a, b, lam):
+        e_a, e_b = skew(self.axis_a), skew(self.axis_b)
+        coupling = e_a @ (a.orientation.T @ b.orientation) @ e_b
+        stiffness = jnp.zeros((12, 12), lam.dtype)
+        stiffness = stiffness.at[ROTATION_A, ROTATION_A].set(
+            e_a @ skew(a.local_axis(b.axis(self.axis_b)))
+        )
+        stiffness = stiffness.at[ROTATION_A, ROTATION_B].set(-coupling)
+        # −ẽ_b R_bᵀR_a ẽ_a is the transpose of −ẽ_a R_aᵀR_b ẽ_b
+        stiffness = stiffness.at[ROTATION_B, ROTATION_A].set(-coupling.T)
+        stiffness = stiffness.at[ROTATION_B, ROTATION_B].set(
+            e_b @ skew(b.local_axis(a.axis(self.axis_a)))
+        )
+        return stiffness * lam[0]
+
+
+class InPlane(AbstractClosedFormConstraint):
+    """The line between two points stays orthogonal to an axis of a: Φ = α·d, α = R_a e_a; λ is a force [N].
+
+    d and D as in `separation`. B = dᵀ(∂α) + αᵀD with ∂α = −R_a ẽ_a on δθ_a, and
+    D_q(Bᵀλ) = λ (ẽ_a (R_aᵀd)~ + (∂α)ᵀD + Dᵀ(∂α) + D_q(Dᵀα)|_α), the first term on (δθ_a, δθ_a).
+    """
+
+    point_a: Float[Array, "3"]
+    point_b: Float[Array, "3"]
+    axis_a: Float[Array, "3"]
+
+    @property
+    def num_rows(self):
+        return 1
+
+    def value(self, a, b):
+        return jnp.dot(a.axis(self.axis_a), b.point(self.point_b) - a.point(self.point_a))[None]
+
+    def _axis_gradient(self, a):
+        return jnp.zeros((3, 12), self.axis_a.dtype).at[:, ROTATION_A].set(-a.orientation @ skew(self.axis_a))
+
+    def jacobian(self, a, b):
+        d, gradient = separation(a, b, self.point_a, self.point_b)
+        return (d @ self._axis_gradient(a) + a.axis(self.axis_a) @ gradient)[None, :]
+
+    def geometric_stiffness(self, a, b, lam):
+        d, gradient = separation(a, b, self.point_a, self.point_b)
+        cross = self._axis_gradient(a).T @ gradient
+        stiffness = cross + cross.T
+        stiffness = stiffness.at[ROTATION_A, ROTATION_A].add(skew(self.axis_a) @ skew(a.local_axis(d)))
+        stiffness += separation_stiffness(a, b, self.point_a, self.point_b, a.axis(self.axis_a))
+        return stiffness * lam[0]
+
+
+class Distance(AbstractClosedFormConstraint):
+    """Two body-fixed points keep their distance: Φ = |d| − L; λ is the compression of the rod [N].
+
+    With n = d/|d|: B = nᵀD and D_q(Bᵀλ) = λ (Dᵀ (I − n nᵀ)/|d| D + D_q(Dᵀn)|_n).
+    """
+
+    point_a: Float[Array, "3"]
+    point_b: Float[Array, "3"]
+    length: Float[Array, ""]
+
+    @property
+    def num_rows(self):
+        return 1
+
+    def value(self, a, b):
+        d = b.point(self.point_b) - a.point(self.point_a)
+        return (jnp.linalg.norm(d) - self.length)[None]
+
+    def jacobian(self, a, b):
+        d, gradient = separation(a, b, self.point_a, self.point_b)
+        return (d / jnp.linalg.norm(d) @ gradient)[None, :]
+
+    def geometric_stiffness(self, a, b, lam):
+        d, gradient = separation(a, b, self.point_a, self.point_b)
+        length = jnp.linalg.norm(d)
+        n = d / length
+        along = n @ gradient
+        stiffness = (gradient.T @ gradient - jnp.outer(along, along)) / length
+        return (stiffness + separation_stiffness(a, b, self.point_a, self.point_b, n)) * lam[0]

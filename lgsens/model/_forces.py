@@ -1,0 +1,192 @@
+"""Force elements as the user writes them: by the names of bodies, in the reference configuration."""
+
+import abc
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens._validate import number_field, point_field
+from lgsens.model._body import RigidBody
+from lgsens.model._frames import Frame, ground_frame
+from lgsens.model._loads import (
+    AbstractLoad,
+    PointForce,
+    SpringDamperLoad,
+    TyreLoad,
+    Weight,
+)
+from lgsens.model._roads import AbstractSignal, FlatRoad
+
+
+class Attached(NamedTuple):
+    """A load and the two bodies that it acts between; None is the ground."""
+
+    load: AbstractLoad
+    a: str | None
+    b: str | None
+
+
+class AbstractForce(eqx.Module):
+    """A force element. One of one's own has leaves for its numbers and these two methods."""
+
+    @property
+    @abc.abstractmethod
+    def bodies(self) -> tuple[str | None, ...]:
+        """The bodies that it names; None is the ground."""
+
+    @abc.abstractmethod
+    def loads(self, bodies: Mapping[str, RigidBody]) -> tuple[Attached, ...]:
+        """The loads of the element, given the bodies in their reference configuration."""
+
+
+def _frame(bodies: Mapping[str, RigidBody], name: str | None, dtype) -> Frame:
+    return ground_frame(dtype) if name is None else bodies[name].frame
+
+
+class Gravity(AbstractForce):
+    """Uniform gravity on every body: F = m g at the centre of mass.
+
+    Arguments:
+        acceleration: the vector g [m/s²], inertial frame, shape (3,), e.g. (0, 0, −9.81).
+    """
+
+    acceleration: Float[Array, "3"] = point_field("acceleration")
+
+    def __init__(self, acceleration):
+        self.acceleration = acceleration
+
+    @property
+    def bodies(self):
+        return ()
+
+    def loads(self, bodies):
+        return tuple(Attached(Weight(body.mass, self.acceleration), None, name) for name, body in bodies.items())
+
+
+class SpringDamper(AbstractForce):
+    """A spring and a damper in parallel between two points; tension F = F₀ + k (ℓ − ℓ₀) + c ℓ̇.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at_a, at_b: the points of attachment in the reference configuration [m], inertial frame, shape (3,).
+        stiffness: spring stiffness k [N/m], shape ().
+        damping: damping c [N s/m], shape ().
+        free_length: length ℓ₀ at which the spring is free [m], shape ().
+        preload: tension F₀ in the reference configuration [N], shape (); negative for a compressed spring.
+            ℓ₀ is then the reference length.
+
+    Give `free_length` or `preload`, not both; with neither the spring is free in the reference
+    configuration. Points that coincide exchange no force. Raises `ValueError` for both, or wrong shapes.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at_a: Float[Array, "3"] = point_field("at_a")
+    at_b: Float[Array, "3"] = point_field("at_b")
+    stiffness: Float[Array, ""] = number_field("stiffness")
+    damping: Float[Array, ""] = number_field("damping", default=0.0)
+    free_length: Float[Array, ""] | None = number_field("free_length", default=None)
+    preload: Float[Array, ""] | None = number_field("preload", default=None)
+
+    def __check_init__(self):
+        if self.free_length is not None and self.preload is not None:
+            raise ValueError(
+                "SpringDamper: give `free_length` or `preload`, not both: each determines the other "
+                "(preload = stiffness · (reference length − free_length))."
+            )
+
+    @property
+    def bodies(self):
+        return (self.a, self.b)
+
+    def loads(self, bodies):
+        dtype = self.stiffness.dtype
+        free_length = jnp.linalg.norm(self.at_b - self.at_a) if self.free_length is None else self.free_length
+        load = SpringDamperLoad(
+            point_a=_frame(bodies, self.a, dtype).local_point(self.at_a),
+            point_b=_frame(bodies, self.b, dtype).local_point(self.at_b),
+            stiffness=self.stiffness,
+            damping=self.damping,
+            free_length=free_length,
+            preload=jnp.zeros((), dtype) if self.preload is None else self.preload,
+        )
+        return (Attached(load, self.a, self.b),)
+
+
+class TyreSpring(AbstractForce):
+    """A tyre as a vertical spring on a road: F_z = F₀ + k (z_road(t) + ℓ₀ − z), on a point of a body.
+
+    Arguments:
+        body: name of the wheel.
+        at: the wheel centre in the reference configuration [m], inertial frame, shape (3,).
+        stiffness: vertical stiffness k [N/m], shape ().
+        road: height of the road under the wheel over time [m], an `AbstractSignal` (default: flat at 0).
+        free_radius: height ℓ₀ of the wheel centre over the road at which the tyre is free [m], shape ().
+        preload: force F₀ in the reference configuration on a road of height 0 [N], shape (). ℓ₀ is then the
+            reference height of the wheel centre.
+
+    Give `free_radius` or `preload`, not both; with neither the tyre is free in the reference
+    configuration. The spring also pulls: bound its force from below (eq. 48) to keep contact. z is the inertial vertical.
+    Raises `ValueError` for both, or wrong shapes. Source: Sonneville & Brüls (2014), §9.
+    """
+
+    body: str = eqx.field(static=True)
+    at: Float[Array, "3"] = point_field("at")
+    stiffness: Float[Array, ""] = number_field("stiffness")
+    road: AbstractSignal = eqx.field(kw_only=True, default_factory=FlatRoad)
+    free_radius: Float[Array, ""] | None = number_field("free_radius", default=None)
+    preload: Float[Array, ""] | None = number_field("preload", default=None)
+
+    def __check_init__(self):
+        if self.free_radius is not None and self.preload is not None:
+            raise ValueError(
+                "TyreSpring: give `free_radius` or `preload`, not both: each determines the other "
+                "(preload = stiffness · (free_radius − reference height))."
+            )
+
+    @property
+    def bodies(self):
+        return (self.body,)
+
+    def loads(self, bodies):
+        load = TyreLoad(
+            point_b=bodies[self.body].frame.local_point(self.at),
+            stiffness=self.stiffness,
+            free_radius=self.at[2] if self.free_radius is None else self.free_radius,
+            preload=jnp.zeros((), self.at.dtype) if self.preload is None else self.preload,
+            road=self.road,
+        )
+        return (Attached(load, None, self.body),)
+
+
+class AppliedForce(AbstractForce):
+    """A given force on a point of a body and a given moment on it, times a signal: s(t) f and s(t) m.
+
+    Arguments:
+        body: name of the body.
+        at: point of application in the reference configuration [m], inertial frame, shape (3,); None: the
+            centre of mass.
+        force: the force f [N], inertial frame, shape (3,).
+        moment: the moment m [N m], body frame, shape (3,).
+        signal: the factor s(t) [–], an `AbstractSignal` (default: 1).
+
+    Raises `ValueError` for wrong shapes.
+    """
+
+    body: str = eqx.field(static=True)
+    at: Float[Array, "3"] | None = point_field("at", default=None)
+    force: Float[Array, "3"] = point_field("force", default=(0.0, 0.0, 0.0))
+    moment: Float[Array, "3"] = point_field("moment", default=(0.0, 0.0, 0.0))
+    signal: AbstractSignal = eqx.field(kw_only=True, default_factory=lambda: FlatRoad(height=1.0))
+
+    @property
+    def bodies(self):
+        return (self.body,)
+
+    def loads(self, bodies):
+        frame = bodies[self.body].frame
+        at = frame.position if self.at is None else self.at
+        return (Attached(PointForce(frame.local_point(at), self.force, self.moment, self.signal), None, self.body),)

@@ -1,0 +1,73 @@
+"""The pose of a body and of the points and axes fixed to it.
+
+Elements connect a body a to a body b (or the ground, whose frame is the inertial frame). Their
+generalized coordinates are ordered [x_a, θ_a, x_b, θ_b]: a translation in the inertial frame and a
+rotation in the body frame, δx and δθ = (Rᵀ δR)^∨, for each body.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens.liegroups import skew
+
+BODY_A, BODY_B = slice(0, 6), slice(6, 12)
+ROTATION = slice(3, 6)  # within one body
+ROTATION_A, TRANSLATION_B, ROTATION_B = slice(3, 6), slice(6, 9), slice(9, 12)  # within an element's 12
+
+
+class Frame(NamedTuple):
+    """Pose of a body: centre of mass [m] in the inertial frame, and orientation R (body to inertial)."""
+
+    position: Float[Array, "3"]
+    orientation: Float[Array, "3 3"]
+
+    def point(self, local: Float[Array, "3"]) -> Float[Array, "3"]:
+        """x + R X: a body-fixed point in the inertial frame [m]."""
+        return self.position + self.orientation @ local
+
+    def axis(self, local: Float[Array, "3"]) -> Float[Array, "3"]:
+        """R e: a body-fixed direction in the inertial frame."""
+        return self.orientation @ local
+
+    def local_point(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Rᵀ(p − x): an inertial point in the body frame [m]."""
+        return self.orientation.T @ (point - self.position)
+
+    def local_axis(self, axis: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Rᵀ e: an inertial direction in the body frame."""
+        return self.orientation.T @ axis
+
+
+def ground_frame(dtype) -> Frame:
+    """The inertial frame itself."""
+    return Frame(jnp.zeros(3, dtype), jnp.eye(3, dtype=dtype))
+
+
+def separation(a: Frame, b: Frame, point_a, point_b) -> tuple[Float[Array, "3"], Float[Array, "3 12"]]:
+    """The vector d between two body-fixed points, and its gradient D with δd = D [δx_a δθ_a δx_b δθ_b].
+
+        d = x_b + R_b X_b − x_a − R_a X_a,     D = [−I,  R_a X̃_a,  I,  −R_b X̃_b]
+
+    from δ(R X) = R θ̃ X = −R X̃ δθ.
+    """
+    d = b.point(point_b) - a.point(point_a)
+    eye = jnp.eye(3, dtype=d.dtype)
+    gradient = jnp.concatenate(
+        [-eye, a.orientation @ skew(point_a), eye, -b.orientation @ skew(point_b)], axis=1
+    )
+    return d, gradient
+
+
+def separation_stiffness(a: Frame, b: Frame, point_a, point_b, force) -> Float[Array, "12 12"]:
+    """The gradient of Dᵀ f for a force f fixed in the inertial frame.
+
+        D_q(Dᵀ f) = blockdiag(0, −X̃_a (R_aᵀ f)~, 0, X̃_b (R_bᵀ f)~)
+
+    from (−R X̃)ᵀ f = X̃ Rᵀ f and δ(Rᵀ f) = −θ̃ Rᵀ f = (Rᵀ f)~ δθ. With f = λ it is the paper's K_t (§3.2;
+    ERRATA: −X̃ (Rᵀλ)~, with X from the pivot to the centre of mass, our −X_b).
+    """
+    stiffness = jnp.zeros((12, 12), force.dtype)
+    stiffness = stiffness.at[ROTATION_A, ROTATION_A].set(-skew(point_a) @ skew(a.local_axis(force)))
+    return stiffness.at[ROTATION_B, ROTATION_B].set(skew(point_b) @ skew(b.local_axis(force)))

@@ -1,0 +1,292 @@
+"""Joints: hard constraints between two bodies, or a body and the ground.
+
+A joint is given in the reference configuration: its hardpoint `at` and axes in the inertial frame.
+The body-fixed points and axes follow from the poses of the bodies there, so the gradient with
+respect to `at` is the gradient with respect to geometry. Reference: Haug (1989), §9.4.
+"""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens._validate import axis_field, number_field, point_field, require
+from lgsens.model._constraints import (
+    AbstractConstraint,
+    Coincidence,
+    Distance,
+    InPlane,
+    Orthogonality,
+)
+from lgsens.model._frames import Frame
+
+
+def _normals(axis: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
+    """The unit vector along `axis` and two unit vectors that complete it to a right-handed triad.
+
+    The triad starts from the coordinate axis least aligned with `axis`; which one it is does not
+    change the motion, only the meaning of the joint's multipliers.
+    """
+    unit = axis / jnp.linalg.norm(axis)
+    least = jax.nn.one_hot(jnp.argmin(jnp.abs(unit)), 3, dtype=axis.dtype)
+    first = jnp.cross(unit, least)
+    first = first / jnp.linalg.norm(first)
+    return unit, first, jnp.cross(unit, first)
+
+
+def _coincidence(a: Frame, b: Frame, at) -> Coincidence:
+    return Coincidence(a.local_point(at), b.local_point(at))
+
+
+def _orthogonality(a: Frame, b: Frame, axis_a, axis_b) -> Orthogonality:
+    return Orthogonality(a.local_axis(axis_a), b.local_axis(axis_b))
+
+
+def _in_plane(a: Frame, b: Frame, at, axis) -> InPlane:
+    return InPlane(a.local_point(at), b.local_point(at), a.local_axis(axis))
+
+
+class AbstractJoint(eqx.Module):
+    """A joint between bodies `a` and `b`; None is the ground.
+
+    A joint of one's own has these two names, leaves for its numbers, and `constraints`.
+    """
+
+    a: eqx.AbstractVar[str | None]
+    b: eqx.AbstractVar[str | None]
+
+    @property
+    @abc.abstractmethod
+    def assembled(self) -> bool:
+        """Whether the reference configuration satisfies the joint by construction."""
+
+    @abc.abstractmethod
+    def constraints(self, a: Frame, b: Frame) -> tuple[AbstractConstraint, ...]:
+        """The basic constraints of the joint, given the reference frames of its two bodies."""
+
+
+class SphericalJoint(AbstractJoint):
+    """Ball joint: one point of `a` coincides with one point of `b`; 3 equations.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at: the hardpoint in the reference configuration [m], inertial frame, shape (3,).
+
+    The multiplier is the force of `b` on `a` [N], inertial frame, shape (3,).
+    Raises `ValueError` for a wrong shape. Source: paper eq. (23); Haug (1989), §9.4.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at: Float[Array, "3"] = point_field("at")
+
+    @property
+    def assembled(self):
+        return True
+
+    def constraints(self, a, b):
+        return (_coincidence(a, b, self.at),)
+
+
+class RevoluteJoint(AbstractJoint):
+    """Hinge: a common point and a common axis; 5 equations.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at: a point of the axis in the reference configuration [m], inertial frame, shape (3,).
+        axis: direction of the hinge in the reference configuration, inertial frame, shape (3,), any length > 0.
+
+    Raises `ValueError` for a wrong shape or a zero axis. Source: Haug (1989), §9.4.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at: Float[Array, "3"] = point_field("at")
+    axis: Float[Array, "3"] = axis_field("axis")
+
+    @property
+    def assembled(self):
+        return True
+
+    def constraints(self, a, b):
+        unit, first, second = _normals(self.axis)
+        return (
+            _coincidence(a, b, self.at),
+            _orthogonality(a, b, first, unit),
+            _orthogonality(a, b, second, unit),
+        )
+
+
+class UniversalJoint(AbstractJoint):
+    """Cardan joint: a common point and two orthogonal axes, one in each body; 4 equations.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at: centre of the cross in the reference configuration [m], inertial frame, shape (3,).
+        axis_a: arm of the cross fixed in `a`, inertial frame, shape (3,), any length > 0.
+        axis_b: arm of the cross fixed in `b`; only its part orthogonal to `axis_a` is used, so the
+            cross stays a right one whatever the two gradients do.
+
+    Raises `ValueError` for a wrong shape, a zero axis or parallel axes. Source: Haug (1989), §9.4.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at: Float[Array, "3"] = point_field("at")
+    axis_a: Float[Array, "3"] = axis_field("axis_a")
+    axis_b: Float[Array, "3"] = axis_field("axis_b")
+
+    def __check_init__(self):
+        require(
+            lambda: (
+                jnp.linalg.norm(jnp.cross(self.axis_a, self.axis_b))
+                > 1e-6 * jnp.linalg.norm(self.axis_a) * jnp.linalg.norm(self.axis_b)
+            ),
+            f"UniversalJoint: `axis_a` {self.axis_a} and `axis_b` {self.axis_b} are parallel; "
+            "the arms of the cross must be orthogonal.",
+            self.axis_a,
+            self.axis_b,
+        )
+
+    @property
+    def assembled(self):
+        return True
+
+    def constraints(self, a, b):
+        arm_a = self.axis_a / jnp.linalg.norm(self.axis_a)
+        arm_b = self.axis_b - jnp.dot(arm_a, self.axis_b) * arm_a
+        arm_b = arm_b / jnp.linalg.norm(arm_b)
+        return (_coincidence(a, b, self.at), _orthogonality(a, b, arm_a, arm_b))
+
+
+class PrismaticJoint(AbstractJoint):
+    """Slider: `b` translates along an axis of `a` without rotation; 5 equations.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at: a point of the sliding axis in the reference configuration [m], inertial frame, shape (3,).
+        axis: direction of sliding, inertial frame, shape (3,), any length > 0.
+
+    Raises `ValueError` for a wrong shape or a zero axis. Source: Haug (1989), §9.4.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at: Float[Array, "3"] = point_field("at")
+    axis: Float[Array, "3"] = axis_field("axis")
+
+    @property
+    def assembled(self):
+        return True
+
+    def constraints(self, a, b):
+        unit, first, second = _normals(self.axis)
+        return (
+            *_same_orientation(a, b, (unit, first, second)),
+            _in_plane(a, b, self.at, first),
+            _in_plane(a, b, self.at, second),
+        )
+
+
+class CylindricalJoint(AbstractJoint):
+    """`b` slides along and turns about an axis of `a`; 4 equations.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at: a point of the axis in the reference configuration [m], inertial frame, shape (3,).
+        axis: direction of the axis, inertial frame, shape (3,), any length > 0.
+
+    Raises `ValueError` for a wrong shape or a zero axis. Source: Haug (1989), §9.4.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at: Float[Array, "3"] = point_field("at")
+    axis: Float[Array, "3"] = axis_field("axis")
+
+    @property
+    def assembled(self):
+        return True
+
+    def constraints(self, a, b):
+        unit, first, second = _normals(self.axis)
+        return (
+            _orthogonality(a, b, first, unit),
+            _orthogonality(a, b, second, unit),
+            _in_plane(a, b, self.at, first),
+            _in_plane(a, b, self.at, second),
+        )
+
+
+class FixedJoint(AbstractJoint):
+    """`b` is rigidly attached to `a`; 6 equations.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at: the point of attachment in the reference configuration [m], inertial frame, shape (3,): the
+            multiplier's force and moments are those at this point.
+
+    Raises `ValueError` for a wrong shape. Source: Haug (1989), §9.4.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at: Float[Array, "3"] = point_field("at")
+
+    @property
+    def assembled(self):
+        return True
+
+    def constraints(self, a, b):
+        eye = jnp.eye(3, dtype=self.at.dtype)
+        return (_coincidence(a, b, self.at), *_same_orientation(a, b, (eye[0], eye[1], eye[2])))
+
+
+class DistanceJoint(AbstractJoint):
+    """A massless rod: a point of `a` and a point of `b` keep their distance; 1 equation.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at_a, at_b: the two ends in the reference configuration [m], inertial frame, shape (3,).
+        length: length of the rod [m], shape (); None: the distance of the two points in the reference
+            configuration. With another length the mechanism is assembled before it moves.
+
+    The multiplier is the compression of the rod [N]. Raises `ValueError` for a wrong shape, a length
+    ≤ 0, or coinciding ends. Source: Haug (1989), §9.4.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at_a: Float[Array, "3"] = point_field("at_a")
+    at_b: Float[Array, "3"] = point_field("at_b")
+    length: Float[Array, ""] | None = number_field("length", default=None)
+
+    def __check_init__(self):
+        require(
+            lambda: jnp.linalg.norm(self.at_b - self.at_a) > 0,
+            f"DistanceJoint: `at_a` and `at_b` coincide at {self.at_a}, so the rod has no direction; "
+            "use a SphericalJoint, or move one end.",
+            self.at_a,
+            self.at_b,
+        )
+        if self.length is not None:
+            require(
+                lambda: self.length > 0,
+                f"DistanceJoint: `length` must be positive, got {self.length} m.",
+                self.length,
+            )
+
+    @property
+    def assembled(self):
+        return self.length is None
+
+    def constraints(self, a, b):
+        length = jnp.linalg.norm(self.at_b - self.at_a) if self.length is None else self.length
+        return (Distance(a.local_point(self.at_a), b.local_point(self.at_b), length),)
+
+
+def _same_orientation(a: Frame, b: Frame, triad) -> tuple[Orthogonality, ...]:
+    """Three orthogonalities of a right-handed triad: at the reference only δθ_a = δθ_b satisfies them."""
+    return tuple(_orthogonality(a, b, triad[i], triad[(i + 1) % 3]) for i in range(3))

@@ -1,0 +1,179 @@
+"""Force elements as stacked numbers, with closed-form tangents.
+
+Each returns the generalized force Q = [F_a, M_a, F_b, M_b] that it applies: forces in the inertial frame [N],
+moments about the centre of mass in the body frame [N m]. The system subtracts it from the residual, so
+f(q, v, t) of eq. (16) is −Q, and K_t, C_t receive −∂Q/∂q, −∂Q/∂v.
+"""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens.liegroups import skew
+from lgsens.model._frames import (
+    BODY_B,
+    ROTATION,
+    ROTATION_A,
+    ROTATION_B,
+    TRANSLATION_B,
+    Frame,
+    separation,
+    separation_stiffness,
+)
+from lgsens.model._roads import AbstractSignal
+
+
+class LoadTangents(NamedTuple):
+    """∂Q/∂q and ∂Q/∂v of a force element, each (12, 12), or None where it is identically zero."""
+
+    position: Float[Array, "12 12"] | None
+    velocity: Float[Array, "12 12"] | None
+
+
+class AbstractLoad(eqx.Module):
+    """A force between the frames of two bodies; its tangents come from autodiff."""
+
+    @abc.abstractmethod
+    def force(self, a: Frame, b: Frame, va, vb, t) -> Float[Array, "12"]:
+        """Q at the given poses, velocities [ẋ, Ω] of shape (6,) each, and time [s]."""
+
+
+class AbstractClosedFormLoad(AbstractLoad):
+    """A force element that brings its own tangents."""
+
+    @abc.abstractmethod
+    def tangents(self, a: Frame, b: Frame, va, vb, t) -> LoadTangents:
+        """∂Q/∂q and ∂Q/∂v at the same arguments as `force`."""
+
+
+class Weight(AbstractClosedFormLoad):
+    """A force m g on the centre of mass of b."""
+
+    mass: Float[Array, ""]
+    acceleration: Float[Array, "3"]
+
+    def force(self, a, b, va, vb, t):
+        return jnp.zeros(12, self.mass.dtype).at[TRANSLATION_B].set(self.mass * self.acceleration)
+
+    def tangents(self, a, b, va, vb, t):
+        return LoadTangents(None, None)
+
+
+class LineForce(NamedTuple):
+    """What a spring-damper does at one instant: length [m], rate [m/s] and tension [N], shape () each."""
+
+    length: Float[Array, ""]
+    rate: Float[Array, ""]
+    tension: Float[Array, ""]
+
+
+class SpringDamperLoad(AbstractClosedFormLoad):
+    """A spring and damper in parallel along the line between two points: Q = −Dᵀ n F, n = d/|d|.
+
+        F = F₀ + k (|d| − ℓ₀) + c nᵀ(D v)
+
+    With P = (I − n nᵀ)/|d|, s = D v = ḋ and S = ∂(D v)/∂q|_v = [0, −R_a (X̃_a Ω_a)~, 0, R_b (X̃_b Ω_b)~], the tangents of
+    Dᵀ n F are
+
+        ∂/∂q = Dᵀ n (k nᵀD + c (sᵀ P D + nᵀS)) + F Dᵀ P D + D_q(Dᵀ f)|_{f = nF},     ∂/∂v = c Dᵀ n nᵀ D.
+    """
+
+    point_a: Float[Array, "3"]
+    point_b: Float[Array, "3"]
+    stiffness: Float[Array, ""]
+    damping: Float[Array, ""]
+    free_length: Float[Array, ""]
+    preload: Float[Array, ""]
+
+    def _geometry(self, a, b):
+        d, gradient = separation(a, b, self.point_a, self.point_b)
+        square = jnp.dot(d, d)
+        # Points that meet give no direction: the force vanishes there instead of being NaN.
+        meet = square == 0.0
+        length = jnp.where(meet, 0.0, jnp.sqrt(jnp.where(meet, 1.0, square)))
+        return d / jnp.where(meet, 1.0, length), length, gradient, jnp.where(meet, 1.0, length)
+
+    def line_force(self, a, b, va, vb) -> LineForce:
+        n, length, gradient, _ = self._geometry(a, b)
+        rate = jnp.dot(n, gradient @ jnp.concatenate([va, vb]))
+        tension = self.preload + self.stiffness * (length - self.free_length) + self.damping * rate
+        return LineForce(length, rate, tension)
+
+    def force(self, a, b, va, vb, t):
+        n, _, gradient, _ = self._geometry(a, b)
+        return -(self.line_force(a, b, va, vb).tension * n) @ gradient
+
+    def tangents(self, a, b, va, vb, t):
+        n, _, gradient, divisor = self._geometry(a, b)
+        tension = self.line_force(a, b, va, vb).tension
+        along = n @ gradient
+        speed = gradient @ jnp.concatenate([va, vb])
+        turning = jnp.zeros((3, 12), n.dtype)
+        turning = turning.at[:, ROTATION_A].set(
+            -a.orientation @ skew(jnp.cross(self.point_a, va[ROTATION]))
+        )
+        turning = turning.at[:, ROTATION_B].set(b.orientation @ skew(jnp.cross(self.point_b, vb[ROTATION])))
+        across = (gradient - jnp.outer(n, along)) / divisor  # P D
+        rate_gradient = speed @ across + n @ turning
+        position = (
+            jnp.outer(along, self.stiffness * along + self.damping * rate_gradient)
+            + tension * (gradient.T @ across)
+            + separation_stiffness(a, b, self.point_a, self.point_b, tension * n)
+        )
+        return LoadTangents(-position, -self.damping * jnp.outer(along, along))
+
+
+class TyreLoad(AbstractClosedFormLoad):
+    """A vertical spring between the road and a point of b: F_z = F₀ + k (z_road(t) − z + ℓ₀), along the inertial z.
+
+    With e_z the vertical, d the point and D_b = [I, −R_b X̃_b] its gradient: Q_b = F_z D_bᵀ e_z,
+    ∂Q/∂q = −k D_bᵀ e_z e_zᵀ D_b + D_q(Dᵀ f)|_{f = F_z e_z}.
+    """
+
+    point_b: Float[Array, "3"]
+    stiffness: Float[Array, ""]
+    free_radius: Float[Array, ""]
+    preload: Float[Array, ""]
+    road: AbstractSignal
+
+    def normal_force(self, b: Frame, t) -> Float[Array, ""]:
+        return self.preload + self.stiffness * (
+            self.road(t) + self.free_radius - b.point(self.point_b)[2]
+        )
+
+    def _vertical(self, a, b):
+        _, gradient = separation(a, b, jnp.zeros_like(self.point_b), self.point_b)
+        return gradient[2].at[: BODY_B.start].set(0.0)
+
+    def force(self, a, b, va, vb, t):
+        return self.normal_force(b, t) * self._vertical(a, b)
+
+    def tangents(self, a, b, va, vb, t):
+        vertical = self._vertical(a, b)
+        force = self.normal_force(b, t) * jnp.asarray([0.0, 0.0, 1.0], vertical.dtype)
+        geometric = separation_stiffness(a, b, jnp.zeros_like(self.point_b), self.point_b, force)
+        return LoadTangents(geometric - self.stiffness * jnp.outer(vertical, vertical), None)
+
+
+class PointForce(AbstractClosedFormLoad):
+    """A force f(t) = s(t) f on a point of b, fixed in the inertial frame, and a moment s(t) m fixed in b.
+
+    Q_b = s [f, X̃ R^T f + m];  ∂Q/∂q = s D_q(Dᵀ f).
+    """
+
+    point_b: Float[Array, "3"]
+    vector: Float[Array, "3"]
+    moment: Float[Array, "3"]
+    signal: AbstractSignal
+
+    def force(self, a, b, va, vb, t):
+        moment = self.moment + jnp.cross(self.point_b, b.local_axis(self.vector))
+        zero = jnp.zeros(6, self.vector.dtype)
+        return self.signal(t) * jnp.concatenate([zero, self.vector, moment])
+
+    def tangents(self, a, b, va, vb, t):
+        stiffness = separation_stiffness(a, b, jnp.zeros_like(self.point_b), self.point_b, self.vector)
+        return LoadTangents(self.signal(t) * stiffness, None)

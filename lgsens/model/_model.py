@@ -1,0 +1,122 @@
+"""The scene: bodies, joints and forces by name."""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from lgsens._validate import is_concrete
+from lgsens.liegroups import Pose
+from lgsens.model._body import RigidBody
+from lgsens.model._forces import AbstractForce
+from lgsens.model._frames import Frame, ground_frame
+from lgsens.model._joints import AbstractJoint
+from lgsens.model._stack import Placed, stack
+from lgsens.model._system import MultibodySystem
+
+
+class Model(eqx.Module):
+    """A scene of rigid bodies connected by joints and forces; a pytree whose numbers are all float leaves.
+
+    Arguments:
+        bodies: `RigidBody` by name.
+        joints: joints by name; each names its two bodies, None for the ground.
+        forces: force elements by name.
+
+    The constructors can be traced, so a function that builds a model from design parameters is the
+    general parametrization; the gradient with respect to a model is again a model.
+
+    Raises `ValueError` for a scene without bodies, unknown body names, a joint or force between a body
+    and itself, and two joints that are the same connection.
+    """
+
+    bodies: dict[str, RigidBody]
+    joints: dict[str, AbstractJoint]
+    forces: dict[str, AbstractForce]
+
+    def __init__(
+        self,
+        bodies: Mapping[str, RigidBody],
+        joints: Mapping[str, AbstractJoint] | None = None,
+        forces: Mapping[str, AbstractForce] | None = None,
+    ):
+        self.bodies, self.joints, self.forces = dict(bodies), dict(joints or {}), dict(forces or {})
+        if not self.bodies:
+            raise ValueError("Model: `bodies` is empty; a scene needs at least one RigidBody.")
+        for what, kind, members in (
+            ("Body", RigidBody, self.bodies),
+            ("Joint", AbstractJoint, self.joints),
+            ("Force", AbstractForce, self.forces),
+        ):
+            for name, member in members.items():
+                if not isinstance(member, kind):
+                    raise ValueError(f"{what} {name!r} must be a {kind.__name__}, got {type(member).__name__}.")
+        for name, joint in self.joints.items():
+            self._check_connection(f"Joint {name!r}", (joint.a, joint.b))
+        for name, force in self.forces.items():
+            self._check_connection(f"Force {name!r}", force.bodies)
+        self._check_duplicates()
+
+    def _check_connection(self, what: str, ends: tuple[str | None, ...]) -> None:
+        for end in ends:
+            if end is not None and end not in self.bodies:
+                raise ValueError(f"{what} refers to body {end!r}; the bodies are {sorted(self.bodies)}.")
+        if len(ends) == 2 and ends[0] == ends[1]:
+            where = "the ground" if ends[0] is None else f"body {ends[0]!r}"
+            raise ValueError(f"{what} connects {where} to itself; name two different bodies.")
+
+    def _check_duplicates(self) -> None:
+        names = list(self.joints)
+        for i, first in enumerate(names):
+            for second in names[i + 1 :]:
+                one, other = self.joints[first], self.joints[second]
+                same_type = type(one) is type(other) and {one.a, one.b} == {other.a, other.b}
+                if same_type and is_concrete(one, other):
+                    if all(jnp.array_equal(x, y) for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other))):
+                        raise ValueError(
+                            f"Joints {first!r} and {second!r} are the same {type(one).__name__} between "
+                            f"{one.a!r} and {one.b!r} at the same place; remove one of them."
+                        )
+
+    def system(self) -> MultibodySystem:
+        """The equations of motion, elements stacked by type.
+
+        Names are sorted here and nowhere else: a dict comes out of `jit` sorted, so its own order cannot
+        be relied on.
+        """
+        names = tuple(sorted(self.bodies))
+        number = {None: None} | {name: i for i, name in enumerate(names)}
+        bodies = {name: self.bodies[name] for name in names}
+        ordered = list(bodies.values())
+        dtype = ordered[0].mass.dtype
+        ground = ground_frame(dtype)
+
+        def frame(name: str | None) -> Frame:
+            return ground if name is None else bodies[name].frame
+
+        constraints = [
+            Placed(constraint, number[joint.a], number[joint.b], name)
+            for name, joint in sorted(self.joints.items())
+            for constraint in joint.constraints(frame(joint.a), frame(joint.b))
+        ]
+        loads = [
+            Placed(attached.load, number[attached.a], number[attached.b], name)
+            for name, force in sorted(self.forces.items())
+            for attached in force.loads(bodies)
+        ]
+        return MultibodySystem(
+            mass=jnp.stack([body.mass for body in ordered]),
+            inertia=jnp.stack([body.inertia_matrix for body in ordered]),
+            pose=Pose(
+                jnp.stack([body.position for body in ordered]),
+                jnp.stack([body.orientation for body in ordered]),
+            ),
+            velocity=jnp.concatenate(
+                [part for body in ordered for part in (body.velocity, body.angular_velocity)]
+            ),
+            constraints=stack(constraints),
+            loads=stack(loads),
+            body_names=names,
+            assembled=all(joint.assembled for joint in self.joints.values()),
+        )

@@ -1,0 +1,91 @@
+"""Signals of time: road profiles and load histories, as modules whose numbers are leaves."""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens._validate import as_float, number_field, require
+
+
+class AbstractSignal(eqx.Module):
+    """A scalar function of time. A signal of one's own has leaves for its numbers and `__call__`."""
+
+    @abc.abstractmethod
+    def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
+        """The value at time t [s]."""
+
+
+class FlatRoad(AbstractSignal):
+    """A constant: z(t) = height.
+
+    Arguments:
+        height: height of the road above z = 0 [m] (or the value of a load factor [–]), shape ().
+    """
+
+    height: Float[Array, ""] = number_field("height", default=0.0)
+
+    def __call__(self, t):
+        return self.height
+
+
+class BumpRoad(AbstractSignal):
+    """A sin² bump: z(t) = h sin²(π (t − t_s)/T) for t_s ≤ t ≤ t_s + T, else 0; that is ½ h (1 − cos 2π(t − t_s)/T).
+
+    Arguments:
+        height: height h of the bump [m], shape ().
+        duration: time T that the wheel takes to cross it [s], shape (), positive.
+        start: time t_s at which it begins [s], shape ().
+
+    Continuous with its first derivative; the second jumps at both ends. Raises `ValueError` for a
+    duration ≤ 0.
+    """
+
+    height: Float[Array, ""] = number_field("height")
+    duration: Float[Array, ""] = number_field("duration")
+    start: Float[Array, ""] = number_field("start", default=0.0)
+
+    def __check_init__(self):
+        require(
+            lambda: self.duration > 0,
+            f"BumpRoad: `duration` must be positive, got {self.duration} s.",
+            self.duration,
+        )
+
+    def __call__(self, t):
+        phase = (t - self.start) / self.duration
+        on_bump = (phase >= 0) & (phase <= 1)
+        return jnp.where(on_bump, self.height * jnp.sin(jnp.pi * phase) ** 2, 0.0)
+
+
+class SampledRoad(AbstractSignal):
+    """Linear interpolation between samples, constant outside them.
+
+    Arguments:
+        times: sample times [s], shape (n,), increasing.
+        heights: heights at these times [m], shape (n,).
+
+    The slope jumps at the samples: put them on time steps to keep second order. Raises `ValueError` for
+    shapes that differ or times that do not increase.
+    """
+
+    times: Float[Array, " n"]
+    heights: Float[Array, " n"]
+
+    def __init__(self, times, heights):
+        self.times = as_float(times, None, "SampledRoad: `times`")
+        self.heights = as_float(heights, None, "SampledRoad: `heights`")
+        if self.times.ndim != 1 or self.times.shape != self.heights.shape or self.times.size < 2:
+            raise ValueError(
+                "SampledRoad: `times` and `heights` must be two vectors of the same length ≥ 2, got shapes "
+                f"{self.times.shape} and {self.heights.shape}."
+            )
+        require(
+            lambda: jnp.all(jnp.diff(self.times) > 0),
+            "SampledRoad: `times` must increase from sample to sample; sort them and drop duplicates.",
+            self.times,
+        )
+
+    def __call__(self, t):
+        return jnp.interp(t, self.times, self.heights)

@@ -1,0 +1,132 @@
+"""Elements of one type, stacked and evaluated together.
+
+Elements are grouped by the structure of their numbers and by which side is the ground; each group is one
+vmapped kernel, so what is compiled grows with the number of element types, not of elements.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lgsens.liegroups import Pose, R3xSO3
+from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint
+from lgsens.model._frames import BODY_A, BODY_B, Frame, ground_frame
+from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, LoadTangents
+
+BODY_DIM = 6
+Element = TypeVar("Element", AbstractConstraint, AbstractLoad)
+
+
+class Placed(NamedTuple, Generic[Element]):
+    """An element, the numbers of its two bodies (None: the ground), and the name of its owner."""
+
+    element: Element
+    a: int | None
+    b: int | None
+    owner: str
+
+
+class Stack(eqx.Module, Generic[Element]):
+    """Elements of one type between bodies `a` and `b`; `a` or `b` is None where all of them are on the ground."""
+
+    elements: Element  # leaves with a leading axis
+    a: tuple[int, ...] | None = eqx.field(static=True)
+    b: tuple[int, ...] | None = eqx.field(static=True)
+    owners: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def part(self) -> slice:
+        """The element coordinates that belong to bodies; the ground has none."""
+        return BODY_B if self.a is None else BODY_A if self.b is None else slice(BODY_A.start, BODY_B.stop)
+
+    @property
+    def coordinates(self) -> np.ndarray:
+        """The system coordinates of each element's `part`, shape (elements, 6 or 12)."""
+        sides = [np.asarray(side)[:, None] * BODY_DIM + np.arange(BODY_DIM) for side in (self.a, self.b) if side]
+        return np.concatenate(sides, axis=1)
+
+    def map(self, function, q, *per_side, extra: Sequence[Any] = ()):
+        """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra)` for every element.
+
+        `q` holds the poses of all bodies, each of `per_side` a (bodies, …) array; a ground side gets the
+        inertial frame and zeros. Each of `extra` has a leading axis over the elements, or is a scalar.
+        """
+        dtype = q.position.dtype
+
+        def side(indices):
+            if indices is None:
+                zeros = [jnp.zeros(array.shape[1:], dtype) for array in per_side]
+                return ground_frame(dtype), zeros, None
+            index = np.asarray(indices)
+            return Frame(q.position[index], q.orientation[index]), [array[index] for array in per_side], 0
+
+        frame_a, arrays_a, axis_a = side(self.a)
+        frame_b, arrays_b, axis_b = side(self.b)
+        arrays = [array for pair in zip(arrays_a, arrays_b) for array in pair]
+        axes = [axis_a, axis_b] * len(per_side)
+        extra_axes = [0 if jnp.ndim(value) else None for value in extra]
+        return jax.vmap(function, in_axes=(0, axis_a, axis_b, *axes, *extra_axes))(
+            self.elements, frame_a, frame_b, *arrays, *extra
+        )
+
+
+def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
+    """Group elements by type and ground side, keeping their order within a group."""
+    groups: dict[Any, list[Placed[Element]]] = {}
+    for item in placed:
+        leaves, structure = jax.tree.flatten(item.element)
+        key = (structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves), item.a is None, item.b is None)
+        groups.setdefault(key, []).append(item)
+    stacks = []
+    for members in groups.values():
+        first = members[0]
+        stacks.append(
+            Stack(
+                elements=jax.tree.map(lambda *leaves: jnp.stack(leaves), *[m.element for m in members]),
+                a=None if first.a is None else tuple(m.a for m in members),
+                b=None if first.b is None else tuple(m.b for m in members),
+                owners=tuple(m.owner for m in members),
+            )
+        )
+    return tuple(stacks)
+
+
+# Elements with closed-form tangents use them; for the others autodiff perturbs by retraction, R exp(θ̃).
+
+
+def _moved(frame: Frame, x) -> Frame:
+    return Frame(*R3xSO3().retract(Pose(*frame), x))
+
+
+def constraint_jacobian(element: AbstractConstraint, a: Frame, b: Frame):
+    """B of one element, shape (rows, 12)."""
+    if isinstance(element, AbstractClosedFormConstraint):
+        return element.jacobian(a, b)
+    zero = jnp.zeros(12, a.position.dtype)
+    return jax.jacfwd(lambda x: element.value(_moved(a, x[BODY_A]), _moved(b, x[BODY_B])))(zero)
+
+
+def constraint_stiffness(element: AbstractConstraint, a: Frame, b: Frame, lam):
+    """D_q(Bᵀλ) of one element, shape (12, 12)."""
+    if isinstance(element, AbstractClosedFormConstraint):
+        return element.geometric_stiffness(a, b, lam)
+    zero = jnp.zeros(12, a.position.dtype)
+    return jax.jacfwd(
+        lambda x: lam @ constraint_jacobian(element, _moved(a, x[BODY_A]), _moved(b, x[BODY_B]))
+    )(zero)
+
+
+def load_tangents(element: AbstractLoad, a: Frame, b: Frame, va, vb, t) -> LoadTangents:
+    """∂Q/∂q and ∂Q/∂v of one element."""
+    if isinstance(element, AbstractClosedFormLoad):
+        return element.tangents(a, b, va, vb, t)
+    zero = jnp.zeros(12, a.position.dtype)
+    position = jax.jacfwd(
+        lambda x: element.force(_moved(a, x[BODY_A]), _moved(b, x[BODY_B]), va, vb, t)
+    )(zero)
+    velocity = jax.jacfwd(lambda x: element.force(a, b, va + x[BODY_A], vb + x[BODY_B], t))(zero)
+    return LoadTangents(position, velocity)
