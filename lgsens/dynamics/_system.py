@@ -23,8 +23,13 @@ class AbstractSystem(eqx.Module):
     subclass on any group has all of them. Every number that the motion depends on is a float
     leaf of the module; everything else is static.
 
+    Attributes:
+        assembled: whether the reference configuration satisfies Φ = 0 by construction (static).
+
     Source: Sonneville & Brüls (2014), eqs. (15)–(17).
     """
+
+    assembled: eqx.AbstractVar[bool]
 
     @property
     @abc.abstractmethod
@@ -35,11 +40,6 @@ class AbstractSystem(eqx.Module):
     @abc.abstractmethod
     def constraint_names(self) -> tuple[str, ...]:
         """A name for each of the m constraint equations, used in messages."""
-
-    @property
-    @abc.abstractmethod
-    def assembled(self) -> bool:
-        """Whether the reference configuration satisfies Φ = 0 by construction (static)."""
 
     @abc.abstractmethod
     def reference(self) -> tuple[Any, Float[Array, " k"]]:

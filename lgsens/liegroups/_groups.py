@@ -93,10 +93,12 @@ class Pose(NamedTuple):
 
 _POSITION = Rn(3)
 _ORIENTATION = SO3()
+_TRANSLATION, _ROTATION = slice(0, 3), slice(3, 6)  # the coordinates of a pose
+_ROTATION_BLOCK, _TRANSLATION_BLOCK = slice(0, 3), slice(3, 7)  # the matrix of a pose, eq. (20)
 
 
 def _split(x):
-    return x[:3], x[3:]
+    return x[_TRANSLATION], x[_ROTATION]
 
 
 class R3xSO3(AbstractLieGroup):
@@ -133,7 +135,9 @@ class R3xSO3(AbstractLieGroup):
         return block_diag(_ORIENTATION.wedge(r), _POSITION.wedge(u))
 
     def vee(self, X):
-        return jnp.concatenate([_POSITION.vee(X[3:, 3:]), _ORIENTATION.vee(X[:3, :3])])
+        u = _POSITION.vee(X[_TRANSLATION_BLOCK, _TRANSLATION_BLOCK])
+        r = _ORIENTATION.vee(X[_ROTATION_BLOCK, _ROTATION_BLOCK])
+        return jnp.concatenate([u, r])
 
     def matrix(self, q):
         """The 7×7 matrix of eq. (20), the rotation block first."""
@@ -153,15 +157,15 @@ class R3xSO3(AbstractLieGroup):
 
     def tangent_mv(self, x, y):
         u, r = _split(y)
-        return jnp.concatenate([u, _ORIENTATION.tangent_mv(x[3:], r)])
+        return jnp.concatenate([u, _ORIENTATION.tangent_mv(x[_ROTATION], r)])
 
     def tangent_rmv(self, x, y):
         u, r = _split(y)
-        return jnp.concatenate([u, _ORIENTATION.tangent_rmv(x[3:], r)])
+        return jnp.concatenate([u, _ORIENTATION.tangent_rmv(x[_ROTATION], r)])
 
     def tangent_inv_mv(self, x, y):
         u, r = _split(y)
-        return jnp.concatenate([u, _ORIENTATION.tangent_inv_mv(x[3:], r)])
+        return jnp.concatenate([u, _ORIENTATION.tangent_inv_mv(x[_ROTATION], r)])
 
     def to_ambient(self, q, w):
         u, r = _split(w)

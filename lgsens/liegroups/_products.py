@@ -1,5 +1,7 @@
 """Direct products: of different groups, and of many copies of one."""
 
+import itertools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,21 +10,19 @@ from jax.scipy.linalg import block_diag
 from ._base import AbstractLieGroup
 
 
+def _slices(sizes):
+    return [slice(end - size, end) for size, end in zip(sizes, itertools.accumulate(sizes))]
+
+
 def _pieces(x, sizes):
-    """Cuts the last axis of `x` in consecutive pieces of the given sizes."""
-    if x.shape[-1] != sum(sizes):
-        raise ValueError(f"Product: coordinates of shape ({sum(sizes)},) expected, got {x.shape}.")
-    ends = [sum(sizes[: i + 1]) for i in range(len(sizes))]
-    return [x[..., end - size : end] for size, end in zip(sizes, ends)]
+    """Cuts coordinates in consecutive pieces of the given sizes."""
+    if x.shape != (sum(sizes),):  # slicing alone would silently accept coordinates that are too long
+        raise ValueError(f"Product: the coordinates have shape {x.shape}; expected ({sum(sizes)},).")
+    return [x[part] for part in _slices(sizes)]
 
 
 def _diagonal_blocks(X, sizes):
-    return [piece[end - size : end] for size, end, piece in _with_ends(X, sizes)]
-
-
-def _with_ends(X, sizes):
-    ends = [sum(sizes[: i + 1]) for i in range(len(sizes))]
-    return zip(sizes, ends, _pieces(X, sizes))
+    return [X[part, part] for part in _slices(sizes)]
 
 
 def _matrix_size(group):
@@ -138,8 +138,8 @@ class Power(AbstractLieGroup):
         return self.n * self.group.dim
 
     def identity(self, dtype=None):
-        copies = lambda leaf: jnp.broadcast_to(leaf, (self.n, *leaf.shape))
-        return jax.tree.map(copies, self.group.identity(dtype))
+        one = self.group.identity(dtype)
+        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (self.n, *leaf.shape)), one)
 
     def compose(self, p, q):
         return jax.vmap(self.group.compose)(p, q)

@@ -72,11 +72,11 @@ class MultibodySystem(AbstractSystem):
         return self.pose, self.velocity
 
     def coordinate_scale(self):
-        # The scene's length: the largest distance of a centre of mass from another body's, or of an
-        # attachment from its centre of mass.
+        # The scene's length: the extent of the centres of mass, or the largest arm of an attachment.
         extents = [jnp.ptp(self.pose.position, axis=0)]
         for stack in (*self.constraints, *self.loads):
-            extents += [jnp.abs(leaf).max(axis=0) for leaf in jax.tree.leaves(stack.elements) if leaf.shape[1:] == (3,)]
+            arms = (getattr(stack.elements, name, None) for name in ("point_a", "point_b"))
+            extents += [jnp.abs(arm).max(axis=0) for arm in arms if arm is not None]
         length = jnp.max(jnp.stack(extents))
         body = jnp.ones(BODY_DIM, length.dtype)
         scale = body.at[: ROTATION.start].set(jnp.where(length > 0, length, 1.0))

@@ -1,0 +1,16 @@
+"""Constrained dynamics on any Lie group (paper, §3)."""
+
+from lgsens.dynamics._equilibrium import equilibrium as equilibrium
+from lgsens.dynamics._initial import (
+    Initial as Initial,
+    accelerations as accelerations,
+    initial_state as initial_state,
+    mass_scale as mass_scale,
+)
+from lgsens.dynamics._results import RESULTS as RESULTS
+from lgsens.dynamics._state import State as State, Tangents as Tangents
+from lgsens.dynamics._system import (
+    AbstractSystem as AbstractSystem,
+    autodiff_constraint_jacobian as autodiff_constraint_jacobian,
+    autodiff_tangents as autodiff_tangents,
+)

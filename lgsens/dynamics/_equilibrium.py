@@ -1,0 +1,78 @@
+"""Static equilibrium: r(q, 0, 0, λ, t) = 0 and Φ(q) = 0."""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from lgsens.dynamics._initial import Initial, mass_scale
+from lgsens.dynamics._results import RESULTS
+from lgsens.dynamics._state import State
+from lgsens.dynamics._system import AbstractSystem
+
+_MAX_ITERATIONS = 60
+
+
+def equilibrium(system: AbstractSystem, t) -> Initial:
+    """The static equilibrium near the reference configuration, as an initial state at rest.
+
+    Newton's iteration on x and λ in q = q_ref exp(x̃), with the matrix [[K_t T, Bᵀ], [B T, 0]] at v = 0. A mechanism
+    may turn freely about some axis (a wheel on its hinge): the step and the derivative are the shortest
+    that solve the equations, found through the pseudo-inverse. The derivative is that of the implicit
+    function theorem; it does not pass through the iteration.
+    """
+    group = system.group
+    q_ref, v_ref = system.reference()
+    k, m, dtype = v_ref.shape[0], len(system.constraint_names), v_ref.dtype
+    zero = jnp.zeros_like(v_ref)
+    scale = lax.stop_gradient(system.coordinate_scale())
+    weight = mass_scale(system.mass_matrix())
+    eps = jnp.finfo(dtype).eps
+
+    def split(z):
+        # Multipliers in units of the mass scale × 1 m/s², so that both parts of z are of order one.
+        return z[:k] * scale, z[k:] * weight
+
+    def equation(z):
+        x, lam = split(z)
+        q = group.retract(q_ref, x)
+        force = system.residual(q, zero, zero, lam, t)
+        return jnp.concatenate([force * scale / weight, system.constraint(q)])
+
+    def matrix(z):
+        x, lam = split(z)
+        tangents = system.tangents(group.retract(q_ref, x), zero, zero, lam, t)
+        by_x = jax.vmap(lambda row: group.tangent_rmv(x, row))
+        jacobian = tangents.constraint_jacobian
+        upper = jnp.concatenate([by_x(tangents.stiffness) * scale[None, :], jacobian.T * weight], axis=1)
+        lower = jnp.concatenate([by_x(jacobian) * scale[None, :], jnp.zeros((m, m), dtype)], axis=1)
+        return jnp.concatenate([upper * (scale / weight)[:, None], lower], axis=0)
+
+    def newton(equation, z):
+        def body(carry):
+            z, _, iteration = carry
+            step = jnp.linalg.lstsq(matrix(z), equation(z), rcond=1e3 * eps)[0]
+            size = jnp.max(jnp.abs(step[:k]))
+            # At most 0.2 rad or a fifth of the scene at a time.
+            return z - step * jnp.minimum(1.0, 0.2 / jnp.maximum(size, 0.2)), size, iteration + 1
+
+        def unfinished(carry):
+            _, size, iteration = carry
+            return (size > jnp.sqrt(eps)) & (iteration < _MAX_ITERATIONS)
+
+        start = (z, jnp.full((), jnp.inf, dtype), jnp.zeros((), jnp.int32))
+        z, _, _ = lax.while_loop(unfinished, body, start)
+        # Newton is quadratic: one step from √eps is at round-off.
+        return z - jnp.linalg.lstsq(matrix(z), equation(z), rcond=1e3 * eps)[0]
+
+    def tangent_solve(linear, rhs):
+        slope = jax.jacfwd(linear)(jnp.zeros_like(rhs))
+        return jnp.linalg.pinv(slope, rtol=1e3 * eps) @ rhs
+
+    z = lax.custom_root(equation, jnp.zeros(k + m, dtype), newton, tangent_solve)
+    x, lam = split(z)
+    state = State(q=group.retract(q_ref, x), v=zero, vdot=zero, lam=lam, a=zero)
+    # Forces balance to √eps of the largest joint force or moment, taken as mass scale × 1 m/s² at least.
+    left = jnp.max(jnp.abs(equation(z)))
+    balanced = left <= jnp.sqrt(eps) * (1.0 + jnp.max(jnp.abs(z[k:]), initial=0.0))
+    result = jnp.where(balanced, RESULTS.successful, RESULTS.equilibrium_failed).astype(jnp.int32)
+    return Initial(state, zero, result, system.constraint(state.q))

@@ -1,0 +1,147 @@
+"""Consistent initial state, eqs. (18)–(19), and the accelerations and multipliers that go with it."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from lgsens.dynamics._results import RESULTS
+from lgsens.dynamics._state import State
+from lgsens.dynamics._system import AbstractSystem
+
+_MAX_ITERATIONS = 30
+
+
+class Initial(NamedTuple):
+    """An initial state and how its computation ended."""
+
+    state: State
+    jerk: Float[Array, " k"]  # v̈ at the initial time
+    result: Int[Array, ""]  # a value of RESULTS
+    violation: Float[Array, " m"]  # Φ after assembly
+
+
+def mass_scale(mass: Float[Array, "k k"]) -> Float[Array, ""]:
+    """The size of M, by which the rows of B and the multipliers are scaled to it (DESIGN: Bottasso et al. 2007)."""
+    return lax.stop_gradient(jnp.trace(mass) / mass.shape[0])
+
+
+def kkt_solve(mass, jacobian, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
+    """Solve [[M, Bᵀ], [B, 0]] [x; λ] = [force; rate], constraint rows and multipliers scaled to M."""
+    k, m = mass.shape[0], jacobian.shape[0]
+    scale = mass_scale(mass)
+    scaled = scale * jacobian
+    matrix = jnp.block([[mass, scaled.T], [scaled, jnp.zeros((m, m), mass.dtype)]])
+    solution = jnp.linalg.solve(matrix, jnp.concatenate([force, scale * rate]))
+    return solution[:k], scale * solution[k:]
+
+
+def accelerations(system: AbstractSystem, q, v, t):
+    """v̇ and λ of the motion through (q, v) at time t, eq. (41).
+
+        M v̇ + Bᵀλ = ad(v)ᵀ M v − f(q, v, t),     B v̇ = −Ḃ v = −D(B v)·(q ṽ)|_v
+    """
+    group, zero = system.group, jnp.zeros_like(v)
+    jacobian = system.constraint_jacobian(q)
+    lam_zero = jnp.zeros(jacobian.shape[0], v.dtype)
+
+    def velocity_constraint(s):
+        return system.constraint_jacobian(group.retract(q, s * v)) @ v
+
+    origin, unit = jnp.zeros((), v.dtype), jnp.ones((), v.dtype)
+    _, rate = jax.jvp(velocity_constraint, (origin,), (unit,))
+    force = -system.residual(q, v, zero, lam_zero, t)
+    return kkt_solve(system.mass_matrix(), jacobian, force, -rate)
+
+
+def jerk(system: AbstractSystem, q, v, vdot, t) -> Float[Array, " k"]:
+    """v̈ of the motion through (q, v): the derivative of `accelerations` along q ṽ, v̇ and 1."""
+    origin, unit = jnp.zeros((), v.dtype), jnp.ones((), v.dtype)
+    along = lambda s: accelerations(system, system.group.retract(q, s * v), v + s * vdot, t + s)[0]  # noqa: E731
+    return jax.jvp(along, (origin,), (unit,))[1]
+
+
+def assemble(system: AbstractSystem):
+    """The configuration closest to the reference that satisfies Φ(q) = 0, and its last violation.
+
+    q = q_ref exp((N μ)~) with N = M⁻¹B(q_ref)ᵀ: the motion that an impulse along the constraint directions
+    would give. The m equations Φ(q) = 0 determine μ; the implicit function theorem, its derivative.
+    """
+    q_ref, v_ref = system.reference()
+    if system.assembled or not system.constraint_names:
+        return q_ref, system.constraint(q_ref)
+    group, mass = system.group, system.mass_matrix()
+    jacobian = system.constraint_jacobian(q_ref)
+    normal = jnp.linalg.solve(mass, jacobian.T)
+    scale = system.coordinate_scale()
+    tolerance = 16 * jnp.finfo(v_ref.dtype).eps
+
+    def place(mu):
+        return group.retract(q_ref, normal @ mu)
+
+    def newton(equation, mu):
+        def body(carry):
+            mu, _, iteration = carry
+            x = normal @ mu
+            q = group.retract(q_ref, x)
+            slope = jax.vmap(lambda row: group.tangent_rmv(x, row))(system.constraint_jacobian(q)) @ normal
+            step = jnp.linalg.solve(slope, equation(mu))
+            # Far from assembly a full step may leave the branch: at most a fifth of the scene at a time.
+            size = jnp.max(jnp.abs(normal @ step) / scale)
+            step = step * jnp.minimum(1.0, 0.2 / jnp.maximum(size, 0.2))
+            return mu - step, size, iteration + 1
+
+        def unfinished(carry):
+            _, size, iteration = carry
+            return (size > tolerance) & (iteration < _MAX_ITERATIONS)
+
+        start = (mu, jnp.full((), jnp.inf, mu.dtype), jnp.zeros((), jnp.int32))
+        return lax.while_loop(unfinished, body, start)[0]
+
+    def tangent_solve(linear, rhs):
+        return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(rhs)), rhs)
+
+    mu = lax.custom_root(
+        lambda mu: system.constraint(place(mu)), jnp.zeros(jacobian.shape[0], v_ref.dtype), newton, tangent_solve
+    )
+    q = place(mu)
+    return q, system.constraint(q)
+
+
+def independence(jacobian: Float[Array, "m k"]) -> Float[Array, ""]:
+    """How far the rows of B are from dependent: the smallest |R_ii| of the QR of the unit rows, 1 when orthogonal."""
+    m, k = jacobian.shape
+    if m > k:
+        return jnp.zeros((), jacobian.dtype)
+    if m == 0:
+        return jnp.ones((), jacobian.dtype)
+    unit = jacobian / jnp.maximum(jnp.linalg.norm(jacobian, axis=1), jnp.finfo(jacobian.dtype).tiny)[:, None]
+    return jnp.min(jnp.abs(jnp.diagonal(jnp.linalg.qr(unit.T, mode="r"))))
+
+
+def initial_state(system: AbstractSystem, t) -> Initial:
+    """q, v, v̇, λ consistent with the constraints at position, velocity and acceleration level; a = v̇.
+
+    Velocities are projected with the metric of kinetic energy, M (v − v_ref) + Bᵀμ = 0 and B v = 0: what an
+    impulse through the joints leaves of v_ref.
+    """
+    q, violation = assemble(system)
+    _, v_ref = system.reference()
+    mass, jacobian = system.mass_matrix(), system.constraint_jacobian(q)
+    v, _ = kkt_solve(mass, jacobian, mass @ v_ref, jnp.zeros(jacobian.shape[0], v_ref.dtype))
+    vdot, lam = accelerations(system, q, v, t)
+    state = State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
+    dtype = v.dtype
+    # Redundant rows leave |R_ii| at round-off, independent ones near a singular configuration well above it.
+    redundant = independence(lax.stop_gradient(jacobian)) < jnp.finfo(dtype).eps ** 0.6
+    length = jnp.max(system.coordinate_scale())
+    largest = jnp.max(jnp.abs(violation), initial=0.0)
+    assembled = largest <= 1e3 * jnp.finfo(dtype).eps * jnp.maximum(length, 1.0)  # NaN is not assembled
+    result = jnp.where(
+        assembled,
+        jnp.where(redundant, RESULTS.redundant_constraints, RESULTS.successful),
+        RESULTS.assembly_failed,
+    ).astype(jnp.int32)
+    return Initial(state, jerk(system, q, v, vdot, t), result, violation)

@@ -1,0 +1,39 @@
+"""How a computation ended: data inside a trace, a message outside it."""
+
+from enum import IntEnum
+
+
+class RESULTS(IntEnum):
+    """Result code of a simulation; `Trajectory.result` holds its value, an int32 array of shape ()."""
+
+    successful = 0
+    assembly_failed = 1
+    redundant_constraints = 2
+    newton_failed = 3
+    equilibrium_failed = 4
+
+    @property
+    def message(self) -> str:
+        """What happened and what to try."""
+        return _MESSAGES[self]
+
+
+_MESSAGES = {
+    RESULTS.successful: "The computation was successful.",
+    RESULTS.assembly_failed: (
+        "The mechanism cannot be assembled from its reference configuration: no configuration nearby "
+        "satisfies all joints. Check lengths, hardpoints and axes of the joints named, or start closer."
+    ),
+    RESULTS.redundant_constraints: (
+        "The joints constrain the same motion twice, so the multipliers are not unique. Replace one of the "
+        "joints named by one with fewer equations (a revolute by a spherical or a cylindrical joint, say)."
+    ),
+    RESULTS.newton_failed: (
+        "Newton's iteration did not converge. Try a smaller step (more `num_steps`), more "
+        "`max_iterations` of the integrator, or look for a singular configuration at this time."
+    ),
+    RESULTS.equilibrium_failed: (
+        "No static equilibrium was found near the reference configuration. Start closer to it, or check "
+        "that the forces can balance (a body that nothing holds falls)."
+    ),
+}

@@ -1,0 +1,10 @@
+"""The Lie-group generalized-α integrator (paper, §4)."""
+
+from lgsens.integrate._integrate import Stats as Stats, integrate as integrate
+from lgsens.integrate._linear import Factors as Factors
+from lgsens.integrate._scheme import (
+    GeneralizedAlpha as GeneralizedAlpha,
+    advance as advance,
+    factorize_iteration_matrix as factorize_iteration_matrix,
+    increment as increment,
+)

@@ -1,0 +1,131 @@
+"""The Lie-group generalized-α scheme as a value, eqs. (24)–(30).
+
+With u = a_{n+1}, one step from (q, v, v̇, a) at t_n solves for u and λ
+
+    x   = h v + h² ((½ − β) a + β u)                      (27)
+    q⁺  = q exp(x̃)                                       (24)
+    v⁺  = v + h ((1 − γ) a + γ u)                         (28)
+    v̇⁺  = ((1 − α_m) u + α_m a − α_f v̇) / (1 − α_f)       (29)
+    r(q⁺, v⁺, v̇⁺, λ⁺, t⁺) = 0,   Φ(q⁺)/(βh²) = 0          (25), (26)
+
+The unknown is u and not x, and the constraint is divided by βh²: with ∂x/∂u = βh² the matrix of eq. (30)
+becomes
+
+    S = [[c M + γh C_t + βh² K_t T(x),  Bᵀ],
+         [B T(x),                       0 ]],      c = (1 − α_m)/(1 − α_f),
+
+which does not degenerate as h → 0 (Bottasso, Bauchau & Cardona 2007; its condition at h = 1e-3 would
+else be 1e18). Its constraint rows and multipliers are further scaled by the size of M.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens.dynamics import AbstractSystem, State, Tangents, mass_scale
+from lgsens.integrate._linear import Factors
+
+
+class GeneralizedAlpha(eqx.Module):
+    """The generalized-α integrator: numerical damping and the settings of its Newton iteration.
+
+        α_m = (2ρ − 1)/(ρ + 1),  α_f = ρ/(ρ + 1),  γ = ½ + α_f − α_m,  β = (γ + ½)²/4
+
+    Arguments:
+        rho_inf: spectral radius ρ∞ at infinite frequency, in [0, 1): 0 damps the fastest modes in one step,
+            values near 1 keep energy and let noise in the multipliers persist.
+        tolerance: the last Newton increment of a configuration, relative to 1 rad or the length of the
+            scene, at which a step has converged. The error left is its square; below 64 round-offs
+            it is raised to that (single precision).
+        max_iterations: Newton iterations per step before the step has failed.
+        second_order_start: start the auxiliary acceleration at a₀ = v̇₀ + (α_m − α_f) h v̈₀ instead of v̇₀. a_n
+            stands for the acceleration at t_n + (α_m − α_f) h, so this start is second order (Arnold,
+            Brüls & Cardona 2015).
+
+    All static and hashable. Raises `ValueError` for ρ∞ outside [0, 1), a tolerance that is not positive, or
+    fewer than 1 iteration. Source: Sonneville & Brüls (2014), §4; Brüls, Cardona & Arnold (2012).
+    """
+
+    rho_inf: float = eqx.field(static=True, default=0.9)
+    tolerance: float = eqx.field(static=True, default=1e-10, kw_only=True)
+    max_iterations: int = eqx.field(static=True, default=10, kw_only=True)
+    second_order_start: bool = eqx.field(static=True, default=True, kw_only=True)
+
+    def __check_init__(self):
+        if not isinstance(self.rho_inf, int | float) or not 0.0 <= self.rho_inf < 1.0:
+            raise ValueError(
+                f"GeneralizedAlpha: `rho_inf` must be a number in [0, 1), got {self.rho_inf!r}; 0.9 damps little, "
+                "0 most."
+            )
+        if not (self.tolerance > 0.0 and math.isfinite(self.tolerance)):
+            raise ValueError(
+                f"GeneralizedAlpha: `tolerance` must be positive, got {self.tolerance!r}; 1e-10 is the default."
+            )
+        if self.max_iterations < 1:
+            raise ValueError(
+                f"GeneralizedAlpha: `max_iterations` must be at least 1, got {self.max_iterations!r}."
+            )
+
+    @property
+    def alpha_m(self) -> float:
+        return (2.0 * self.rho_inf - 1.0) / (self.rho_inf + 1.0)
+
+    @property
+    def alpha_f(self) -> float:
+        return self.rho_inf / (self.rho_inf + 1.0)
+
+    @property
+    def gamma(self) -> float:
+        return 0.5 + self.alpha_f - self.alpha_m
+
+    @property
+    def beta(self) -> float:
+        return (self.gamma + 0.5) ** 2 / 4.0
+
+    @property
+    def inertia_factor(self) -> float:
+        """c = ∂v̇⁺/∂u."""
+        return (1.0 - self.alpha_m) / (1.0 - self.alpha_f)
+
+
+class Motion(NamedTuple):
+    """The increment and the kinematic state that u gives, eqs. (24), (27)–(29)."""
+
+    x: Float[Array, " k"]
+    q: Any
+    v: Float[Array, " k"]
+    vdot: Float[Array, " k"]
+
+
+def increment(scheme: GeneralizedAlpha, previous: State, u, h) -> Float[Array, " k"]:
+    """x of eq. (27)."""
+    return h * previous.v + h**2 * ((0.5 - scheme.beta) * previous.a + scheme.beta * u)
+
+
+def advance(scheme: GeneralizedAlpha, system: AbstractSystem, previous: State, u, h) -> Motion:
+    """What follows from the unknown u = a_{n+1}."""
+    x = increment(scheme, previous, u, h)
+    v = previous.v + h * ((1.0 - scheme.gamma) * previous.a + scheme.gamma * u)
+    vdot = (
+        (1.0 - scheme.alpha_m) * u + scheme.alpha_m * previous.a - scheme.alpha_f * previous.vdot
+    ) / (1.0 - scheme.alpha_f)
+    return Motion(x, system.group.retract(previous.q, x), v, vdot)
+
+
+def factorize_iteration_matrix(scheme: GeneralizedAlpha, system: AbstractSystem, tangents: Tangents, mass, x, h):
+    """The factors of S above: one LU, which serves Newton, the DDM, and transposed, the AVM."""
+    group = system.group
+    k = mass.shape[0]
+    # A T(x) for the rows of K_t and B together
+    rows = jnp.concatenate([tangents.stiffness, tangents.constraint_jacobian])
+    rows = jax.vmap(lambda row: group.tangent_rmv(x, row))(rows)
+    dynamic = (
+        scheme.inertia_factor * mass
+        + (scheme.gamma * h) * tangents.damping
+        + (scheme.beta * h**2) * rows[:k]
+    )
+    return Factors.of(dynamic, tangents.constraint_jacobian.T, rows[k:], mass_scale(mass))

@@ -1,0 +1,169 @@
+"""The linearized trajectory, L δ = b: the one operator behind both sensitivity methods.
+
+Let δ_n = (w, v', v̇', λ', a')_n be the sensitivities of the state at t_n, with q' = q w̃ (eq. 32), and p the parameters:
+the numbers of the system, t0 and h. Differentiating the step (eqs. 24–29, §6.2) gives, for n → n+1,
+
+    x'  = h v'_n + h² ((½ − β) a'_n + β a'_{n+1}) + x_h h'            x_h = v_n + 2h ((½ − β) a_n + β a_{n+1})
+    (24)  w_{n+1}  − D(exp x̃) w_n − T(x) x'                                                  = b.w
+    (28)  v'_{n+1} − v'_n − h ((1 − γ) a'_n + γ a'_{n+1}) − v_h h'                              = b.v
+                                                                       v_h = (1 − γ) a_n + γ a_{n+1}
+    (29)  v̇'_{n+1} − ((1 − α_m) a'_{n+1} + α_m a'_n − α_f v̇'_n)/(1 − α_f)                      = b.vdot
+    (26)  (B w_{n+1} + Φ_p p')/(βh²)                                                          = b.lam
+    (25)  M v̇'_{n+1} + C_t v'_{n+1} + K_t w_{n+1} + Bᵀλ'_{n+1} + r_p p' + r_t (t0' + (n+1) h')   = b.a
+
+Row 0 is δ_0 = b_0 and the last row p' = b.p. L is block lower bidiagonal with a border for p. A derivative has b_0 and
+b.p only (all other rows zero); derivatives of derivatives fill the other rows too.
+Forward substitution with L is the direct differentiation method (`_direct.py`), back substitution with Lᵀ the
+discrete adjoint variable method (`_adjoint.py`). Both solve with the exact iteration matrix of eq. (30).
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens.dynamics import AbstractSystem, State, Tangents
+from lgsens.integrate import GeneralizedAlpha, increment
+
+
+class Parameters(NamedTuple):
+    """What a trajectory depends on besides its initial state, or a tangent or cotangent of it."""
+
+    system: AbstractSystem
+    t0: Float[Array, ""]
+    h: Float[Array, ""]
+
+
+class Variation(NamedTuple):
+    """δ of one state (or, stacked, of a trajectory) in Lie-algebra coordinates; also one row of the equations."""
+
+    w: Float[Array, " k"]
+    v: Float[Array, " k"]
+    vdot: Float[Array, " k"]
+    lam: Float[Array, " m"]
+    a: Float[Array, " k"]
+
+
+class Rates(NamedTuple):
+    """x_h and v_h: how the increments depend on the step size."""
+
+    x: Float[Array, " k"]
+    v: Float[Array, " k"]
+
+
+class Step(NamedTuple):
+    """One converged step, from `previous` to `state` at `t`."""
+
+    previous: State
+    state: State
+    t: Float[Array, ""]
+
+
+def steps(states: State, parameters: Parameters) -> Step:
+    """All steps of a trajectory, stacked."""
+    num_steps = states.v.shape[0] - 1
+    count = jnp.arange(1, num_steps + 1, dtype=states.v.dtype)
+    return Step(
+        previous=jax.tree.map(lambda leaf: leaf[:-1], states),
+        state=jax.tree.map(lambda leaf: leaf[1:], states),
+        t=parameters.t0 + count * parameters.h,
+    )
+
+
+def step_increment(scheme: GeneralizedAlpha, step: Step, h) -> tuple[Float[Array, " k"], Rates]:
+    """x of eq. (27) at the converged step, and the rates with the step size."""
+    previous, u = step.previous, step.state.a
+    x = increment(scheme, previous, u, h)
+    x_h = previous.v + 2.0 * h * ((0.5 - scheme.beta) * previous.a + scheme.beta * u)
+    v_h = (1.0 - scheme.gamma) * previous.a + scheme.gamma * u
+    return x, Rates(x_h, v_h)
+
+
+def step_tangents(system: AbstractSystem, step: Step) -> Tangents:
+    """K_t, C_t and B at the converged state."""
+    state = step.state
+    return system.tangents(state.q, state.v, state.vdot, state.lam, step.t)
+
+
+def kinematics(scheme: GeneralizedAlpha, group, x, rates: Rates, h, previous: Variation, u, dh):
+    """w, v', v̇' at n+1 from eqs. (24), (28), (29), given δ_n, u' = a'_{n+1} and h'."""
+    dx = h * previous.v + h**2 * ((0.5 - scheme.beta) * previous.a + scheme.beta * u) + rates.x * dh
+    w = group.Ad_inv_mv(group.exp(x), previous.w) + group.tangent_mv(x, dx)
+    v = previous.v + h * ((1.0 - scheme.gamma) * previous.a + scheme.gamma * u) + rates.v * dh
+    vdot = (
+        (1.0 - scheme.alpha_m) * u + scheme.alpha_m * previous.a - scheme.alpha_f * previous.vdot
+    ) / (1.0 - scheme.alpha_f)
+    return w, v, vdot
+
+
+def pseudo_load_function(step: Step):
+    """p ↦ (r, Φ) at the fixed converged state: its JVP is (r_p p', Φ_p p'), its VJP their transposes."""
+    state = step.state
+
+    def loads(system: AbstractSystem, t):
+        return system.residual(state.q, state.v, state.vdot, state.lam, t), system.constraint(state.q)
+
+    return loads
+
+
+def pseudo_loads(step: Step, parameters: Parameters, d: Parameters):
+    """r_p p' + r_t t' and Φ_p p', with t' = t0' + (n+1) h'."""
+    n = (step.t - parameters.t0) / parameters.h
+    loads = pseudo_load_function(step)
+    return jax.jvp(loads, (parameters.system, step.t), (d.system, d.t0 + n * d.h))[1]
+
+
+def matvec(scheme: GeneralizedAlpha, states: State, parameters: Parameters, delta: Variation, d: Parameters):
+    """L (δ, p'), all steps at once: the equations above, written out. What JAX differentiates a second time."""
+    mass = parameters.system.mass_matrix()
+    group, h = parameters.system.group, parameters.h
+
+    def rows(step: Step, previous: Variation, current: Variation) -> Variation:
+        x, rates = step_increment(scheme, step, h)
+        w, v, vdot = kinematics(scheme, group, x, rates, h, previous, current.a, d.h)
+        k_t, c_t, b = step_tangents(parameters.system, step)
+        r_p, phi_p = pseudo_loads(step, parameters, d)
+        return Variation(
+            w=current.w - w,
+            v=current.v - v,
+            vdot=current.vdot - vdot,
+            lam=(b @ current.w + phi_p) / (scheme.beta * h**2),
+            a=mass @ current.vdot + c_t @ current.v + k_t @ current.w + current.lam @ b + r_p,
+        )
+
+    previous = jax.tree.map(lambda leaf: leaf[:-1], delta)
+    current = jax.tree.map(lambda leaf: leaf[1:], delta)
+    later = jax.vmap(rows)(steps(states, parameters), previous, current)
+    return jax.tree.map(lambda first, rest: jnp.concatenate([first[:1], rest]), delta, later), d
+
+
+# Conversion between Lie-algebra coordinates and the arrays of q: the only place where it happens.
+
+
+def to_algebra(group, state: State, tangent: State) -> Variation:
+    """The Lie-algebra coordinates of a tangent of a state's arrays."""
+    return Variation(group.from_ambient(state.q, tangent.q), tangent.v, tangent.vdot, tangent.lam, tangent.a)
+
+
+def to_ambient(group, state: State, delta: Variation) -> State:
+    """The tangent of a state's arrays with the given Lie-algebra coordinates."""
+    return State(group.to_ambient(state.q, delta.w), delta.v, delta.vdot, delta.lam, delta.a)
+
+
+def cotangent_to_algebra(group, state: State, cotangent: State) -> Variation:
+    """The transpose of `to_ambient`: what a cotangent of the arrays says of the coordinates."""
+    (w,) = jax.linear_transpose(lambda w: group.to_ambient(state.q, w), state.v)(cotangent.q)
+    return Variation(w, cotangent.v, cotangent.vdot, cotangent.lam, cotangent.a)
+
+
+def cotangent_to_ambient(group, state: State, delta: Variation) -> State:
+    """The transpose of `to_algebra`."""
+    (q,) = jax.linear_transpose(lambda dq: group.from_ambient(state.q, dq), state.q)(delta.w)
+    return State(q, delta.v, delta.vdot, delta.lam, delta.a)
+
+
+def zeros_like_trajectory(states: State) -> Any:
+    """The rows of b that a first derivative leaves zero."""
+    zero = jnp.zeros_like(states.v)
+    return Variation(zero, zero, zero, jnp.zeros_like(states.lam), zero)

@@ -1,0 +1,136 @@
+"""How a trajectory is differentiated, as a value: the two rules on the whole trajectory.
+
+Both rules are module-level functions of explicit arguments, and keep states only.
+"""
+
+import abc
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.flatten_util import ravel_pytree
+
+from lgsens.dynamics import State
+from lgsens.integrate import GeneralizedAlpha, Stats, integrate
+from lgsens.sensitivity._adjoint import adjoint_sweep
+from lgsens.sensitivity._direct import direct_sweep
+from lgsens.sensitivity._linearization import (
+    Parameters,
+    Variation,
+    cotangent_to_algebra,
+    cotangent_to_ambient,
+    matvec,
+    to_algebra,
+    to_ambient,
+    zeros_like_trajectory,
+)
+
+
+class AbstractSensitivity(eqx.Module):
+    """A method to differentiate a trajectory."""
+
+    @abc.abstractmethod
+    def trajectory(
+        self, scheme: GeneralizedAlpha, num_steps: int, state0: State, parameters: Parameters
+    ) -> tuple[State, Stats]:
+        """The states and statistics of all steps, with this method as their derivative."""
+
+
+class DirectDifferentiation(AbstractSensitivity):
+    """The hand-derived linearization L of the scheme, in both modes; the default.
+
+    Forward mode (`jvp`, `jacfwd`) is the direct differentiation method of §6.2, forward substitution with L; JAX
+    transposes it (`grad`, `jacrev`) to back substitution with Lᵀ, the discrete adjoint variable method. The derivative is
+    that of the numerical solution, to round-off. Supports every JAX transformation, nested too (`hessian`).
+    """
+
+    def trajectory(self, scheme, num_steps, state0, parameters):
+        return _direct_trajectory(scheme, num_steps, state0, parameters)
+
+
+class AdjointVariable(AbstractSensitivity):
+    """The backward sweep with Lᵀ as an explicit `custom_vjp`: reverse mode only, first derivatives only.
+
+    The same numbers as `DirectDifferentiation` in reverse mode, from a rule that JAX does not take apart.
+    Forward mode through it raises JAX's TypeError.
+    """
+
+    def trajectory(self, scheme, num_steps, state0, parameters):
+        return _adjoint_trajectory(scheme, num_steps, state0, parameters)
+
+
+def _run(scheme, num_steps, state0, parameters):
+    return integrate(scheme, num_steps, parameters.system, state0, parameters.t0, parameters.h)
+
+
+# Direct differentiation. The tangent of the trajectory solves L (δ, p') = (b, p'), b = (δ_0, 0, …, 0).
+# `custom_linear_solve` carries the two sweeps side by side: JAX takes `solve` forwards, `transpose_solve` backwards,
+# and for second derivatives differentiates `matvec`, that is L itself, never the sweeps.
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _direct_trajectory(scheme, num_steps, state0, parameters):
+    return _run(scheme, num_steps, state0, parameters)
+
+
+@_direct_trajectory.defjvp
+def _direct_rule(scheme, num_steps, primals, tangents):
+    state0, parameters = primals
+    d_state0, d_parameters = tangents
+    states, stats = _direct_trajectory(scheme, num_steps, state0, parameters)
+    group = parameters.system.group
+    first = to_algebra(group, state0, d_state0)
+    b = jax.tree.map(lambda zeros, leaf: zeros.at[0].set(leaf), zeros_like_trajectory(states), first)
+    # One flat vector, because `custom_linear_solve` is transposed only where no part of b is a constant, and the
+    # tangent of a parameter that is not differentiated is one: a zero.
+    flat, unravel = ravel_pytree((b, d_parameters))
+    solution = lax.custom_linear_solve(
+        lambda unknown: ravel_pytree(matvec(scheme, states, parameters, *unravel(unknown)))[0],
+        flat,
+        solve=lambda _, rhs: ravel_pytree(direct_sweep(scheme, states, parameters, *unravel(rhs)))[0],
+        transpose_solve=lambda _, rhs: ravel_pytree(adjoint_sweep(scheme, states, parameters, *unravel(rhs)))[0],
+    )
+    delta, _ = unravel(solution)
+    d_states = jax.vmap(partial(to_ambient, group))(states, delta)
+    return (states, stats), (d_states, _no_tangent(stats))
+
+
+def _no_tangent(stats: Stats) -> Stats:
+    """Statistics have no derivative: zero for floats, float0 for the rest."""
+    return jax.tree.map(
+        lambda leaf: (
+            jnp.zeros_like(leaf)
+            if jnp.issubdtype(leaf.dtype, jnp.floating)
+            else np.zeros(leaf.shape, jax.dtypes.float0)
+        ),
+        stats,
+    )
+
+
+# Adjoint variable method.
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _adjoint_trajectory(scheme, num_steps, state0, parameters):
+    return _run(scheme, num_steps, state0, parameters)
+
+
+def _adjoint_forward(scheme, num_steps, state0, parameters):
+    states, stats = _run(scheme, num_steps, state0, parameters)
+    return (states, stats), (states, parameters)
+
+
+def _adjoint_backward(scheme, num_steps, kept, cotangents):
+    states, parameters = kept
+    group = parameters.system.group
+    c = jax.vmap(partial(cotangent_to_algebra, group))(states, cotangents[0])
+    mu, bar = adjoint_sweep(scheme, states, parameters, c, jax.tree.map(jnp.zeros_like, parameters))
+    state0 = jax.tree.map(lambda leaf: leaf[0], states)
+    first = Variation(*[leaf[0] for leaf in mu])
+    return cotangent_to_ambient(group, state0, first), bar
+
+
+_adjoint_trajectory.defvjp(_adjoint_forward, _adjoint_backward)

@@ -1,0 +1,310 @@
+"""One suite for all groups: each operation against its definition on the matrix representation."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from lgsens.liegroups import SO3, AbstractLieGroup, Pose, Power, Product, R3xSO3, Rn
+
+GROUPS = {
+    "Rn": Rn(3),
+    "SO3": SO3(),
+    "R3xSO3": R3xSO3(),
+    "Product": Product((Rn(2), R3xSO3(), SO3())),
+    "Power": Power(R3xSO3(), 3),
+}
+DTYPES = [np.float32, np.float64]
+METHODS = ["exp", "log", "wedge", "vee", "matrix", "ad", "compose", "inverse", "retract"]
+METHODS += ["Ad_inv", "Ad_inv_mv", "Ad_inv_rmv", "tangent", "tangent_mv", "tangent_rmv"]
+METHODS += ["tangent_inv", "tangent_inv_mv", "to_ambient", "from_ambient"]
+
+# Coordinates are of order 1 and formulas are short: errors of a few eps per entry, more where a matrix product of the
+# reference sums up to 21 of them. 32 eps (7e-15) tells that apart from any wrong coefficient.
+ULPS = 32
+
+
+class Jitted:
+    """A group with every method compiled, which makes the suite ten times faster."""
+
+    def __init__(self, group):
+        self.group, self.dim = group, group.dim
+        for name in METHODS:
+            setattr(self, name, jax.jit(getattr(group, name)))
+
+
+JITTED = {name: Jitted(group) for name, group in GROUPS.items()}
+
+
+@pytest.fixture(params=GROUPS)
+def group(request):
+    return JITTED[request.param]
+
+
+def coordinates(group, count=1, dtype=np.float64, seed=0, scale=0.7):
+    x = jnp.asarray(np.random.default_rng(seed).normal(scale=scale, size=(count, group.dim)), dtype)
+    return x[0] if count == 1 else tuple(x)
+
+
+def close(actual, expected, dtype=np.float64, ulps=ULPS):
+    jax.tree.map(
+        lambda a, e: np.testing.assert_allclose(a, e, rtol=0, atol=ulps * np.finfo(dtype).eps),
+        actual,
+        expected,
+    )
+
+
+expm = jax.jit(jax.scipy.linalg.expm)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_exp_is_the_matrix_exponential(group, dtype):
+    x = coordinates(group, dtype=dtype)
+    close(group.matrix(group.exp(x)), expm(group.wedge(x.astype(np.float64))), dtype)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_log_inverts_exp(group, dtype):
+    for scale in (0.0, 1e-6, 0.7):
+        x = coordinates(group, dtype=dtype, scale=scale)
+        close(group.log(group.exp(x)), x, dtype)
+
+
+@given(data=st.data())
+@settings(max_examples=60, deadline=None)
+@pytest.mark.parametrize("name", GROUPS)
+def test_log_inverts_exp_everywhere_below_pi(name, data):
+    group = JITTED[name]
+    # |x_i| ≤ 1.8 keeps every rotation vector below 1.8 √3 = 3.12 < π.
+    entry = st.floats(-1.8, 1.8, allow_subnormal=False)
+    x = jnp.asarray(data.draw(st.lists(entry, min_size=group.dim, max_size=group.dim)))
+    close(group.log(group.exp(x)), x)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_group_axioms(group, dtype):
+    p, q, r = (group.exp(x) for x in coordinates(group, 3, dtype))
+    e = group.group.identity(dtype)
+    close(group.compose(group.compose(p, q), r), group.compose(p, group.compose(q, r)), dtype)
+    close(group.compose(q, e), q, dtype)
+    close(group.compose(e, q), q, dtype)
+    close(group.compose(q, group.inverse(q)), e, dtype)
+    close(group.compose(group.inverse(q), q), e, dtype)
+    close(group.matrix(group.compose(p, q)), group.matrix(p) @ group.matrix(q), dtype)
+    close(group.matrix(e), jnp.eye(len(group.matrix(e)), dtype=dtype), dtype)
+
+
+def test_retract_is_composition_with_exp(group):
+    x, y = coordinates(group, 2)
+    q = group.exp(x)
+    close(group.matrix(group.retract(q, y)), group.matrix(q) @ expm(group.wedge(y)))
+
+
+def test_vee_inverts_wedge(group):
+    x = coordinates(group)
+    close(group.vee(group.wedge(x)), x, ulps=0)
+
+
+def test_Ad_inv_is_conjugation(group):
+    x, w = coordinates(group, 2)
+    q = group.exp(x)
+    expected = group.vee(group.matrix(group.inverse(q)) @ group.wedge(w) @ group.matrix(q))
+    close(group.Ad_inv_mv(q, w), expected)
+    close(group.Ad_inv(q), expm(-group.ad(x)))
+
+
+def test_ad_is_the_commutator(group):
+    x, y = coordinates(group, 2)
+    X, Y = group.wedge(x), group.wedge(y)
+    close(group.wedge(group.ad(x) @ y), X @ Y - Y @ X)
+
+
+@pytest.mark.parametrize("method", ["Ad_inv", "tangent"])
+def test_rmv_is_the_transpose_of_mv(group, method):
+    x, y, z = coordinates(group, 3)
+    point = group.exp(x) if method == "Ad_inv" else x
+    mv, rmv = getattr(group, method + "_mv"), getattr(group, method + "_rmv")
+    matrix = getattr(group, method)(point)
+    close(mv(point, y), matrix @ y)
+    close(rmv(point, y), matrix.T @ y)
+    close(jnp.vdot(z, mv(point, y)), jnp.vdot(rmv(point, z), y))
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-7, 0.7])
+def test_tangent_is_the_derivative_of_exp(group, scale):
+    x, y = coordinates(group, 2, scale=scale)[0], coordinates(group, seed=1)
+    exp = group.group.exp
+    q, dq = jax.jit(lambda x, y: jax.jvp(exp, (x,), (y,)))(x, y)
+    close(group.from_ambient(q, dq), group.tangent_mv(x, y))
+    close(group.to_ambient(q, group.tangent_mv(x, y)), dq)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-7, 0.7])
+def test_tangent_inverse(group, scale):
+    x, y = coordinates(group, 2, scale=scale)[0], coordinates(group, seed=1)
+    close(group.tangent_inv(x) @ group.tangent(x), jnp.eye(group.dim))
+    close(group.tangent_inv_mv(x, group.tangent_mv(x, y)), y)
+
+
+def tangent_series(ad, x):
+    """T(x) = Σ_k (-ad x)^k / (k+1)!, which holds on every Lie group; 40 terms suffice for |x| ≤ 5."""
+    A = -ad(x)
+    term = total = jnp.eye(len(A), dtype=A.dtype)
+    for k in range(1, 40):
+        term = term @ A / (k + 1.0)
+        total = total + term
+    return total
+
+
+def test_tangent_and_two_derivatives_match_the_series(group):
+    x, y, z = coordinates(group, 3)
+
+    def derivatives(T):
+        first = lambda x: jax.jvp(T, (x,), (y,))[1]
+        return T(x), first(x), jax.jvp(first, (x,), (z,))[1]
+
+    # `derivatives` closes over x: jit would fold the whole series, so pass through an eager call of compiled pieces.
+    T = jax.jit(group.group.tangent)
+    series = jax.jit(lambda x: tangent_series(group.group.ad, x))
+    close(derivatives(T), derivatives(series))
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.7])
+def test_derivative_of_the_tangent_satisfies_the_commutation_rule(group, scale):
+    """Eq. (6), `δu - d(δq)/ds = ad(u) δq`, with `u = T(x) y` and `δq = T(x) z`."""
+    x, (y, z) = coordinates(group, scale=scale), coordinates(group, 2, seed=1)
+    T = group.tangent_mv
+
+    def difference(x):
+        along = lambda y, z: jax.jvp(lambda x: T(x, y), (x,), (z,))[1]
+        return along(y, z) - along(z, y)
+
+    close(difference(x), group.ad(T(x, y)) @ T(x, z))
+
+
+def test_taylor_remainder_of_the_tangent_has_rate_two(group):
+    x, y = coordinates(group, 2)
+    q = group.exp(x)
+    steps = 0.1 * 0.5 ** np.arange(5)
+
+    def remainder(h):
+        moved = group.log(group.compose(group.inverse(q), group.exp(x + h * y)))
+        return float(jnp.linalg.norm(moved - h * group.tangent_mv(x, y)))
+
+    remainders = np.array([remainder(h) for h in steps])
+    if isinstance(group.group, Rn):
+        assert remainders.max() < 1e-14  # linear: nothing remains but the rounding of numbers of order 1
+    else:
+        rates = np.log2(remainders[:-1] / remainders[1:])
+        # Rate 2 up to O(h): 0.1 at h = 0.1, halved at each step.
+        np.testing.assert_allclose(rates[-2:], 2.0, atol=0.1)
+
+
+def test_ambient_and_algebra_coordinates_are_inverse(group):
+    x, w = coordinates(group, 2)
+    q = group.exp(x)
+    dq = group.to_ambient(q, w)
+    assert jax.tree.structure(dq) == jax.tree.structure(q)
+    close(group.from_ambient(q, dq), w)
+    # δq = q w~ of eq. (3), on matrices. `matrix` is affine in the arrays of q, so its tangent is exact.
+    tangent = jax.jit(lambda q, dq: jax.jvp(group.group.matrix, (q,), (dq,))[1])(q, dq)
+    close(tangent, group.matrix(q) @ group.wedge(w))
+
+
+def test_from_ambient_projects_on_the_tangent_space():
+    group = SO3()
+    q = group.exp(jnp.array([0.3, -0.5, 0.8]))
+    w = jnp.array([1.0, -2.0, 0.5])
+    symmetric = jnp.array([[1.0, 2.0, 3.0], [2.0, -1.0, 0.5], [3.0, 0.5, 4.0]])
+    close(group.from_ambient(q, group.to_ambient(q, w) + q @ symmetric), w)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_derivatives_through_exp_and_log_at_zero(group, dtype):
+    """Under jit, vmap and both modes, at the point where θ = |x| has no derivative."""
+    weights = coordinates(group, dtype=dtype, seed=2)
+    p = group.exp(coordinates(group, dtype=dtype, seed=3))
+    zeros = jnp.zeros((2, group.dim), dtype)
+
+    def f(x):  # log(exp(x)) = x: linear, with gradient `weights` and no curvature
+        return jnp.vdot(weights, group.log(group.exp(x)))
+
+    def g(x):  # log(p exp(x)), whose derivative at 0 is T^{-1}(log p)
+        return group.log(group.retract(p, x))
+
+    gradient, curvature = jax.jit(jax.vmap(lambda x: (jax.grad(f)(x), jax.hessian(f)(x))))(zeros)
+    close(gradient, jnp.stack([weights, weights]), dtype)
+    close(curvature, jnp.zeros((2, group.dim, group.dim), dtype), dtype)
+    forward, reverse = jax.jit(jax.vmap(lambda x: (jax.jacfwd(g)(x), jax.jacrev(g)(x))))(zeros)
+    expected = group.tangent_inv(group.log(p))
+    close(forward, jnp.stack([expected, expected]), dtype)
+    close(reverse, forward, dtype)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_every_method_follows_the_dtype_and_vmaps(group, dtype):
+    x, y = coordinates(group, 2, dtype)
+    q, p = group.exp(x), group.exp(y)
+    X, dq = group.wedge(x), group.to_ambient(q, y)
+    arguments = {"exp": (x,), "log": (q,), "wedge": (x,), "vee": (X,), "matrix": (q,), "ad": (x,)}
+    arguments |= {"compose": (p, q), "inverse": (q,), "retract": (q, x), "Ad_inv": (q,)}
+    arguments |= {"tangent": (x,), "tangent_inv": (x,), "to_ambient": (q, y), "from_ambient": (q, dq)}
+    arguments |= dict.fromkeys(["Ad_inv_mv", "Ad_inv_rmv"], (q, y))
+    arguments |= dict.fromkeys(["tangent_mv", "tangent_rmv", "tangent_inv_mv"], (x, y))
+    assert set(arguments) == set(METHODS)
+    for name, args in arguments.items():
+        method = getattr(group.group, name)
+        single = jax.eval_shape(method, *args)
+        assert all(leaf.dtype == dtype for leaf in jax.tree.leaves(single)), name
+        batch = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((4, *leaf.shape), leaf.dtype), (args, single))
+        assert jax.eval_shape(jax.vmap(method), *batch[0]) == batch[1], name
+
+
+@pytest.mark.parametrize("dtype", [*DTYPES, None])
+def test_identity_has_the_dtype_asked_for(group, dtype):
+    e = group.group.identity(dtype)
+    assert all(leaf.dtype == (dtype or np.float64) for leaf in jax.tree.leaves(e))
+    assert jax.tree.structure(e) == jax.tree.structure(group.exp(coordinates(group)))
+
+
+def test_groups_are_static_values(group):
+    assert isinstance(group.group, AbstractLieGroup)
+    assert not jax.tree.leaves(group.group)
+    assert len({group.group, jax.tree.map(lambda leaf: leaf, group.group)}) == 1
+    assert group.group.log(group.group.identity()).shape == (group.dim,)
+
+
+def test_shapes_and_order_of_coordinates():
+    x = jnp.arange(1.0, 7.0)
+    q = R3xSO3().exp(x)
+    assert isinstance(q, Pose)
+    np.testing.assert_array_equal(q.position, x[:3])
+    close(q.orientation, SO3().exp(x[3:]))
+    # The direct product, not SE(3): conjugation leaves the translation alone.
+    np.testing.assert_array_equal(R3xSO3().Ad_inv_mv(q, x)[:3], x[:3])
+    # Eq. (20): the rotation first, then the translation in the last column.
+    matrix = R3xSO3().matrix(q)
+    np.testing.assert_array_equal(matrix[:3, :3], q.orientation)
+    np.testing.assert_array_equal(matrix[3:6, 6], q.position)
+    powers = Power(R3xSO3(), 2).exp(jnp.concatenate([x, -x]))
+    assert powers.position.shape == (2, 3) and powers.orientation.shape == (2, 3, 3)
+    np.testing.assert_array_equal(powers.position[1], -x[:3])
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: Rn(-1), "`n` is the dimension"),
+        (lambda: Rn(2.0), "`n` is the dimension"),
+        (lambda: Product([SO3()]), "`groups` is a non-empty tuple"),
+        (lambda: Product(()), "`groups` is a non-empty tuple"),
+        (lambda: Product((SO3(), 3)), r"`groups\[1\]` is not a Lie group"),
+        (lambda: Power(SO3, 2), "`group` is not a Lie group"),
+        (lambda: Power(SO3(), 0), "`n` is the number of copies"),
+        (lambda: Product((SO3(), Rn(1))).exp(jnp.zeros(5)), r"expected \(4,\)"),
+    ],
+)
+def test_wrong_arguments_are_named(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
