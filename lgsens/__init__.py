@@ -1,0 +1,41 @@
+"""lgsens: differentiable constrained multibody dynamics on Lie groups in JAX.
+
+Bodies in absolute coordinates on a Lie group, joints as hard constraints, the Lie-group generalized-α integrator,
+and hand-derived derivatives of the trajectory: the direct differentiation method in forward mode, the adjoint
+variable method in reverse mode (Sonneville & Brüls, Sensitivity analysis for multibody systems formulated on a Lie
+group, Multibody System Dynamics, 2014). SI units; `jax.config.update("jax_enable_x64", True)` before use.
+"""
+
+from lgsens._errors import SimulationError as SimulationError
+from lgsens._simulate import (
+    equilibrium as equilibrium,
+    initial_state as initial_state,
+    simulate as simulate,
+)
+from lgsens._trajectory import BodyMotion as BodyMotion, Trajectory as Trajectory
+from lgsens.criteria import time_integral as time_integral
+from lgsens.dynamics import RESULTS as RESULTS, AbstractSystem as AbstractSystem, State as State
+from lgsens.integrate import GeneralizedAlpha as GeneralizedAlpha
+from lgsens.model import (
+    AppliedForce as AppliedForce,
+    BumpRoad as BumpRoad,
+    CylindricalJoint as CylindricalJoint,
+    DistanceJoint as DistanceJoint,
+    FixedJoint as FixedJoint,
+    FlatRoad as FlatRoad,
+    Gravity as Gravity,
+    Model as Model,
+    PrismaticJoint as PrismaticJoint,
+    RevoluteJoint as RevoluteJoint,
+    RigidBody as RigidBody,
+    SampledRoad as SampledRoad,
+    SphericalJoint as SphericalJoint,
+    SpringDamper as SpringDamper,
+    TyreSpring as TyreSpring,
+    UniversalJoint as UniversalJoint,
+    static_preload as static_preload,
+)
+from lgsens.sensitivity import (
+    AdjointVariable as AdjointVariable,
+    DirectDifferentiation as DirectDifferentiation,
+)

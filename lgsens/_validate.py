@@ -1,5 +1,6 @@
 """Checks of arguments: conversion to float leaves once, at construction, and clear errors."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -35,9 +36,12 @@ def is_concrete(*values: Any) -> bool:
     )
 
 
-def require(condition: Any, message: str, *values: Any) -> None:
-    """Raise `ValueError(message)` unless `condition()` holds; skipped while `values` are traced."""
-    if is_concrete(*values) and not bool(condition()):
+def require(condition: Callable[..., Any], message: str, *values: Any) -> None:
+    """Raise `ValueError(message)` unless `condition(*values)` holds; skipped while `values` are traced.
+
+    The condition sees NumPy arrays: inside `jit` JAX operations are traced even on concrete values.
+    """
+    if is_concrete(*values) and not bool(condition(*map(np.asarray, values))):
         raise ValueError(message)
 
 
@@ -70,7 +74,7 @@ def axis_field(name: str) -> Any:
     def convert(value: Any) -> Array:
         axis = as_float(value, (3,), f"`{name}`")
         require(
-            lambda: jnp.linalg.norm(axis) > 0,
+            lambda axis: np.linalg.norm(axis) > 0,
             f"`{name}` has zero length; give a direction, e.g. (0, 0, 1).",
             axis,
         )

@@ -1,4 +1,4 @@
-"""Matrix Lie groups: exponential, logarithm, tangent operator, and the linear maps the sensitivities need (paper, §2).
+"""Matrix Lie groups: exponential, logarithm, tangent operator, and their linear maps (paper, §2).
 
 Everything acts on one unbatched element; `jax.vmap` batches it.
 """

@@ -13,11 +13,12 @@ Element = Any
 
 
 class AbstractLieGroup(eqx.Module):
-    """A `k`-dimensional matrix Lie group `G`: what the integrator and the sensitivities know of the configuration space.
+    """A `k`-dimensional matrix Lie group `G`: all that the integrator knows of the configuration space.
 
-    Variations are left-invariant, `δq = q (δq)~` (eq. 3): coordinates `x, w` in `R^k` are those of the Lie algebra
-    and refer to the moving (body) frame. All methods act on one element, follow the dtype of their arguments and can
-    be differentiated twice everywhere they are smooth. A group is static data: its fields are hashable, it has no leaf.
+    Variations are left-invariant, `δq = q (δq)~` (eq. 3): coordinates `x, w` in `R^k` are those of the Lie
+    algebra, and rotational ones refer to the body frame. All methods act on one element, follow the dtype of
+    their arguments and can be differentiated twice wherever they are smooth. A group is static data: it is
+    hashable and has no leaf.
 
     Source: paper, §2 and §6.2; Brüls & Cardona 2010, §2.
     """
@@ -73,7 +74,7 @@ class AbstractLieGroup(eqx.Module):
 
     @abc.abstractmethod
     def tangent_mv(self, x: Float[Array, " k"], y: Float[Array, " k"]) -> Float[Array, " k"]:
-        """`T(x) y` with `q^{-1} dq = (T(x) dx)~` for `q = exp(x~)` (eq. 9). `x, y`: coordinates, shape (k,)."""
+        """`T(x) y`, where `q^{-1} dq = (T(x) dx)~` for `q = exp(x~)` (eq. 9). `x, y`: shape (k,)."""
 
     @abc.abstractmethod
     def tangent_rmv(self, x: Float[Array, " k"], y: Float[Array, " k"]) -> Float[Array, " k"]:
@@ -81,7 +82,7 @@ class AbstractLieGroup(eqx.Module):
 
     @abc.abstractmethod
     def tangent_inv_mv(self, x: Float[Array, " k"], y: Float[Array, " k"]) -> Float[Array, " k"]:
-        """`T(x)^{-1} y`, the inverse of `tangent_mv`, where `T(x)` is regular. `x, y`: coordinates, shape (k,)."""
+        """`T(x)^{-1} y`, the inverse of `tangent_mv`, where `T(x)` is regular. `x, y`: shape (k,)."""
 
     @abc.abstractmethod
     def to_ambient(self, q: Element, w: Float[Array, " k"]) -> Element:
@@ -91,7 +92,7 @@ class AbstractLieGroup(eqx.Module):
     def from_ambient(self, q: Element, dq: Element) -> Float[Array, " k"]:
         """The coordinates `w`, shape (k,), with `δq = q w~` (eq. 3).
 
-        `dq` has the structure of `q`. What round-off leaves in it outside the tangent space at `q` is projected away.
+        `dq` has the structure of `q`. What it holds outside the tangent space at `q` is projected away.
         """
 
     @final

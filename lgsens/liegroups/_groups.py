@@ -104,8 +104,8 @@ def _split(x):
 class R3xSO3(AbstractLieGroup):
     """The direct product `R^3 × SO(3)`, `k = 6`: an element is a `Pose`.
 
-    Coordinates are `[u, Ω]`: three of translation in the inertial frame (for a velocity `u = ẋ` [m/s]), then three of
-    rotation in the body frame (`Ω~ = R^T Ṙ` [rad/s]). Not SE(3): the exponential map does not couple the two.
+    Coordinates are `[u, Ω]`: three of translation in the inertial frame (for a velocity `u = ẋ` [m/s]), then
+    three of rotation in the body frame (`Ω~ = R^T Ṙ` [rad/s]). Not SE(3): `exp` does not couple the two.
 
     Source: paper, §3.2 and eq. (20); Brüls, Arnold & Cardona 2011.
     """

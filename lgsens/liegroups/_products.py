@@ -30,7 +30,7 @@ def _matrix_size(group):
 
 
 class Product(AbstractLieGroup):
-    """The direct product of groups: an element is the tuple of theirs, coordinates are concatenated in that order.
+    """The direct product of groups: an element is the tuple of theirs, coordinates are concatenated in order.
 
     Arguments: `groups`, a tuple of Lie groups.
     """
@@ -110,8 +110,8 @@ class Product(AbstractLieGroup):
 class Power(AbstractLieGroup):
     """The direct product of `n` copies of one group, each operation one `jax.vmap` over them.
 
-    An element is the group's pytree with a leading axis `n` on each leaf; coordinates, shape (n*d,), are those of the
-    copies one after the other, `x.reshape(n, d)`.
+    An element is the group's pytree with a leading axis `n` on each leaf; coordinates, shape (n*d,), are
+    `x.reshape(n, d)` read row by row.
 
     Arguments: `group`, a Lie group; `n`, the number of copies, an integer.
     """

@@ -8,17 +8,17 @@ from jaxtyping import Array, Float
 from ._base import AbstractLieGroup
 from ._coefficients import c1, c2, c3, horner, inverse_tangent_coefficient
 
-# arctan(√m)/√m = Σ_j (-m)^j / (2j+1). `_log` calls it with m ≤ tan²(π/16) = 0.0396, where the first term left out of
-# the second derivative, n (n-1) m^(n-2) / (2n+1), is 9e-17 for n = 14, against 2/5 for the derivative itself.
+# arctan(√m)/√m = Σ_j (-m)^j / (2j+1). `_log` calls it with m ≤ tan²(π/16) = 0.0396, where the first term left
+# out of the second derivative, n (n-1) m^(n-2) / (2n+1), is 9e-17 for n = 14, against 2/5 for the whole.
 _ARCTAN = tuple((-1) ** j / (2 * j + 1) for j in range(14))
 
 # (x~)_ij = Σ_k _SKEW[i, j, k] x_k: minus the permutation symbol.
 _EYE = np.eye(3)
 _SKEW = np.cross(_EYE[:, None, :], _EYE[None, :, :]).transpose(2, 1, 0)
 
-# 4 p pᵀ = I + Σ_kl _QUATERNION[:, :, k, l] R_kl for the unit quaternion p = (cos θ/2, sin θ/2 n) of the rotation R.
+# 4 p pᵀ = I + Σ_kl _QUATERNION[:, :, k, l] R_kl for the unit quaternion p = (cos θ/2, sin θ/2 n) of R.
 _QUATERNION = np.zeros((4, 4, 3, 3))
-_QUATERNION[0, 0] = np.eye(3)
+_QUATERNION[0, 0] = _EYE
 _QUATERNION[0, 1:] = _QUATERNION[1:, 0] = _SKEW.transpose(2, 0, 1)
 _QUATERNION[1:, 1:] = (
     _EYE[:, None, :, None] * _EYE[None, :, None, :] + _EYE[:, None, None, :] * _EYE[None, :, :, None]
@@ -48,8 +48,8 @@ def unskew(X: Float[Array, "3 3"]) -> Float[Array, "3"]:
 
 
 def _matmul(A, B):
-    # Matrices this small are faster as a fused sum of products than as a `dot`. Moreover a `dot` in float32 is
-    # rounded to TF32 on a GPU unless told otherwise: three digits, and a rotation would not stay one.
+    # Matrices this small are faster as a fused sum of products than as a `dot`. Moreover a `dot` in float32
+    # may be rounded to TF32 on a GPU: three digits, and a rotation would not stay one.
     return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)
 
 
@@ -69,8 +69,8 @@ def _exp(x):
 
 
 def _quaternion(R):
-    # 4 p pᵀ for the unit quaternion p = (cos θ/2, sin θ/2 n) is linear in R. Its row with the largest diagonal entry
-    # (≥ 1, Shepperd 1978) is p up to a factor, free of cancellation; normalizing it needs no other branch.
+    # The row of 4 p pᵀ with the largest diagonal entry (≥ 1, Shepperd 1978) is p up to a factor, free of
+    # cancellation; normalizing it needs no other branch.
     constant, linear = jnp.eye(4, dtype=R.dtype), jnp.asarray(_QUATERNION, R.dtype)
     rows = constant + jnp.sum(linear * R[None, None, :, :], axis=(2, 3))
     row = lax.dynamic_index_in_dim(rows, jnp.argmax(jnp.diagonal(rows)), keepdims=False)
@@ -79,8 +79,8 @@ def _quaternion(R):
 
 
 def _log(R):
-    # tan(φ/2) = tan φ / (1 + √(1 + tan² φ)), along the axis n: from the quaternion to tan(θ/4) n, tan(θ/8) n and
-    # tan(θ/16) n. There one short series serves all angles up to π: no switch, no singular square root.
+    # tan(φ/2) = tan φ / (1 + √(1 + tan² φ)), along the axis n: from the quaternion to tan(θ/4) n, tan(θ/8) n
+    # and tan(θ/16) n. There one short series serves all angles up to π: no switch, no singular square root.
     p = _quaternion(R)
     y = p[1:] / (1.0 + p[0])
     for _ in range(2):
@@ -111,14 +111,17 @@ class SO3(AbstractLieGroup):
         return q.T
 
     def exp(self, x):
-        """`R = I + sin θ/θ x~ + (1 - cos θ)/θ² x~²`, `θ = |x|` (Rodrigues). `x`: rotation vector [rad], shape (3,)."""
+        """`R = I + sin θ/θ x~ + (1 - cos θ)/θ² x~²` (Rodrigues), `θ = |x|`.
+
+        `x`: rotation vector [rad], shape (3,).
+        """
         return _exp(x)
 
     def log(self, q):
         """The rotation vector [rad], shape (3,), `|x| ≤ π`, with `exp(x~) = q`.
 
-        To round-off (absolute near `π`, relative near 0). At an angle of exactly `π` both `x` and `-x` are right; this
-        is one of the two, and there the map jumps from one to the other.
+        Accurate to round-off, absolute near `π` and relative near 0. At an angle of exactly `π` both `x` and
+        `-x` are right: this is one of the two, and there the map jumps from one to the other.
         """
         return _log(q)
 
@@ -164,5 +167,5 @@ class SO3(AbstractLieGroup):
         return _matmul(q, skew(w))
 
     def from_ambient(self, q, dq):
-        """`w = unskew(R^T dR)`: the skew-symmetric part, hence the orthogonal projection on the tangent space."""
+        """`w = unskew(R^T dR)`: the skew part, hence the orthogonal projection on the tangent space."""
         return unskew(_matmul(q.T, dq))

@@ -44,3 +44,4 @@ from lgsens.model._roads import (
     SampledRoad as SampledRoad,
 )
 from lgsens.model._system import MultibodySystem as MultibodySystem
+from lgsens.model._trim import static_preload as static_preload

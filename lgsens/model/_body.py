@@ -59,19 +59,19 @@ class RigidBody(eqx.Module):
                 f"centre of mass, shape (3, 3), got shape {self.inertia.shape}."
             )
         require(
-            lambda: self.mass > 0 and jnp.isfinite(self.mass),
+            lambda mass: mass > 0 and np.isfinite(mass),
             f"RigidBody: `mass` must be positive, got {self.mass} kg.",
             self.mass,
         )
         require(
-            lambda: _is_physical(self.inertia),
+            _is_physical,
             f"RigidBody: `inertia` {self.inertia} kg m² is not the inertia of a body: it must be symmetric and "
             "positive definite, and each principal moment at most the sum of the other two (check units, "
             "axes and the centre of mass).",
             self.inertia,
         )
         require(
-            lambda: _is_rotation(self.orientation),
+            _is_rotation,
             "RigidBody: `orientation` must be a rotation matrix (RᵀR = I, det R = 1); its columns are the "
             "body's axes in the inertial frame.",
             self.orientation,

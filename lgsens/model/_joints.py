@@ -10,6 +10,7 @@ import abc
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import axis_field, number_field, point_field, require
@@ -140,10 +141,7 @@ class UniversalJoint(AbstractJoint):
 
     def __check_init__(self):
         require(
-            lambda: (
-                jnp.linalg.norm(jnp.cross(self.axis_a, self.axis_b))
-                > 1e-6 * jnp.linalg.norm(self.axis_a) * jnp.linalg.norm(self.axis_b)
-            ),
+            lambda a, b: np.linalg.norm(np.cross(a, b)) > 1e-6 * np.linalg.norm(a) * np.linalg.norm(b),
             f"UniversalJoint: `axis_a` {self.axis_a} and `axis_b` {self.axis_b} are parallel; "
             "the arms of the cross must be orthogonal.",
             self.axis_a,
@@ -265,7 +263,7 @@ class DistanceJoint(AbstractJoint):
 
     def __check_init__(self):
         require(
-            lambda: jnp.linalg.norm(self.at_b - self.at_a) > 0,
+            lambda a, b: np.linalg.norm(b - a) > 0,
             f"DistanceJoint: `at_a` and `at_b` coincide at {self.at_a}, so the rod has no direction; "
             "use a SphericalJoint, or move one end.",
             self.at_a,
@@ -273,7 +271,7 @@ class DistanceJoint(AbstractJoint):
         )
         if self.length is not None:
             require(
-                lambda: self.length > 0,
+                lambda length: length > 0,
                 f"DistanceJoint: `length` must be positive, got {self.length} m.",
                 self.length,
             )

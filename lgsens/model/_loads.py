@@ -96,7 +96,7 @@ class SpringDamperLoad(AbstractClosedFormLoad):
         length = jnp.where(meet, 0.0, jnp.sqrt(jnp.where(meet, 1.0, square)))
         return d / jnp.where(meet, 1.0, length), length, gradient, jnp.where(meet, 1.0, length)
 
-    def line_force(self, a, b, va, vb) -> LineForce:
+    def measure(self, a, b, va, vb, t) -> LineForce:
         n, length, gradient, _ = self._geometry(a, b)
         rate = jnp.dot(n, gradient @ jnp.concatenate([va, vb]))
         tension = self.preload + self.stiffness * (length - self.free_length) + self.damping * rate
@@ -104,11 +104,11 @@ class SpringDamperLoad(AbstractClosedFormLoad):
 
     def force(self, a, b, va, vb, t):
         n, _, gradient, _ = self._geometry(a, b)
-        return -(self.line_force(a, b, va, vb).tension * n) @ gradient
+        return -(self.measure(a, b, va, vb, t).tension * n) @ gradient
 
     def tangents(self, a, b, va, vb, t):
         n, _, gradient, divisor = self._geometry(a, b)
-        tension = self.line_force(a, b, va, vb).tension
+        tension = self.measure(a, b, va, vb, t).tension
         along = n @ gradient
         speed = gradient @ jnp.concatenate([va, vb])
         turning = jnp.zeros((3, 12), n.dtype)
@@ -139,7 +139,7 @@ class TyreLoad(AbstractClosedFormLoad):
     preload: Float[Array, ""]
     road: AbstractSignal
 
-    def normal_force(self, b: Frame, t) -> Float[Array, ""]:
+    def measure(self, a, b, va, vb, t) -> Float[Array, ""]:
         return self.preload + self.stiffness * (
             self.road(t) + self.free_radius - b.point(self.point_b)[2]
         )
@@ -149,11 +149,11 @@ class TyreLoad(AbstractClosedFormLoad):
         return gradient[2].at[: BODY_B.start].set(0.0)
 
     def force(self, a, b, va, vb, t):
-        return self.normal_force(b, t) * self._vertical(a, b)
+        return self.measure(a, b, va, vb, t) * self._vertical(a, b)
 
     def tangents(self, a, b, va, vb, t):
         vertical = self._vertical(a, b)
-        force = self.normal_force(b, t) * jnp.asarray([0.0, 0.0, 1.0], vertical.dtype)
+        force = self.measure(a, b, va, vb, t) * jnp.asarray([0.0, 0.0, 1.0], vertical.dtype)
         geometric = separation_stiffness(a, b, jnp.zeros_like(self.point_b), self.point_b, force)
         return LoadTangents(geometric - self.stiffness * jnp.outer(vertical, vertical), None)
 

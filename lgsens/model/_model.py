@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from lgsens._validate import is_concrete
 from lgsens.liegroups import Pose
@@ -73,7 +74,7 @@ class Model(eqx.Module):
                 one, other = self.joints[first], self.joints[second]
                 same_type = type(one) is type(other) and {one.a, one.b} == {other.a, other.b}
                 if same_type and is_concrete(one, other):
-                    if all(jnp.array_equal(x, y) for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other))):
+                    if all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other))):
                         raise ValueError(
                             f"Joints {first!r} and {second!r} are the same {type(one).__name__} between "
                             f"{one.a!r} and {one.b!r} at the same place; remove one of them."

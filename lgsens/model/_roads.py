@@ -4,6 +4,7 @@ import abc
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, number_field, require
@@ -48,7 +49,7 @@ class BumpRoad(AbstractSignal):
 
     def __check_init__(self):
         require(
-            lambda: self.duration > 0,
+            lambda duration: duration > 0,
             f"BumpRoad: `duration` must be positive, got {self.duration} s.",
             self.duration,
         )
@@ -82,7 +83,7 @@ class SampledRoad(AbstractSignal):
                 f"{self.times.shape} and {self.heights.shape}."
             )
         require(
-            lambda: jnp.all(jnp.diff(self.times) > 0),
+            lambda times: np.all(np.diff(times) > 0),
             "SampledRoad: `times` must increase from sample to sample; sort them and drop duplicates.",
             self.times,
         )

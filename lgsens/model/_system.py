@@ -6,10 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lgsens._validate import suggestion
 from lgsens.dynamics import AbstractSystem, Tangents
 from lgsens.liegroups import Pose, Power, R3xSO3, skew
 from lgsens.model._constraints import AbstractConstraint
-from lgsens.model._frames import ROTATION, Frame
+from lgsens.model._frames import ROTATION
 from lgsens.model._loads import AbstractLoad
 from lgsens.model._stack import (
     BODY_DIM,
@@ -162,7 +163,28 @@ class MultibodySystem(AbstractSystem):
         stiffness_matrix = self._matrix(stiffness) if stiffness else jnp.zeros((k, k), self.mass.dtype)
         return Tangents(stiffness_matrix, self._matrix(damping), self.constraint_jacobian(q))
 
-    def body_frame(self, q, name: str) -> Frame:
-        """The pose of one body in configuration `q`."""
-        index = self.body_names.index(name)
-        return Frame(q.position[index], q.orientation[index])
+    def measure(self, force: str, q, v, t):
+        """What the force element `force` measures at each of the stacked poses, velocities and times.
+
+        The `measure` of its load if it has one, else its generalized force.
+        """
+        found = [(stack, i) for stack in self.loads for i, owner in enumerate(stack.owners) if owner == force]
+        if not found:
+            known = {owner for stack in self.loads for owner in stack.owners}
+            raise ValueError(f"`force`: {suggestion(force, known)}.")
+        if len(found) > 1:
+            raise ValueError(f"`force`: {force!r} acts on {len(found)} bodies and has no single value.")
+        stack, i = found[0]
+        load = jax.tree.map(lambda leaf: leaf[i], stack.elements)
+        single = Stack(
+            elements=jax.tree.map(lambda leaf: leaf[None], load),
+            a=None if stack.a is None else (stack.a[i],),
+            b=None if stack.b is None else (stack.b[i],),
+            owners=(force,),
+        )
+
+        def at_time(q, v, t):
+            evaluate = lambda e, *args: getattr(e, "measure", e.force)(*args)  # noqa: E731
+            return single.map(evaluate, q, v.reshape(-1, BODY_DIM), extra=(t,))
+
+        return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(at_time)(q, v, t))

@@ -1,0 +1,96 @@
+"""Failures are data inside a trace; here they become exceptions, with the step, the time and advice."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from lgsens.dynamics import RESULTS
+
+
+class SimulationError(RuntimeError):
+    """A simulation or an equilibrium that failed; the message says at which step, when, and what to try."""
+
+
+def redundant_names(jacobian: np.ndarray, names: tuple[str, ...]) -> list[str]:
+    """The joints whose rows of B are linearly dependent: those with weight in the left null space of B."""
+    rows = jacobian / np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), np.finfo(jacobian.dtype).tiny)
+    left, singular, _ = np.linalg.svd(rows)
+    threshold = np.sqrt(np.finfo(jacobian.dtype).eps)
+    rank = int(np.sum(singular > threshold))
+    weight = np.abs(left[:, rank:]).max(axis=1, initial=0.0)
+    return sorted({name for name, w in zip(names, weight) if w > threshold})
+
+
+def describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> str:
+    """The message of a failure; `details` are those that `details_of` collects."""
+    code = RESULTS(result)
+    if code is RESULTS.assembly_failed:
+        violation = np.abs(details["violation"])
+        worst = int(np.argmax(np.where(np.isfinite(violation), violation, np.inf)))
+        return f"{code.message} Left over: |Φ| = {violation[worst]:.3g}, largest in joint {names[worst]!r}."
+    if code is RESULTS.redundant_constraints:
+        return f"{code.message} Joints involved: {redundant_names(details['jacobian'], names)}."
+    if code is RESULTS.newton_failed:
+        step = int(details["step"])
+        return (
+            f"{code.message} It failed at step {step} of {int(details['num_steps'])}, t = {details['time']:.6g} s, after "
+            f"{int(details['iterations'])} iterations: last increment {details['increment']:.3g} (tolerance "
+            f"{details['tolerance']:.3g}), residual {details['residual']:.3g}. "
+            "`throw=False` returns the data up to the step before."
+        )
+    return code.message
+
+
+def _exception(result: int, details: dict[str, Any], names: tuple[str, ...]) -> Exception:
+    bad_input = (RESULTS.assembly_failed, RESULTS.redundant_constraints)
+    kind = ValueError if result in bad_input else SimulationError
+    return kind(describe(result, details, names))
+
+
+def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tuple[str, ...]) -> Any:
+    """`tree` unchanged, unless `result` is a failure: then raise, now or, inside a trace, when it runs.
+
+    Inside a trace the exception is JAX's runtime error with the same message. The callback runs only in the
+    failing branch (under `vmap`, always, and names the first lane that failed).
+    """
+
+    def host(result, details) -> np.ndarray:
+        codes = np.asarray(result)
+        failed = np.argwhere(codes != RESULTS.successful)
+        if failed.size:
+            lane = tuple(failed[0])
+            message_details = {key: np.asarray(value)[lane] for key, value in details.items()}
+            raise _exception(int(codes[lane]), message_details, names)
+        return np.ones(codes.shape, bool)
+
+    if not isinstance(result, jax.core.Tracer):
+        # Details may be traced (by grad) where the result is not; their values are all that is needed.
+        if int(result) != RESULTS.successful:
+            values = {key: np.asarray(_value(value)) for key, value in details.items()}
+            raise _exception(int(result), values, names)
+        return tree
+
+    def fail(operands):
+        shape = jax.ShapeDtypeStruct((), bool)
+        return jax.pure_callback(host, shape, *operands, vmap_method="broadcast_all")
+
+    operands = lax.stop_gradient((result, details))
+    passed = lax.cond(result != RESULTS.successful, fail, lambda _: jnp.ones((), bool), operands)
+    return jax.tree.map(lambda leaf: _poisoned(passed, leaf), tree)
+
+
+def _value(array: Any) -> Any:
+    while isinstance(array, jax.core.Tracer) and hasattr(array, "primal"):
+        array = array.primal
+    return array
+
+
+def _poisoned(passed, leaf):
+    """`leaf`, made to depend on the callback so that it is not removed."""
+    return jnp.where(passed, leaf, jnp.nan) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+
+

@@ -1,0 +1,179 @@
+"""`simulate`, `initial_state` and `equilibrium`: the model in, a trajectory or a state out."""
+
+import operator
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from lgsens._errors import throw_if_failed
+from lgsens._trajectory import Trajectory
+from lgsens._validate import as_float, require
+from lgsens.dynamics import RESULTS, AbstractSystem, Initial, State, equilibrium as _equilibrium, initial_state as _initial
+from lgsens.integrate import GeneralizedAlpha
+from lgsens.model import Model
+from lgsens.sensitivity import AbstractSensitivity, DirectDifferentiation, Parameters
+
+
+def _as_system(model: Model | AbstractSystem) -> AbstractSystem:
+    if isinstance(model, Model):
+        return model.system()
+    if isinstance(model, AbstractSystem):
+        return model
+    raise ValueError(f"`model` must be a Model or an AbstractSystem, got {type(model).__name__}.")
+
+
+def _warn_of_single_precision(system: AbstractSystem) -> None:
+    if jax.tree.leaves(system)[0].dtype == jnp.float32:
+        warnings.warn(
+            "lgsens runs in single precision: positions carry seven digits, accelerations lose them as 1/h². Call "
+            'jax.config.update("jax_enable_x64", True) before the model is built.',
+            stacklevel=3,
+        )
+
+
+def initial_state(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) -> State:
+    """The consistent initial state of a model: q, v, v̇, λ, and a = v̇ (paper eqs. 18–19).
+
+    The reference configuration is assembled if a joint asks for it (a `DistanceJoint` with a length), velocities
+    are projected on those that the joints allow, accelerations and multipliers solve
+
+        [[M, Bᵀ], [B, 0]] [v̇; λ] = [−f + ad(v)ᵀMv; −Ḃ v].
+
+    Arguments:
+        model: the scene, or an `AbstractSystem`.
+        t0: initial time [s], shape ().
+        throw: raise if the mechanism cannot be assembled or has redundant constraints.
+
+    Differentiable, by the implicit function theorem. Raises `ValueError` as said under `throw`; inside
+    `jit`, JAX's runtime error with the same message.
+    """
+    system = _as_system(model)
+    t0 = as_float(t0, (), "`t0`")
+    initial = _initial_jit(system, t0)
+    return _checked(system, initial, throw)
+
+
+def equilibrium(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) -> State:
+    """The static equilibrium near the reference configuration: f(q, 0, t0) + Bᵀλ = 0, Φ(q) = 0.
+
+    Arguments:
+        model: the scene, or an `AbstractSystem`. Its velocities are ignored.
+        t0: the time at which time-dependent forces are taken [s], shape ().
+        throw: raise if no equilibrium is found.
+
+    Returns the state at rest there, to be used as `state0` of `simulate`. Differentiable, by the implicit
+    function theorem; where a body turns freely (a wheel on its hinge) both the state and its derivative are
+    those closest to the reference. Raises `SimulationError` if none is found; inside `jit`, JAX's runtime
+    error with the same message.
+    """
+    system = _as_system(model)
+    t0 = as_float(t0, (), "`t0`")
+    return _checked(system, _equilibrium_jit(system, t0), throw)
+
+
+@eqx.filter_jit
+def _initial_jit(system, t0) -> Initial:
+    return _initial(system, t0)
+
+
+@eqx.filter_jit
+def _equilibrium_jit(system, t0) -> Initial:
+    return _equilibrium(system, t0)
+
+
+def _checked(system: AbstractSystem, initial: Initial, throw: bool) -> State:
+    if not throw:
+        return initial.state
+    details = {"violation": initial.violation, "jacobian": system.constraint_jacobian(initial.state.q)}
+    return throw_if_failed(initial.state, initial.result, details, system.constraint_names)
+
+
+def simulate(
+    model: Model | AbstractSystem,
+    *,
+    t0=0.0,
+    t1,
+    num_steps: int,
+    integrator: GeneralizedAlpha = GeneralizedAlpha(),
+    sensitivity: AbstractSensitivity = DirectDifferentiation(),
+    state0: State | None = None,
+    throw: bool = True,
+) -> Trajectory:
+    """Integrate the motion of a model from t0 to t1 with the Lie-group generalized-α scheme (paper §4).
+
+    Arguments:
+        model: the scene, or an `AbstractSystem`.
+        t0, t1: initial and final time [s], shape (); t1 > t0.
+        num_steps: number of steps of equal size h = (t1 − t0)/num_steps; a Python int.
+        integrator: the scheme and its Newton settings.
+        sensitivity: how the trajectory is differentiated. `DirectDifferentiation` supports every JAX
+            transformation; `AdjointVariable` is reverse mode only.
+        state0: the state at t0, used as it is: one of `equilibrium`, or `Trajectory.state` to continue. None: the
+            consistent initial state of the model.
+        throw: raise if the simulation fails. With False `Trajectory.result` says so, and the data are
+            finite up to the failure and NaN from there on.
+
+    The derivative of the trajectory with respect to every number of the model, the initial state and the
+    times is that of the numerical solution, to round-off.
+
+    Raises `ValueError` for bad arguments, a mechanism that cannot be assembled or has redundant constraints,
+    and `SimulationError` for a step that does not converge; inside `jit`, JAX's runtime error with the
+    same message. Source: Sonneville & Brüls (2014), §4 and §6.2.
+    """
+    system = _as_system(model)
+    _warn_of_single_precision(system)
+    if not isinstance(integrator, GeneralizedAlpha):
+        raise ValueError(f"`integrator` must be a GeneralizedAlpha, got {integrator!r}.")
+    if not isinstance(sensitivity, AbstractSensitivity):
+        raise ValueError(f"`sensitivity` must be DirectDifferentiation() or AdjointVariable(), got {sensitivity!r}.")
+    try:
+        num_steps = operator.index(num_steps)
+    except TypeError as error:
+        raise ValueError(f"`num_steps` must be a Python int (it is static), got {num_steps!r}.") from error
+    if num_steps < 1:
+        raise ValueError(f"`num_steps` must be at least 1, got {num_steps}.")
+    t0, t1 = as_float(t0, (), "`t0`"), as_float(t1, (), "`t1`")
+    require(lambda t0, t1: t1 > t0, f"`t1` must be later than `t0`, got t0 = {t0} s and t1 = {t1} s.", t0, t1)
+    trajectory, details = _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0)
+    if throw:
+        trajectory = throw_if_failed(trajectory, trajectory.result, details, system.constraint_names)
+    return trajectory
+
+
+@eqx.filter_jit
+def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0):
+    h = (t1 - t0) / num_steps
+    if state0 is None:
+        initial = _initial(system, t0)
+        state0 = _started(integrator, initial, h)
+        result, violation = initial.result, initial.violation
+    else:
+        result, violation = jnp.zeros((), jnp.int32), system.constraint(state0.q)
+    states, stats = sensitivity.trajectory(integrator, num_steps, state0, Parameters(system, t0, h))
+    failed = jnp.argmin(stats.converged)  # the first step that did not converge, 0 if all did
+    newton = jnp.where(jnp.all(stats.converged), RESULTS.successful, RESULTS.newton_failed)
+    result = jnp.where(result == RESULTS.successful, newton, result).astype(jnp.int32)
+    count = jnp.arange(num_steps + 1, dtype=h.dtype)
+    trajectory = Trajectory(t=t0 + count * h, states=states, result=result, stats=stats, system=system)
+    details = {
+        "violation": violation,
+        "jacobian": system.constraint_jacobian(state0.q),
+        "step": failed + 1,
+        "num_steps": jnp.asarray(num_steps),
+        "time": trajectory.t[failed + 1],
+        "iterations": stats.iterations[failed],
+        "increment": stats.increment[failed],
+        "residual": stats.residual[failed],
+        "tolerance": jnp.asarray(integrator.tolerance),
+    }
+    return trajectory, jax.lax.stop_gradient(details)
+
+
+def _started(integrator: GeneralizedAlpha, initial: Initial, h) -> State:
+    """The initial state with its auxiliary acceleration a₀; see `GeneralizedAlpha.second_order_start`."""
+    if not integrator.second_order_start:
+        return initial.state
+    shift = (integrator.alpha_m - integrator.alpha_f) * h
+    return eqx.tree_at(lambda state: state.a, initial.state, initial.state.vdot + shift * initial.jerk)

@@ -1,0 +1,100 @@
+"""The result of a simulation."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from lgsens._validate import suggestion
+from lgsens.dynamics import AbstractSystem, State
+from lgsens.integrate import Stats
+from lgsens.model import MultibodySystem
+
+
+class BodyMotion(NamedTuple):
+    """The motion of one body; every array has a leading axis over the n + 1 times.
+
+    Attributes:
+        position: centre of mass [m], inertial frame, shape (n+1, 3).
+        orientation: rotation matrix, body to inertial frame, shape (n+1, 3, 3).
+        velocity: velocity of the centre of mass [m/s], inertial frame, shape (n+1, 3).
+        angular_velocity: Ω [rad/s], body frame, shape (n+1, 3).
+        acceleration: acceleration of the centre of mass [m/s²], inertial frame, shape (n+1, 3).
+        angular_acceleration: Ω̇ [rad/s²], body frame, shape (n+1, 3).
+    """
+
+    position: Float[Array, "n 3"]
+    orientation: Float[Array, "n 3 3"]
+    velocity: Float[Array, "n 3"]
+    angular_velocity: Float[Array, "n 3"]
+    acceleration: Float[Array, "n 3"]
+    angular_acceleration: Float[Array, "n 3"]
+
+    def point(self, at) -> Float[Array, "n 3"]:
+        """The path [m], inertial frame, of the body's point that is at `at` (inertial frame, shape (3,)) at first."""
+        local = self.orientation[0].T @ (jnp.asarray(at, self.position.dtype) - self.position[0])
+        return self.position + self.orientation @ local
+
+
+class Trajectory(eqx.Module):
+    """A simulated motion, a pytree like every other: criteria of it are differentiated as usual.
+
+    Attributes:
+        t: the times t0 + n h [s], shape (n+1,).
+        states: the states, stacked along a leading axis.
+        result: a value of `RESULTS`, shape (), int32; 0 is success.
+        stats: Newton's iterations, increments and residuals.
+        system: the equations that were integrated.
+    """
+
+    t: Float[Array, " n+1"]
+    states: State
+    result: Int[Array, ""]
+    stats: Stats
+    system: AbstractSystem
+
+    def _multibody(self) -> MultibodySystem:
+        if not isinstance(self.system, MultibodySystem):
+            raise ValueError(
+                f"This trajectory is one of a {type(self.system).__name__}, which has no named bodies, joints or "
+                "forces; use `states`."
+            )
+        return self.system
+
+    def body(self, name: str) -> BodyMotion:
+        """The motion of the body `name`. Raises `ValueError` for an unknown name."""
+        system = self._multibody()
+        if name not in system.body_names:
+            raise ValueError(f"`body`: {suggestion(name, system.body_names)}.")
+        index = system.body_names.index(name)
+        count = len(system.body_names)
+        states = self.states
+        v, vdot = (x.reshape(x.shape[0], count, 2, 3)[:, index] for x in (states.v, states.vdot))
+        return BodyMotion(
+            states.q.position[:, index], states.q.orientation[:, index], v[:, 0], v[:, 1], vdot[:, 0], vdot[:, 1]
+        )
+
+    def multiplier(self, joint: str) -> Float[Array, "n+1 rows"]:
+        """The Lagrange multipliers of a joint, shape (n+1, its equations); the joint says what they mean.
+
+        Raises `ValueError` for an unknown name.
+        """
+        system = self._multibody()
+        if joint not in system.constraint_names:
+            raise ValueError(f"`multiplier`: {suggestion(joint, set(system.constraint_names))}.")
+        return self.states.lam[:, system.multiplier_rows(joint)]
+
+    def force(self, name: str) -> Any:
+        """What a force element measures over the trajectory, every array with a leading axis n + 1.
+
+        A `SpringDamper` gives its `LineForce` (length [m], rate [m/s], tension [N]), a `TyreSpring` its normal
+        force [N], shape (n+1,); other elements the generalized force [F_a, M_a, F_b, M_b] that they apply.
+        Raises `ValueError` for an unknown name, or one of several loads (gravity).
+        """
+        return self._multibody().measure(name, self.states.q, self.states.v, self.t)
+
+    def state(self, index: int) -> State:
+        """The state at step `index` (negative: from the end), from which a simulation can be continued."""
+        return jax.tree.map(lambda leaf: leaf[index], self.states)

@@ -1,0 +1,267 @@
+"""The quarter-car of the paper's §9 with a real five-link rear suspension."""
+
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens._validate import as_float
+from lgsens.model import (
+    BumpRoad,
+    FixedJoint,
+    Gravity,
+    Model,
+    PrismaticJoint,
+    RevoluteJoint,
+    RigidBody,
+    SphericalJoint,
+    SpringDamper,
+    TyreSpring,
+    UniversalJoint,
+    static_preload,
+)
+
+GRAVITY = 9.81  # m/s²
+
+
+class Link(eqx.Module):
+    """A rigid bar: universal joint at the chassis, spherical joint at the knuckle; points [m], mass [kg]."""
+
+    chassis: Float[Array, "3"]
+    knuckle: Float[Array, "3"]
+    mass: Float[Array, ""]
+
+
+class Strut(eqx.Module):
+    """Where a spring or a damper acts: between a link and the chassis; points [m], rate [N/m] or [N s/m]."""
+
+    link: str = eqx.field(static=True)
+    link_point: Float[Array, "3"]
+    chassis_point: Float[Array, "3"]
+    rate: Float[Array, ""]
+
+
+class Part(eqx.Module):
+    """A body: centre of mass [m], mass [kg], principal moments about the axes of the file [kg m²]."""
+
+    centre: Float[Array, "3"]
+    mass: Float[Array, ""]
+    inertia: Float[Array, "3"]
+
+
+class QuarterCar(eqx.Module):
+    """A quarter-car with a five-link suspension: its data, all numbers leaves. `QuarterCar.load()` reads them.
+
+    Five links, knuckle, wheel and chassis are eight rigid bodies. Each link has a universal joint at the
+    chassis and a spherical joint at the knuckle; the wheel turns on a hinge of the knuckle or is locked to it;
+    the chassis heaves only. With 48 coordinates and 45 (46) constraints the mechanism has 3 (2) degrees of
+    freedom. Frame: x forward, y left, z up; SI units.
+
+    Source: Sonneville & Brüls (2014), §9; hardpoints, masses and rates from BPMinaker/eom_pkg,
+    input_5link.m (R. Rieveley 2009).
+    """
+
+    name: str = eqx.field(static=True)
+    links: dict[str, Link]
+    knuckle: Part
+    wheel: Part
+    chassis: Part
+    bearing: Float[Array, "3"]
+    spring: Strut
+    damper: Strut
+    tyre_stiffness: Float[Array, ""]
+    link_radius: Float[Array, ""]
+    bump_height: Float[Array, ""]
+    bump_duration: Float[Array, ""]
+
+    @staticmethod
+    def load(path: str | Path | None = None) -> "QuarterCar":
+        """Read a suspension from a TOML file; None: the one that ships with lgsens.
+
+        The shipped file, `lgsens/examples/data/five_link_suspension.toml`, shows the format. Raises `ValueError`
+        naming the file and the key (or the line) for a file that cannot be read or is incomplete.
+        """
+        if path is None:
+            source = resources.files("lgsens.examples") / "data" / "five_link_suspension.toml"
+            return _parse(source.read_text(encoding="utf-8"), "five_link_suspension.toml")
+        try:
+            text = Path(path).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise ValueError(f"Hardpoint file {str(path)!r} cannot be read: {error}.") from error
+        return _parse(text, str(path))
+
+    def model(self, *, wheel: str = "hinged", free_length=None, free_radius=None) -> Model:
+        """The scene at rest on its springs at the design position, a bump ahead.
+
+        Arguments:
+            wheel: "hinged" (45 constraints, 3 degrees of freedom) or "locked" (46 and 2).
+            free_length: free length of the spring [m]. None: the preloads of spring and tyre are those that hold
+                the car at the design position, whatever the parameters, and so are their derivatives.
+            free_radius: free radius of the tyre [m], with `free_length`.
+
+        Raises `ValueError` for an unknown kind of wheel.
+        """
+        if wheel not in ("hinged", "locked"):
+            raise ValueError(f"`wheel` must be 'hinged' or 'locked', got {wheel!r}.")
+        frozen = free_length is not None
+        bodies = {
+            "chassis": _body(self.chassis),
+            "knuckle": _body(self.knuckle),
+            "wheel": _body(self.wheel),
+        } | {name: _bar(link, self.link_radius) for name, link in self.links.items()}
+        along_x = jnp.asarray([1.0, 0.0, 0.0], self.bearing.dtype)
+        along_y = jnp.asarray([0.0, 1.0, 0.0], self.bearing.dtype)
+        along_z = jnp.asarray([0.0, 0.0, 1.0], self.bearing.dtype)
+        joints: dict[str, Any] = {
+            "heave": PrismaticJoint(None, "chassis", at=self.chassis.centre, axis=along_z),
+            "hub": RevoluteJoint("knuckle", "wheel", at=self.bearing, axis=along_y)
+            if wheel == "hinged"
+            else FixedJoint("knuckle", "wheel", at=self.bearing),
+        }
+        for name, link in self.links.items():
+            joints[f"{name}_chassis"] = UniversalJoint(
+                "chassis",
+                name,
+                at=link.chassis,
+                axis_a=along_x,
+                axis_b=jnp.cross(along_x, link.knuckle - link.chassis),
+            )
+            joints[f"{name}_knuckle"] = SphericalJoint("knuckle", name, at=link.knuckle)
+        spring, damper = self.spring, self.damper
+        forces = {
+            "gravity": Gravity(-GRAVITY * along_z),
+            "spring": SpringDamper(
+                spring.link,
+                "chassis",
+                at_a=spring.link_point,
+                at_b=spring.chassis_point,
+                stiffness=spring.rate,
+                free_length=free_length,
+            ),
+            "damper": SpringDamper(
+                damper.link,
+                "chassis",
+                at_a=damper.link_point,
+                at_b=damper.chassis_point,
+                stiffness=jnp.zeros_like(damper.rate),
+                damping=damper.rate,
+            ),
+            "tyre": TyreSpring(
+                "wheel",
+                at=self.wheel.centre,
+                stiffness=self.tyre_stiffness,
+                free_radius=free_radius,
+                road=BumpRoad(height=self.bump_height, duration=self.bump_duration),
+            ),
+        }
+        model = Model(bodies, joints, forces)
+        return model if frozen else static_preload(model, ("spring", "tyre"))[0]
+
+
+def _body(part: Part) -> RigidBody:
+    return RigidBody(mass=part.mass, inertia=part.inertia, position=part.centre)
+
+
+def _bar(link: Link, radius) -> RigidBody:
+    """A uniform round bar between its two ends: m r²/2 about its axis, m L²/12 + m r²/4 across."""
+    direction = link.knuckle - link.chassis
+    square = jnp.dot(direction, direction)
+    along = jnp.outer(direction, direction) / square
+    across = jnp.eye(3, dtype=square.dtype) - along
+    inertia = link.mass * (radius**2 / 2 * along + (square / 12 + radius**2 / 4) * across)
+    return RigidBody(mass=link.mass, inertia=inertia, position=(link.knuckle + link.chassis) / 2)
+
+
+class _Reader:
+    """Reads keys of a TOML document, and says which one is missing or wrong."""
+
+    def __init__(self, table: dict, path: str, keys: tuple[str, ...] = ()):
+        self._table, self._path, self._keys = table, path, keys
+
+    def _fail(self, key: str, why: str) -> ValueError:
+        return ValueError(f"Hardpoint file {self._path!r}, key {'.'.join((*self._keys, key))!r}: {why}")
+
+    def _get(self, key: str) -> Any:
+        if key not in self._table:
+            raise self._fail(key, "is missing; see lgsens/examples/data/five_link_suspension.toml for the format.")
+        return self._table[key]
+
+    def table(self, key: str) -> "_Reader":
+        value = self._get(key)
+        if not isinstance(value, dict):
+            raise self._fail(key, f"must be a table, got {value!r}.")
+        return _Reader(value, self._path, (*self._keys, key))
+
+    def names(self) -> list[str]:
+        return list(self._table)
+
+    def number(self, key: str, scale: float = 1.0, positive: bool = True) -> Array:
+        value = self._get(key)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self._fail(key, f"must be a number, got {value!r}.")
+        if positive and not value > 0:
+            raise self._fail(key, f"must be positive, got {value!r}.")
+        return as_float(value * scale, (), key)
+
+    def vector(self, key: str, scale: float = 1.0) -> Array:
+        value = self._get(key)
+        is_number = [isinstance(x, int | float) and not isinstance(x, bool) for x in value] if isinstance(value, list) else []
+        if len(is_number) != 3 or not all(is_number):
+            raise self._fail(key, f"must be three numbers [x, y, z], got {value!r}.")
+        return as_float([x * scale for x in value], (3,), key)
+
+    def choice(self, key: str, known) -> str:
+        value = self._get(key)
+        if value not in known:
+            raise self._fail(key, f"must be one of {sorted(known)}, got {value!r}.")
+        return value
+
+
+def _parse(text: str, path: str) -> QuarterCar:
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"Hardpoint file {path!r} is not valid TOML: {error}.") from error
+    root = _Reader(document, path)
+    units = root.table("units")
+    metre, kilogram = float(units.number("length")), float(units.number("mass"))
+    table = root.table("links")
+    if len(table.names()) != 5:
+        raise ValueError(f"Hardpoint file {path!r}, key 'links': five links are needed, got {sorted(table.names())}.")
+    links = {}
+    for name in table.names():
+        link = table.table(name)
+        links[name] = Link(link.vector("chassis", metre), link.vector("knuckle", metre), link.number("mass", kilogram))
+
+    def part(key: str, centre: str) -> Part:
+        body = root.table(key)
+        return Part(body.vector(centre, metre), body.number("mass", kilogram), body.vector("inertia"))
+
+    def strut(key: str, rate: str) -> Strut:
+        element = root.table(key)
+        return Strut(
+            element.choice("link", links),
+            element.vector("link_point", metre),
+            element.vector("chassis_point", metre),
+            element.number(rate),
+        )
+
+    bump = root.table("bump")
+    return QuarterCar(
+        name=str(document.get("name", Path(path).stem)),
+        links=links,
+        knuckle=part("knuckle", "centre_of_mass"),
+        wheel=part("wheel", "centre"),
+        chassis=part("chassis", "centre_of_mass"),
+        bearing=root.table("wheel").vector("bearing", metre),
+        spring=strut("spring", "stiffness"),
+        damper=strut("damper", "damping"),
+        tyre_stiffness=root.table("tyre").number("stiffness"),
+        link_radius=root.table("link_section").number("radius"),
+        bump_height=bump.number("height", positive=False),
+        bump_duration=bump.number("duration"),
+    )
