@@ -56,11 +56,14 @@ def accelerations(system: AbstractSystem, q, v, t):
     return kkt_solve(system.mass_matrix(), jacobian, force, -rate)
 
 
-def jerk(system: AbstractSystem, q, v, vdot, t) -> Float[Array, " k"]:
-    """v̈ of the motion through (q, v): the derivative of `accelerations` along q ṽ, v̇ and 1."""
-    origin, unit = jnp.zeros((), v.dtype), jnp.ones((), v.dtype)
-    along = lambda s: accelerations(system, system.group.retract(q, s * v), v + s * vdot, t + s)[0]  # noqa: E731
-    return jax.jvp(along, (origin,), (unit,))[1]
+def acceleration_and_jerk(system: AbstractSystem, q, v, t):
+    """v̇, λ and v̈ of the motion through (q, v): v̈ is the derivative of `accelerations` along q ṽ, v̇ and 1."""
+
+    def nearby(x, v, t):
+        return accelerations(system, system.group.retract(q, x), v, t)
+
+    (vdot, lam), derivative = jax.linearize(nearby, jnp.zeros_like(v), v, t)
+    return vdot, lam, derivative(v, vdot, jnp.ones_like(t))[0]
 
 
 def assemble(system: AbstractSystem):
@@ -131,7 +134,7 @@ def initial_state(system: AbstractSystem, t) -> Initial:
     _, v_ref = system.reference()
     mass, jacobian = system.mass_matrix(), system.constraint_jacobian(q)
     v, _ = kkt_solve(mass, jacobian, mass @ v_ref, jnp.zeros(jacobian.shape[0], v_ref.dtype))
-    vdot, lam = accelerations(system, q, v, t)
+    vdot, lam, vddot = acceleration_and_jerk(system, q, v, t)
     state = State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
     dtype = v.dtype
     # Redundant rows leave |R_ii| at round-off, independent ones near a singular configuration well above it.
@@ -144,4 +147,4 @@ def initial_state(system: AbstractSystem, t) -> Initial:
         jnp.where(redundant, RESULTS.redundant_constraints, RESULTS.successful),
         RESULTS.assembly_failed,
     ).astype(jnp.int32)
-    return Initial(state, jerk(system, q, v, vdot, t), result, violation)
+    return Initial(state, vddot, result, violation)

@@ -12,14 +12,11 @@ from ._coefficients import c1, c2, c3, horner, inverse_tangent_coefficient
 # out of the second derivative, n (n-1) m^(n-2) / (2n+1), is 9e-17 for n = 14, against 2/5 for the whole.
 _ARCTAN = tuple((-1) ** j / (2 * j + 1) for j in range(14))
 
-# (x~)_ij = Σ_k _SKEW[i, j, k] x_k: minus the permutation symbol.
-_EYE = np.eye(3)
-_SKEW = np.cross(_EYE[:, None, :], _EYE[None, :, :]).transpose(2, 1, 0)
-
 # 4 p pᵀ = I + Σ_kl _QUATERNION[:, :, k, l] R_kl for the unit quaternion p = (cos θ/2, sin θ/2 n) of R.
+_EYE = np.eye(3)
 _QUATERNION = np.zeros((4, 4, 3, 3))
 _QUATERNION[0, 0] = _EYE
-_QUATERNION[0, 1:] = _QUATERNION[1:, 0] = _SKEW.transpose(2, 0, 1)
+_QUATERNION[0, 1:] = _QUATERNION[1:, 0] = np.cross(_EYE[None, :, :], _EYE[:, None, :])
 _QUATERNION[1:, 1:] = (
     _EYE[:, None, :, None] * _EYE[None, :, None, :] + _EYE[:, None, None, :] * _EYE[None, :, :, None]
 )
@@ -38,13 +35,17 @@ def cross(x: Float[Array, "3"], y: Float[Array, "3"]) -> Float[Array, "3"]:
 
 def skew(x: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """The skew-symmetric matrix `x~` with `x~ y = x × y` (§3.2). `x`: shape (3,)."""
-    # One product and one sum, which XLA fuses with their surroundings: faster than stacking nine scalars.
-    return jnp.sum(jnp.asarray(_SKEW, x.dtype) * x[None, None, :], axis=-1)
+    # Stacked, not summed over a constant tensor, faster though that is: XLA's CPU compiler (jax 0.10.2 and 0.12)
+    # miscompiles that sum when it is fused in a vmapped float32 `exp`, wrong signs past 32768 results.
+    x1, x2, x3 = _components(x)
+    o = jnp.zeros_like(x1)
+    return jnp.stack([o, -x3, x2, x3, o, -x1, -x2, x1, o]).reshape(3, 3)
 
 
 def unskew(X: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """The vector `x`, shape (3,), whose `x~` is the skew-symmetric part of `X`, shape (3, 3)."""
-    return jnp.sum(jnp.asarray(0.5 * _SKEW, X.dtype) * X[:, :, None], axis=(0, 1))
+    (_, X12, X13), (X21, _, X23), (X31, X32, _) = (_components(row) for row in _components(X))
+    return 0.5 * jnp.stack([X32 - X23, X13 - X31, X21 - X12])
 
 
 def _matmul(A, B):
@@ -71,8 +72,8 @@ def _exp(x):
 def _quaternion(R):
     # The row of 4 p pᵀ with the largest diagonal entry (≥ 1, Shepperd 1978) is p up to a factor, free of
     # cancellation; normalizing it needs no other branch.
-    constant, linear = jnp.eye(4, dtype=R.dtype), jnp.asarray(_QUATERNION, R.dtype)
-    rows = constant + jnp.sum(linear * R[None, None, :, :], axis=(2, 3))
+    linear = jnp.tensordot(jnp.asarray(_QUATERNION, R.dtype), R, 2, precision=lax.Precision.HIGHEST)
+    rows = jnp.eye(4, dtype=R.dtype) + linear
     row = lax.dynamic_index_in_dim(rows, jnp.argmax(jnp.diagonal(rows)), keepdims=False)
     # Of the two quaternions ±p, the one with θ ≤ π. At θ = π both have cos θ/2 = 0 and this picks one.
     return row * lax.rsqrt(_dot(row, row)) * jnp.where(row[0] < 0.0, -1.0, 1.0).astype(R.dtype)

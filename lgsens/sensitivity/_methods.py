@@ -9,7 +9,6 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
@@ -48,7 +47,7 @@ class DirectDifferentiation(AbstractSensitivity):
     """
 
     def trajectory(self, scheme, num_steps, state0, parameters):
-        return _direct_trajectory(scheme, num_steps, state0, parameters)
+        return _decoded(_direct_trajectory(scheme, num_steps, state0, parameters))
 
 
 class AdjointVariable(AbstractSensitivity):
@@ -59,11 +58,25 @@ class AdjointVariable(AbstractSensitivity):
     """
 
     def trajectory(self, scheme, num_steps, state0, parameters):
-        return _adjoint_trajectory(scheme, num_steps, state0, parameters)
+        return _decoded(_adjoint_trajectory(scheme, num_steps, state0, parameters))
+
+
+# The custom rules see statistics as floats: an integer output of a `custom_vjp` reaches operations that have no
+# derivative (`jnp.all`) with a tangent, and JAX refuses.
 
 
 def _run(scheme, num_steps, state0, parameters):
-    return integrate(scheme, num_steps, parameters.system, state0, parameters.t0, parameters.h)
+    states, stats = integrate(scheme, num_steps, parameters.system, state0, parameters.t0, parameters.h)
+    return states, jax.tree.map(lambda leaf: leaf.astype(states.v.dtype), stats)
+
+
+def _decoded(run) -> tuple[State, Stats]:
+    states, encoded = run
+    stats = lax.stop_gradient(encoded)
+    stats = stats._replace(
+        iterations=stats.iterations.astype(jnp.int32), converged=stats.converged.astype(bool)
+    )
+    return states, stats
 
 
 # Direct differentiation. The tangent of the trajectory solves L (δ, p') = (b, p'), b = (δ_0, 0, …, 0).
@@ -95,19 +108,7 @@ def _direct_rule(scheme, num_steps, primals, tangents):
     )
     delta, _ = unravel(solution)
     d_states = jax.vmap(partial(to_ambient, group))(states, delta)
-    return (states, stats), (d_states, _no_tangent(stats))
-
-
-def _no_tangent(stats: Stats) -> Stats:
-    """Statistics have no derivative: zero for floats, float0 for the rest."""
-    return jax.tree.map(
-        lambda leaf: (
-            jnp.zeros_like(leaf)
-            if jnp.issubdtype(leaf.dtype, jnp.floating)
-            else np.zeros(leaf.shape, jax.dtypes.float0)
-        ),
-        stats,
-    )
+    return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
 
 
 # Adjoint variable method.

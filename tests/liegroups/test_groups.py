@@ -21,7 +21,7 @@ METHODS = ["exp", "log", "wedge", "vee", "matrix", "ad", "compose", "inverse", "
 METHODS += ["Ad_inv", "Ad_inv_mv", "Ad_inv_rmv", "tangent", "tangent_mv", "tangent_rmv"]
 METHODS += ["tangent_inv", "tangent_inv_mv", "to_ambient", "from_ambient"]
 
-# Coordinates are of order 1 and formulas are short: errors of a few eps per entry, more where a product of the
+# Coordinates are of order 1 and formulas are short: a few eps of error per entry, more where a product in a
 # reference sums up to 21 of them. 32 eps (7e-15) tells that from any wrong coefficient.
 ULPS = 32
 
@@ -318,3 +318,22 @@ def test_shapes_and_order_of_coordinates():
 def test_wrong_arguments_are_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("method", ["exp", "retract", "to_ambient", "log"])
+def test_large_batches_equal_small_ones(method, dtype):
+    """XLA's CPU compiler splits loops of more than 32768 results; it once got the signs of `exp` wrong there."""
+    group = SO3()
+    x, y = jnp.asarray(np.random.default_rng(0).normal(scale=0.5, size=(2, 8000, 3)), dtype)
+
+    @jax.jit
+    @jax.vmap
+    def apply(x, y):
+        q = group.exp(x)
+        arguments = {"exp": (x,), "log": (q,), "retract": (q, y), "to_ambient": (q, y)}
+        return getattr(group, method)(*arguments[method])
+
+    pieces = [np.asarray(apply(x[i : i + 80], y[i : i + 80])) for i in range(0, 8000, 80)]
+    # The same formulas, perhaps contracted differently to fused multiply-adds: a few eps.
+    close(np.asarray(apply(x, y)), np.concatenate(pieces), dtype)
