@@ -10,7 +10,15 @@ import jax.numpy as jnp
 from lgsens._errors import throw_if_failed
 from lgsens._trajectory import Trajectory
 from lgsens._validate import as_float, require
-from lgsens.dynamics import RESULTS, AbstractSystem, Initial, State, equilibrium as _equilibrium, initial_state as _initial
+from lgsens.dynamics import (
+    RESULTS,
+    AbstractSystem,
+    Initial,
+    State,
+    equilibrium as _equilibrium,
+    initial_state as _initial,
+    split_velocity,
+)
 from lgsens.integrate import GeneralizedAlpha
 from lgsens.model import Model
 from lgsens.sensitivity import AbstractSensitivity, DirectDifferentiation, Parameters
@@ -147,7 +155,7 @@ def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0):
     h = (t1 - t0) / num_steps
     if state0 is None:
         initial = _initial(system, t0)
-        state0 = _started(integrator, initial, h)
+        state0 = _started(integrator, system, initial, h)
         result, violation = initial.result, initial.violation
     else:
         result, violation = jnp.zeros((), jnp.int32), system.constraint(state0.q)
@@ -171,9 +179,29 @@ def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0):
     return trajectory, jax.lax.stop_gradient(details)
 
 
-def _started(integrator: GeneralizedAlpha, initial: Initial, h) -> State:
-    """The initial state with its auxiliary acceleration a₀; see `GeneralizedAlpha.second_order_start`."""
+def _started(integrator: GeneralizedAlpha, system: AbstractSystem, initial: Initial, h) -> State:
+    """The starting values of the scheme; see `GeneralizedAlpha.second_order_start`.
+
+    With exact values, and a_n = v̇(t_n + Δ h), Δ = α_m − α_f, the increment (27) misses the true one,
+    h v + h²/2 v̇ + h³ (v̈/6 + ad(v) v̇/12) (from ẋ = T⁻¹(x) v, T⁻¹ = I + ½ ad(x) + …), by h³ c with
+
+        c = (1/6 − β − Δ/2) v̈ + ad(v) v̇/12.
+
+    The constraint at t_{n+1} takes B c h³ out again, through the velocity once the scheme is under way: B v_n = −h² B c
+    there. Started with B v_0 = 0 it must do so through the first accelerations, and λ is off by O(h) for some steps.
+    So v_0 receives h² P c, P the M-orthogonal projection on the constraint directions.
+    """
     if not integrator.second_order_start:
         return initial.state
-    shift = (integrator.alpha_m - integrator.alpha_f) * h
-    return eqx.tree_at(lambda state: state.a, initial.state, initial.state.vdot + shift * initial.jerk)
+    state = initial.state
+    delta = integrator.alpha_m - integrator.alpha_f
+    missed = (1.0 / 6.0 - integrator.beta - delta / 2.0) * initial.jerk
+    missed = missed + system.group.ad(state.v) @ state.vdot / 12.0
+    _, normal = split_velocity(system, state.q, missed)
+    return State(
+        q=state.q,
+        v=state.v + h**2 * normal,
+        vdot=state.vdot,
+        lam=state.lam,
+        a=state.vdot + (delta * h) * initial.jerk,
+    )

@@ -6,6 +6,7 @@ from lgsens.dynamics._initial import (
     accelerations as accelerations,
     initial_state as initial_state,
     mass_scale as mass_scale,
+    split_velocity as split_velocity,
 )
 from lgsens.dynamics._results import RESULTS as RESULTS
 from lgsens.dynamics._state import State as State, Tangents as Tangents

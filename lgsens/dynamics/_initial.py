@@ -38,6 +38,16 @@ def kkt_solve(mass, jacobian, force, rate) -> tuple[Float[Array, " k"], Float[Ar
     return solution[:k], scale * solution[k:]
 
 
+def split_velocity(system: AbstractSystem, q, v) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+    """v as the sum of what the constraints allow and what they do not, M-orthogonal to each other.
+
+        [[M, Bᵀ], [B, 0]] [v_tangential; μ] = [M v; 0]
+    """
+    mass, jacobian = system.mass_matrix(), system.constraint_jacobian(q)
+    tangential, _ = kkt_solve(mass, jacobian, mass @ v, jnp.zeros(jacobian.shape[0], v.dtype))
+    return tangential, v - tangential
+
+
 def accelerations(system: AbstractSystem, q, v, t):
     """v̇ and λ of the motion through (q, v) at time t, eq. (41).
 
@@ -132,13 +142,12 @@ def initial_state(system: AbstractSystem, t) -> Initial:
     """
     q, violation = assemble(system)
     _, v_ref = system.reference()
-    mass, jacobian = system.mass_matrix(), system.constraint_jacobian(q)
-    v, _ = kkt_solve(mass, jacobian, mass @ v_ref, jnp.zeros(jacobian.shape[0], v_ref.dtype))
+    v, _ = split_velocity(system, q, v_ref)
     vdot, lam, vddot = acceleration_and_jerk(system, q, v, t)
     state = State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
     dtype = v.dtype
     # Redundant rows leave |R_ii| at round-off, independent ones near a singular configuration well above it.
-    redundant = independence(lax.stop_gradient(jacobian)) < jnp.finfo(dtype).eps ** 0.6
+    redundant = independence(lax.stop_gradient(system.constraint_jacobian(q))) < jnp.finfo(dtype).eps ** 0.6
     length = jnp.max(system.coordinate_scale())
     largest = jnp.max(jnp.abs(violation), initial=0.0)
     assembled = largest <= 1e3 * jnp.finfo(dtype).eps * jnp.maximum(length, 1.0)  # NaN is not assembled

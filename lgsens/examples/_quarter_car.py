@@ -85,14 +85,7 @@ class QuarterCar(eqx.Module):
         The shipped file, `lgsens/examples/data/five_link_suspension.toml`, shows the format. Raises `ValueError`
         naming the file and the key (or the line) for a file that cannot be read or is incomplete.
         """
-        if path is None:
-            source = resources.files("lgsens.examples") / "data" / "five_link_suspension.toml"
-            return _parse(source.read_text(encoding="utf-8"), "five_link_suspension.toml")
-        try:
-            text = Path(path).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise ValueError(f"Hardpoint file {str(path)!r} cannot be read: {error}.") from error
-        return _parse(text, str(path))
+        return _parse(*_read(path))
 
     def model(self, *, wheel: str = "hinged", free_length=None, free_radius=None) -> Model:
         """The scene at rest on its springs at the design position, a bump ahead.
@@ -214,6 +207,13 @@ class _Reader:
             raise self._fail(key, f"must be three numbers [x, y, z], got {value!r}.")
         return as_float([x * scale for x in value], (3,), key)
 
+    def interval(self, key: str) -> tuple[Array, Array]:
+        value = self._get(key)
+        is_number = [isinstance(x, int | float) and not isinstance(x, bool) for x in value] if isinstance(value, list) else []
+        if len(is_number) != 2 or not all(is_number) or not 0 < value[0] < value[1]:
+            raise self._fail(key, f"must be two numbers [lower, upper] with 0 < lower < upper, got {value!r}.")
+        return as_float(value[0], (), key), as_float(value[1], (), key)
+
     def choice(self, key: str, known) -> str:
         value = self._get(key)
         if value not in known:
@@ -221,11 +221,23 @@ class _Reader:
         return value
 
 
-def _parse(text: str, path: str) -> QuarterCar:
+def _read(path: str | Path | None) -> tuple[dict, str]:
+    """The TOML document and the name by which messages call it; None: the file that ships with lgsens."""
+    if path is None:
+        source = resources.files("lgsens.examples") / "data" / "five_link_suspension.toml"
+        text, path = source.read_text(encoding="utf-8"), source.name
+    else:
+        try:
+            text = Path(path).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise ValueError(f"Hardpoint file {str(path)!r} cannot be read: {error}.") from error
     try:
-        document = tomllib.loads(text)
+        return tomllib.loads(text), str(path)
     except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"Hardpoint file {path!r} is not valid TOML: {error}.") from error
+        raise ValueError(f"Hardpoint file {str(path)!r} is not valid TOML: {error}.") from error
+
+
+def _parse(document: dict, path: str) -> QuarterCar:
     root = _Reader(document, path)
     units = root.table("units")
     metre, kilogram = float(units.number("length")), float(units.number("mass"))

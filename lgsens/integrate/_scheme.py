@@ -42,9 +42,11 @@ class GeneralizedAlpha(eqx.Module):
             scene, at which a step has converged. The error left is its square; below 64 round-offs
             it is raised to that (single precision).
         max_iterations: Newton iterations per step before the step has failed.
-        second_order_start: start the auxiliary acceleration at a₀ = v̇₀ + (α_m − α_f) h v̈₀ instead of v̇₀. a_n
-            stands for the acceleration at t_n + (α_m − α_f) h, so this start is second order (Arnold,
-            Brüls & Cardona 2015).
+        second_order_start: start with a₀ = v̇₀ + (α_m − α_f) h v̈₀, because a_n stands for the acceleration at
+            t_n + (α_m − α_f) h, and with v₀ moved by O(h²) along the constraint directions, where the scheme keeps
+            it anyway: positions, velocities and multipliers are then second order from the first step.
+            False: a₀ = v̇₀ and v₀ as it is; multipliers are first order in the first steps (Arnold,
+            Brüls & Cardona, Numerische Mathematik 129, 2015, doi:10.1007/s00211-014-0633-1).
 
     All static and hashable. Raises `ValueError` for ρ∞ outside [0, 1), a tolerance that is not positive, or
     fewer than 1 iteration. Source: Sonneville & Brüls (2014), §4; Brüls, Cardona & Arnold (2012).

@@ -323,7 +323,7 @@ def test_wrong_arguments_are_named(build, message):
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("method", ["exp", "retract", "to_ambient", "log"])
 def test_large_batches_equal_small_ones(method, dtype):
-    """XLA's CPU compiler splits loops of more than 32768 results; it once got the signs of `exp` wrong there."""
+    """XLA's CPU compiler splits loops past 32768 results, and once got the signs of `exp` wrong there."""
     group = SO3()
     x, y = jnp.asarray(np.random.default_rng(0).normal(scale=0.5, size=(2, 8000, 3)), dtype)
 

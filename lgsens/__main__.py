@@ -1,0 +1,8 @@
+"""`python -m lgsens` is the console script `lgsens`."""
+
+import sys
+
+from lgsens._cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,92 @@
+"""The console script `lgsens`: arguments in, an exit status out; 2 and one line on stderr for bad input."""
+
+import argparse
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn
+
+import jax
+
+from lgsens import _cli_optimize, _cli_top
+from lgsens._errors import SimulationError
+from lgsens._version import version
+from lgsens.examples import PARAMETERS
+
+BAD_INPUT = 2
+
+
+class _Parser(argparse.ArgumentParser):
+    """One line for bad arguments; argparse would print the usage as well."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(BAD_INPUT, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not (value > 0 and math.isfinite(value)):
+        raise argparse.ArgumentTypeError(f"must be positive, got {text}")
+    return value
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, got {text}")
+    return value
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser("lgsens", description="Differentiable constrained multibody dynamics on Lie groups in JAX.")
+    parser.add_argument("--version", action="version", version=f"lgsens {version()}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    optimize = commands.add_parser(
+        "optimize",
+        help="optimize a suspension",
+        description="Find the suspension whose chassis accelerates least over a bump, its tyre on the road and its "
+        "spring within its travel (Sonneville & Brüls 2014, §9).",
+    )
+    optimize.add_argument("problem", choices=["quarter-car"], help="what to optimize")
+    optimize.add_argument("--out", type=Path, default=Path("out/quarter-car"), metavar="DIR",
+                          help="folder for result.json and the figures, a new one (default: %(default)s)")  # fmt: skip
+    optimize.add_argument("--overwrite", action="store_true", help="write into --out even if it exists")
+    optimize.add_argument("--hardpoints", type=Path, metavar="FILE.toml",
+                          help="a suspension of your own (default: the one that ships with lgsens)")  # fmt: skip
+    optimize.add_argument("--parameters", choices=list(PARAMETERS), default="k,c",
+                          help="what to change: stiffness k and damping c, the chassis hardpoints, or all "
+                          "(default: %(default)s)")  # fmt: skip
+    optimize.add_argument("--t1", type=_positive, default=2.0, help="duration [s] (default: %(default)s)")
+    optimize.add_argument("--dt", type=_positive, default=2e-3, help="step size [s] (default: %(default)s)")
+    optimize.add_argument("--steps", type=_count, default=60,
+                          help="number of gradients of the optimizer (default: %(default)s)")  # fmt: skip
+    optimize.add_argument("--wheel", choices=["hinged", "locked"], default="hinged",
+                          help="whether the wheel turns on its hinge (default: %(default)s)")  # fmt: skip
+    optimize.add_argument("--quiet", action="store_true", help="no progress bar and no table")
+    optimize.set_defaults(run=_cli_optimize.run)
+
+    top = commands.add_parser(
+        "top",
+        help="differentiate the spinning top",
+        description="The sensitivity of the paper's spinning top (§8) by every method, beside its reference value.",
+    )
+    top.add_argument("--h", type=_positive, default=1e-3, help="step size [s] (default: %(default)s)")
+    top.set_defaults(run=_cli_top.run)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit status: 0 success, 1 no feasible design, 2 bad input."""
+    # Names and units are not ASCII; a terminal that cannot show them gets a question mark, not an exception.
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")
+    arguments = _parser().parse_args(argv)
+    jax.config.update("jax_enable_x64", True)  # an application may; the library never does
+    try:
+        return arguments.run(arguments)
+    except (ValueError, OSError, ImportError, SimulationError) as error:
+        print(f"lgsens {arguments.command}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return BAD_INPUT

@@ -1,0 +1,201 @@
+"""The suspension design problem of the paper's §9: comfort, under bounds on tyre force and spring length."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens._simulate import simulate
+from lgsens._trajectory import Trajectory
+from lgsens._validate import suggestion
+from lgsens.criteria import time_integral
+from lgsens.examples._quarter_car import GRAVITY, QuarterCar, _read, _Reader
+
+# What the user may ask for, and the members of the design that it frees.
+PARAMETERS = {
+    "k,c": ("stiffness", "damping"),
+    "hardpoints": ("hardpoints",),
+    "k,c,hardpoints": ("stiffness", "damping", "hardpoints"),
+}
+
+
+class DesignLimits(eqx.Module):
+    """The limits of a suspension design; `DesignLimits.load()` reads the table `[design]` of a hardpoint file.
+
+    Attributes:
+        minimum_tyre_force: F_min of eq. (48) [N].
+        minimum_spring_length, maximum_spring_length: l_min and l_max of eqs. (49)–(50) [m].
+        stiffness, damping: lower and upper bound of k [N/m] and of c [N s/m].
+        hardpoint_box: how far a hardpoint may move either way along each axis [m].
+    """
+
+    minimum_tyre_force: Float[Array, ""]
+    minimum_spring_length: Float[Array, ""]
+    maximum_spring_length: Float[Array, ""]
+    stiffness: tuple[Float[Array, ""], Float[Array, ""]]
+    damping: tuple[Float[Array, ""], Float[Array, ""]]
+    hardpoint_box: Float[Array, ""]
+
+    @staticmethod
+    def load(path: str | Path | None = None) -> "DesignLimits":
+        """Read the limits from a TOML file; None: the one that ships with lgsens.
+
+        Raises `ValueError` naming the file and the key for a table that is missing, incomplete or contradictory.
+        """
+        document, name = _read(path)
+        table = _Reader(document, name).table("design")
+        shortest, longest = table.number("minimum_spring_length"), table.number("maximum_spring_length")
+        if not shortest < longest:
+            raise ValueError(
+                f"Hardpoint file {name!r}, key 'design.maximum_spring_length': must exceed minimum_spring_length = "
+                f"{float(shortest)}, got {float(longest)}."
+            )
+        return DesignLimits(
+            table.number("minimum_tyre_force", positive=False),
+            shortest,
+            longest,
+            table.interval("stiffness"),
+            table.interval("damping"),
+            table.number("hardpoint_box"),
+        )
+
+
+class Response(NamedTuple):
+    """What the design problem looks at; every array but `objective` has a leading axis over the n + 1 times.
+
+    Attributes:
+        t: times [s].
+        acceleration: vertical acceleration of the chassis [m/s²].
+        spring_length: l [m].
+        tyre_force: F, the normal force of the tyre on the road [N].
+        objective: Ψ₀ of eq. (47) [m²/s³], shape ().
+        constraints: Ψ₁, Ψ₂, Ψ₃ of eqs. (48)–(50) over their scales [–], ≤ 0 where they hold, shape (n+1, 3).
+    """
+
+    t: Float[Array, " n"]
+    acceleration: Float[Array, " n"]
+    spring_length: Float[Array, " n"]
+    tyre_force: Float[Array, " n"]
+    objective: Float[Array, ""]
+    constraints: Float[Array, "n 3"]
+
+
+class SuspensionDesign(eqx.Module):
+    """Find the most comfortable quarter-car over a bump that keeps its tyre on the road and its travel in bounds.
+
+        min Ψ₀ = ∫ v̇_z² dt of the chassis                    (47)
+        Ψ₁(t) = F_min − F(t) ≤ 0   over the static tyre force  (48)
+        Ψ₂(t) = l_min − l(t) ≤ 0   over l_max − l_min          (49)
+        Ψ₃(t) = l(t) − l_max ≤ 0   over l_max − l_min          (50)
+
+    at every time step. The design is a dict: `stiffness` k [N/m] and `damping` c [N s/m] of shape (), `hardpoints`
+    [m] of shape (5, 3), the chassis ends of the links in sorted order of their names, or all three. Whatever the
+    design, the preloads of spring and tyre are those that hold the car at rest at the design position.
+
+    Arguments:
+        car: the suspension to start from.
+        limits: bounds and limits.
+        parameters: a key of `PARAMETERS`.
+        wheel: "hinged" or "locked".
+        t1: duration [s]. num_steps: its number of steps, static.
+
+    The limits that ship with lgsens, and why:
+      - the start (k = 109 kN/m, c = 4.9 kN s/m, as in the source) is a firm production set-up: motion ratios 0.60
+        and 0.89 give 40 N/mm at the wheel, the body at 1.4 Hz with 0.49 of critical damping;
+      - F_min = 650 N is 15 % of the static 4,428 N: some grip is left on the far side of the bump;
+      - l_min = 254 mm is 35 mm of wheel travel over the design position (275 mm), where a jounce bumper begins, which a
+        bump as common as this one should not touch; l_max = 300 mm is 41 mm of travel down to the rebound stop;
+      - k from 50 to 200 kN/m is the body at 1.0 to 1.8 Hz: below, 100 kg over this corner sink it by more than
+        5 cm and need levelling; above lie sports cars;
+      - c from 1.5 to 10 kN s/m is 0.15 to 1 of critical damping at the start's stiffness;
+      - ±30 mm is the room that a subframe usually leaves around a link's bush.
+
+    Raises `ValueError` for unknown parameters. Source: Sonneville & Brüls (2014), §9.
+    """
+
+    car: QuarterCar
+    limits: DesignLimits
+    parameters: str = eqx.field(static=True, default="k,c")
+    wheel: str = eqx.field(static=True, default="hinged")
+    t1: float = eqx.field(static=True, default=2.0)
+    num_steps: int = eqx.field(static=True, default=1000)
+
+    def __check_init__(self):
+        if self.parameters not in PARAMETERS:
+            raise ValueError(f"`parameters`: {suggestion(self.parameters, PARAMETERS)}.")
+
+    def _members(self, stiffness, damping, hardpoints) -> dict[str, Array]:
+        members = {"stiffness": stiffness, "damping": damping, "hardpoints": hardpoints}
+        return {name: members[name] for name in PARAMETERS[self.parameters]}
+
+    @property
+    def start(self) -> dict[str, Array]:
+        """The design of the hardpoint file."""
+        points = jnp.stack([self.car.links[name].chassis for name in sorted(self.car.links)])
+        return self._members(self.car.spring.rate, self.car.damper.rate, points)
+
+    @property
+    def bounds(self) -> tuple[dict[str, Array], dict[str, Array]]:
+        """The lower and the upper bound of the design."""
+        limits = self.limits
+        points = jnp.stack([self.car.links[name].chassis for name in sorted(self.car.links)])
+        lower, upper = (
+            self._members(limits.stiffness[i], limits.damping[i], points + sign * limits.hardpoint_box)
+            for i, sign in ((0, -1.0), (1, 1.0))
+        )
+        return lower, upper
+
+    @property
+    def log_scale(self) -> dict[str, bool]:
+        """Which members are searched by their logarithm: the rates, which are positive and span a decade."""
+        return {name: name != "hardpoints" for name in PARAMETERS[self.parameters]}
+
+    def with_design(self, design: dict[str, Array]) -> QuarterCar:
+        """The car with the values of a design."""
+        car = self.car
+        if "stiffness" in design:
+            car = eqx.tree_at(lambda c: c.spring.rate, car, design["stiffness"])
+        if "damping" in design:
+            car = eqx.tree_at(lambda c: c.damper.rate, car, design["damping"])
+        if "hardpoints" in design:
+            names = sorted(car.links)
+            car = eqx.tree_at(lambda c: [c.links[name].chassis for name in names], car, list(design["hardpoints"]))
+        return car
+
+    def simulate(self, design: dict[str, Array], throw: bool = True) -> Trajectory:
+        """The motion of a design over the bump; `throw` as in `lgsens.simulate`."""
+        model = self.with_design(design).model(wheel=self.wheel)
+        return simulate(model, t1=self.t1, num_steps=self.num_steps, throw=throw)
+
+    def response(self, trajectory: Trajectory) -> Response:
+        """The objective and the path constraints of a motion."""
+        limits = self.limits
+        acceleration = trajectory.body("chassis").acceleration[:, 2]
+        length, force = trajectory.force("spring").length, trajectory.force("tyre")
+        car = self.car
+        masses = [car.chassis.mass, car.knuckle.mass, car.wheel.mass, *(link.mass for link in car.links.values())]
+        static_force = GRAVITY * jnp.sum(jnp.stack(masses))
+        travel = limits.maximum_spring_length - limits.minimum_spring_length
+        constraints = (
+            (limits.minimum_tyre_force - force) / static_force,  # Ψ₁
+            (limits.minimum_spring_length - length) / travel,  # Ψ₂
+            (length - limits.maximum_spring_length) / travel,  # Ψ₃
+        )
+        return Response(
+            trajectory.t,
+            acceleration,
+            length,
+            force,
+            time_integral(trajectory.t, acceleration**2),
+            jnp.stack(constraints, axis=1),
+        )
+
+    def __call__(self, design: dict[str, Array]) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
+        """Ψ₀ [m²/s³] and the scaled path constraints, as `lgsens.optimize.minimize` wants them.
+
+        A step that does not converge makes them NaN from there on, which `minimize` steps back from.
+        """
+        response = self.response(self.simulate(design, throw=False))
+        return response.objective, response.constraints

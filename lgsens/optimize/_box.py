@@ -1,0 +1,84 @@
+"""The box that a design lies in, scaled to [0, 1]."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, PyTree
+
+from lgsens._validate import as_float
+
+
+class Box(NamedTuple):
+    """The map between x and z in [0, 1], linear or logarithmic entry by entry."""
+
+    lower: Float[Array, " n"]
+    upper: Float[Array, " n"]
+    log: Bool[Array, " n"]
+
+    def _ends(self):
+        safe = lambda bound: jnp.log(jnp.where(self.log, bound, 1.0))  # noqa: E731
+        return jnp.where(self.log, safe(self.lower), self.lower), jnp.where(self.log, safe(self.upper), self.upper)
+
+    def scaled(self, x):
+        lower, upper = self._ends()
+        return (jnp.where(self.log, jnp.log(jnp.where(self.log, x, 1.0)), x) - lower) / (upper - lower)
+
+    def value(self, z):
+        lower, upper = self._ends()
+        y = lower + z * (upper - lower)
+        # The clip keeps round-off of the logarithm from leaving the bounds.
+        return jnp.clip(jnp.where(self.log, jnp.exp(jnp.where(self.log, y, 0.0)), y), self.lower, self.upper)
+
+
+def checked_box(x0, lower, upper, log_scale) -> tuple[Array, Callable[[Array], PyTree], Box]:
+    """x0 as a vector, the way back, and the box around it."""
+    x0 = jax.tree.map(lambda leaf: as_float(leaf, None, "`x0`"), x0)
+    if not jax.tree.leaves(x0):
+        raise ValueError("`x0` has no arrays; there is nothing to design.")
+    if isinstance(log_scale, bool):
+        log_scale = jax.tree.map(lambda _: log_scale, x0)
+
+    def vector(tree, what: str, convert) -> Array:
+        if jax.tree.structure(tree) != jax.tree.structure(x0):
+            raise ValueError(
+                f"`{what}` must be a pytree like `x0`, {jax.tree.structure(x0)}, got {jax.tree.structure(tree)}."
+            )
+
+        def leaf(path, x, value):
+            value = convert(value)
+            if value.shape not in ((), x.shape):
+                name = jax.tree_util.keystr(path)
+                raise ValueError(f"`{what}{name}` must have shape {x.shape} or (), got shape {value.shape}.")
+            return jnp.broadcast_to(value, x.shape)
+
+        return ravel_pytree(jax.tree_util.tree_map_with_path(leaf, x0, tree))[0]
+
+    x, unravel = ravel_pytree(x0)
+    box = Box(
+        vector(lower, "lower", lambda value: as_float(value, None, "`lower`")),
+        vector(upper, "upper", lambda value: as_float(value, None, "`upper`")),
+        vector(log_scale, "log_scale", lambda value: jnp.asarray(value, bool)),
+    )
+    names = entry_names(x0)
+    values = (np.asarray(box.lower), np.asarray(box.upper), np.asarray(x), np.asarray(box.log))
+    for name, low, high, value, log in zip(names, *values):
+        if not low < high:
+            raise ValueError(f"`lower` must be below `upper`, got {low} and {high} for x{name}.")
+        if not low <= value <= high:
+            raise ValueError(f"`x0` must lie within the bounds: x{name} = {value} is outside [{low}, {high}].")
+        if log and not low > 0:
+            raise ValueError(f"A logarithmic scale needs positive bounds, got {low} for x{name}.")
+    return x, unravel, box
+
+
+def entry_names(tree) -> list[str]:
+    """A name for each number of a pytree, in the order of `ravel_pytree`: ['stiffness'], ['points'][0, 2]."""
+    return [
+        jax.tree_util.keystr(path) + (str(list(map(int, index))) if index else "")
+        for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+        for index in np.ndindex(np.shape(leaf))
+    ]

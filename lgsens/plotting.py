@@ -1,0 +1,269 @@
+"""Figures: time histories with their limits, convergence, the mechanism in space; on matplotlib, imported when used.
+
+Figures are made without pyplot, so they need no display and leave no global state; in a notebook they show
+themselves, and `save` writes them.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from lgsens.model import Model, RevoluteJoint, SpringDamper, TyreSpring
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS = ("#8c8c8c", "#1b62a5", "#d9822b", "#3a8a4d")  # before in grey, after in blue, then others
+LIMIT = "#b3262e"
+ROLES = {"bar": "#1b62a5", "solid": "#3a8a4d", "wheel": "#3c3c3c", "spring": "#d9822b", "damper": "#7a4b9a"}
+
+
+class Panel(NamedTuple):
+    """One quantity over time.
+
+    Attributes:
+        label: what the axis shows, with its unit: "tyre force [kN]".
+        series: values over time by the name of the run, each of shape (n,).
+        limits: values of horizontal limit lines by name.
+    """
+
+    label: str
+    series: Mapping[str, Any]
+    limits: Mapping[str, float] = {}  # noqa: RUF012 (read only)
+
+
+def figure(width: float = 7.0, height: float = 4.5) -> "Figure":
+    """An empty figure of this size [inch]. Raises `ImportError` saying what to install where matplotlib is missing."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError('Figures need matplotlib: pip install "lgsens[plot]"') from error
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def save(fig: "Figure", path: str | Path, dpi: int = 150) -> Path:
+    """Write a figure as a PNG (or what the suffix says) and return its path; the folder must exist."""
+    path = Path(path)
+    fig.savefig(path, dpi=dpi)
+    return path
+
+
+def _plain(axes: "Axes") -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(True, color="#e4e4e4", linewidth=0.6)
+    axes.set_axisbelow(True)
+
+
+def time_histories(t, panels: Sequence[Panel], title: str = "") -> "Figure":
+    """Quantities over time, one above the other, several runs in each, with their limits as dashed lines.
+
+    Arguments:
+        t: times [s], shape (n,).
+        panels: what to draw, from top to bottom.
+        title: over the figure.
+
+    Raises `ImportError` without matplotlib.
+    """
+    fig = figure(8.0, 1.2 + 2.3 * len(panels))
+    all_axes = fig.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    t = np.asarray(t)
+    for axes, panel in zip(all_axes, panels):
+        for i, (name, values) in enumerate(panel.series.items()):
+            axes.plot(t, np.asarray(values), label=name, color=COLOURS[i % len(COLOURS)], linewidth=1.8)
+        for name, value in panel.limits.items():
+            axes.axhline(value, color=LIMIT, linestyle=(0, (5, 3)), linewidth=1.2)
+            # The name stands at the right end of its line, where motions have died out.
+            axes.annotate(
+                name,
+                (1.0, value),
+                xycoords=("axes fraction", "data"),
+                xytext=(-4, 3),
+                textcoords="offset points",
+                ha="right",
+                color=LIMIT,
+                fontsize=9,
+            )
+        _plain(axes)
+        axes.margins(x=0, y=0.12)
+        axes.set_ylabel(panel.label)
+    fig.align_ylabels()
+    all_axes[-1].set_xlabel("time [s]")
+    handles, labels = all_axes[0].get_legend_handles_labels()
+    all_axes[0].legend(handles, labels, frameon=False, ncols=len(labels), loc="upper right")
+    if title:
+        fig.suptitle(title)
+    return fig
+
+
+def convergence(history: Any, *, tolerance: float, best: int | None = None, objective: str = "objective") -> "Figure":
+    """The objective, the worst constraint and the projected gradient over the steps of a minimization.
+
+    Arguments:
+        history: `OptimizationResult.history`.
+        tolerance: up to which the constraints count as satisfied; the region beyond is shaded.
+        best: the step whose design was kept, to be marked.
+        objective: label of the objective, with its unit.
+
+    Raises `ImportError` without matplotlib.
+    """
+    fig = figure(8.0, 7.4)
+    top, middle, bottom = fig.subplots(3, 1, sharex=True)
+    steps = np.arange(len(history.objective))
+    style = {"color": COLOURS[1], "linewidth": 1.6, "marker": "o", "markersize": 3}
+    top.plot(steps, history.objective, **style)
+    middle.plot(steps, history.worst_constraint, **style)
+    bottom.semilogy(steps, history.gradient_norm, **style)
+    # Far from the limit a linear axis hides the end, where the constraint is met to 1e-3.
+    if np.all(np.isfinite(history.worst_constraint)):
+        middle.set_yscale("symlog", linthresh=tolerance)
+        low, high = middle.get_ylim()
+        high = max(high, 10 * tolerance)
+        middle.axhspan(tolerance, high, color=LIMIT, alpha=0.10, linewidth=0)
+        middle.set_ylim(low, high)
+        middle.annotate("violated", (1.0, 1.0), xycoords="axes fraction", xytext=(-4, -4),
+                        textcoords="offset points", ha="right", va="top", color=LIMIT, fontsize=9)  # fmt: skip
+    if best is not None:
+        values = (history.objective, history.worst_constraint, history.gradient_norm)
+        for axes, value in zip((top, middle, bottom), values):
+            axes.plot(best, value[best], "o", color=COLOURS[2], markersize=8, label="design kept", zorder=3)
+        top.legend(frameon=False)
+    labels = (objective, "worst constraint\nover its scale [–]", "projected gradient\nof the Lagrangian [–]")
+    for axes, label in zip((top, middle, bottom), labels):
+        _plain(axes)
+        axes.set_ylabel(label)
+        axes.margins(x=0.02)
+    bottom.set_xlabel("step")
+    fig.align_ylabels()
+    return fig
+
+
+def mechanism(models: Mapping[str, Model], title: str = "", view: tuple[float, float] = (18.0, -38.0)) -> "Figure":
+    """Mechanisms in their reference configuration, in space and with equal axes: the last in colour, the others grey.
+
+    A body is drawn from the points at which joints hold it: two make a bar, more a solid; one with a tyre
+    is a wheel. Springs are coils, dampers tubes with a rod.
+
+    Arguments:
+        models: scenes by name, drawn over each other.
+        title: over the figure.
+        view: elevation and azimuth [degree].
+
+    Raises `ImportError` without matplotlib.
+    """
+    fig = figure(8.0, 7.0)
+    axes = fig.add_subplot(projection="3d")
+    points, handles = [], []
+    for name, model in models.items():
+        last = name == list(models)[-1]
+        points += _draw(axes, model, ROLES if last else dict.fromkeys(ROLES, COLOURS[0]))
+        if not last:
+            handles += axes.plot([], [], [], color=COLOURS[0], linewidth=3, label=name)
+        elif len(models) > 1:
+            handles += axes.plot([], [], [], color=ROLES["bar"], linewidth=3, label=name)
+    points = np.asarray(points)
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.03 * np.max(high - low)
+    for setter, a, b in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), low - margin, high + margin):
+        setter(a, b)
+    axes.set_box_aspect(high - low + 2 * margin, zoom=0.95)
+    axes.view_init(*view)
+    axes.set(xlabel="x [m], forward", ylabel="y [m], left", zlabel="z [m], up")
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        axis.set_pane_color((0.98, 0.98, 0.98))
+        axis.labelpad = 8
+    if handles:
+        axes.legend(handles=handles, frameon=False, loc="upper left", fontsize=11)
+    if title:
+        fig.suptitle(title)
+    return fig
+
+
+def _draw(axes: Any, model: Model, colours: Mapping[str, str]) -> list[np.ndarray]:
+    """Draw one scene; returns the points that the axes must hold."""
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    held, drawn = _joint_points(model), []
+    wheels = {force.body: np.asarray(force.at) for force in model.forces.values() if isinstance(force, TyreSpring)}
+    for name, points in held.items():
+        drawn += points
+        if name in wheels:
+            circle = _circle(wheels[name], _spin_axis(model, name))
+            axes.add_collection3d(Poly3DCollection([circle], facecolor=colours["wheel"], alpha=0.08))
+            axes.plot(*circle.T, color=colours["wheel"], linewidth=2.5, alpha=0.8)
+            drawn += list(circle)
+        elif len(points) == 2:
+            axes.plot(*np.transpose(points), color=colours["bar"], linewidth=4.5, solid_capstyle="round")
+        elif len(points) > 2:
+            faces = _hull(np.asarray(points))
+            axes.add_collection3d(Poly3DCollection(faces, facecolor=colours["solid"], alpha=0.16, linewidth=0))
+            for face in faces if len(faces) > 1 else ():
+                axes.plot(*np.concatenate([face, face[:1]]).T, color=colours["solid"], linewidth=0.4, alpha=0.5)
+    for force in model.forces.values():
+        if isinstance(force, SpringDamper):
+            a, b = np.asarray(force.at_a), np.asarray(force.at_b)
+            if float(force.stiffness) > 0:
+                axes.plot(*_coil(a, b).T, color=colours["spring"], linewidth=1.8)
+            else:
+                axes.plot(*np.transpose([a, b]), color=colours["damper"], linewidth=1.8)
+                axes.plot(*np.transpose([a, a + 0.6 * (b - a)]), color=colours["damper"], linewidth=6, alpha=0.45)
+            drawn += [a, b]
+    joints = np.asarray([point for points in held.values() for point in points])
+    if joints.size:
+        axes.scatter(*joints.T, color="white", edgecolors=colours["bar"], s=24, depthshade=False, zorder=5)
+    return drawn
+
+
+def _joint_points(model: Model) -> dict[str, list[np.ndarray]]:
+    """The points of each body at which a joint connects it to another one.
+
+    Not those to the ground (a guide of the chassis says nothing of its shape), nor those of springs (which would
+    make a solid of a bar).
+    """
+    held: dict[str, list[np.ndarray]] = {name: [] for name in model.bodies}
+    for joint in model.joints.values():
+        if None not in (joint.a, joint.b):
+            held[joint.a].append(np.asarray(joint.at_a if hasattr(joint, "at_a") else joint.at))
+            held[joint.b].append(np.asarray(joint.at_b if hasattr(joint, "at_b") else joint.at))
+    return held
+
+
+def _spin_axis(model: Model, wheel: str) -> np.ndarray:
+    for joint in model.joints.values():
+        if isinstance(joint, RevoluteJoint) and wheel in (joint.a, joint.b):
+            return np.asarray(joint.axis) / np.linalg.norm(joint.axis)
+    return np.array([0.0, 1.0, 0.0])
+
+
+def _circle(centre: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """The rim of a wheel that stands on z = 0."""
+    first = np.cross(axis, [0.0, 0.0, 1.0])
+    first /= np.linalg.norm(first)
+    second = np.cross(axis, first)
+    angle = np.linspace(0, 2 * np.pi, 73)[:, None]
+    return centre + centre[2] * (np.cos(angle) * first + np.sin(angle) * second)
+
+
+def _coil(a: np.ndarray, b: np.ndarray, turns: int = 6, radius: float = 0.12) -> np.ndarray:
+    """A coil between two points, its radius as a fraction of its length, straight at both ends."""
+    length = np.linalg.norm(b - a)
+    axis = (b - a) / length
+    first = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0])
+    first /= np.linalg.norm(first)
+    second = np.cross(axis, first)
+    s = np.linspace(0, 1, 40 * turns)[:, None]
+    wave = 2 * np.pi * turns * s
+    coil = a + (0.1 + 0.8 * s) * (b - a) + radius * length * (np.cos(wave) * first + np.sin(wave) * second)
+    return np.concatenate([[a, a + 0.1 * (b - a)], coil, [b - 0.1 * (b - a), b]])
+
+
+def _hull(points: np.ndarray) -> np.ndarray:
+    """The triangles of the convex hull, shape (m, 3, 3); of points in a plane, the polygon through them."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        return points[ConvexHull(points).simplices]
+    except QhullError:
+        return points[None]

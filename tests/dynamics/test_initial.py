@@ -1,0 +1,246 @@
+"""Consistent initial states, assembly and accelerations against their defining equations and independent motions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import EPS, GRAVITY, close, displaced, random_body
+from scipy.linalg import null_space
+
+import lgsens as lg
+from lgsens.dynamics import accelerations, autodiff_tangents, initial_state
+from lgsens.liegroups import Pose
+
+
+def double_pendulum(seed) -> lg.Model:
+    """A body on a ball joint, another hinged to it with a damper between them, and velocities that fit neither joint."""
+    rng = np.random.default_rng(seed)
+    upper, lower = (
+        random_body(rng, velocity=rng.normal(size=3), angular_velocity=3 * rng.normal(size=3)) for _ in range(2)
+    )
+    joints = {
+        "ball": lg.SphericalJoint(None, "upper", at=rng.uniform(-1, 1, 3)),
+        "hinge": lg.RevoluteJoint("upper", "lower", at=rng.uniform(-1, 1, 3), axis=rng.normal(size=3)),
+    }
+    ends = {"at_a": rng.uniform(1, 2, 3), "at_b": rng.uniform(-2, -1, 3)}
+    forces = {
+        "gravity": lg.Gravity(GRAVITY),
+        "damper": lg.SpringDamper("upper", "lower", **ends, stiffness=20.0, damping=1.0),
+        "push": lg.AppliedForce("lower", force=rng.normal(size=3), signal=lg.BumpRoad(height=5.0, duration=1.0)),
+    }
+    return lg.Model({"upper": upper, "lower": lower}, joints, forces)
+
+
+TIME = jnp.asarray(0.2, dtype=float)
+start = jax.jit(lambda model: initial_state(model.system(), TIME))
+
+
+@jax.jit
+def matrices(model, q):
+    system = model.system()
+    return system.mass_matrix(), system.constraint_jacobian(q)
+
+
+@pytest.fixture(scope="module", params=range(3))
+def pendulum(request):
+    """A model, its initial state, M, B, and the amplification of round-off by the equations that gave the state."""
+    model = double_pendulum(request.param)
+    initial = start(model)
+    mass, jacobian = map(np.asarray, matrices(model, initial.state.q))
+    condition = np.linalg.cond(jacobian @ np.linalg.solve(mass, jacobian.T))
+    assert condition < 1e5
+    return model, initial, mass, jacobian, condition
+
+
+def test_reference_of_joints_is_kept(pendulum):
+    model, initial, *_ = pendulum
+    assert initial.result == lg.RESULTS.successful
+    jax.tree.map(np.testing.assert_array_equal, initial.state.q, model.system().pose)
+
+
+def test_velocity_is_the_closest_that_the_joints_allow(pendulum):
+    """B v = 0, and M (v − v_ref) does no work on any velocity that they allow: v is nearest in kinetic energy."""
+    model, initial, mass, jacobian, condition = pendulum
+    wanted, v = np.asarray(model.system().velocity), np.asarray(initial.state.v)
+    size = np.abs(wanted).max()
+    assert np.abs(jacobian @ wanted).max() > 0.1
+    # v solves a linear system of that condition; B and M enlarge what is left of it by their norm.
+    allowed = 10 * condition * size * np.linalg.norm(mass)
+    close(jacobian @ v, np.zeros(len(jacobian)), 10 * condition, scale=size * np.linalg.norm(jacobian))
+    tangents = null_space(jacobian)
+    assert tangents.shape[1] == 4
+    close(tangents.T @ mass @ (v - wanted), np.zeros(4), 1, scale=allowed)
+    # And so by the definition: every other allowed velocity is farther.
+    distance = lambda v: (v - wanted) @ mass @ (v - wanted)  # noqa: E731
+    rng = np.random.default_rng(0)
+    assert all(distance(v + 1e-3 * tangents @ rng.normal(size=4)) > distance(v) for _ in range(20))
+
+
+def test_accelerations_satisfy_the_equations_of_motion(pendulum):
+    model, initial, mass, jacobian, condition = pendulum
+    state = initial.state
+    residual = model.system().residual(state.q, state.v, state.vdot, state.lam, TIME)
+    forces = np.abs(mass @ state.vdot).max() + np.abs(jacobian.T @ state.lam).max()
+    # LU is backward stable: the residual is that many round-offs of the terms, whatever the condition.
+    close(residual, np.zeros(12), 100, scale=forces)
+    np.testing.assert_array_equal(state.a, state.vdot)
+
+
+@jax.jit
+def along(model, state):
+    """Φ and its first two time derivatives along q exp(s v + s²/2 v̇), the motion to second order."""
+    system = model.system()
+
+    def value(s):
+        return system.constraint(system.group.retract(state.q, s * state.v + s**2 / 2 * state.vdot))
+
+    rate = lambda s: jax.jvp(value, (s,), (jnp.ones_like(s),))[1]  # noqa: E731
+    return value(0.0 * TIME), *jax.jvp(rate, (0.0 * TIME,), (jnp.ones_like(TIME),))
+
+
+def test_constraints_hold_to_their_second_derivative(pendulum):
+    model, initial, _, jacobian, condition = pendulum
+    for order, derivative in enumerate(along(model, initial.state)):
+        scale = np.linalg.norm(jacobian) * (1.0, np.abs(initial.state.v).max(), np.abs(initial.state.vdot).max())[order]
+        close(derivative, np.zeros(8), 10 * condition, scale=scale)
+
+
+@jax.jit
+def fly(model, q0, v0, h):
+    """v̇ at times h (−2, −1, 0, 1, 2) from `TIME`, by ten Runge-Kutta steps per h on x, v with q = q₀ exp(x̃).
+
+    Index 1 and fourth order: nothing here is in the integrator.
+    """
+    system, group = model.system(), model.system().group
+
+    def slope(y, t):
+        x, v = y
+        return group.tangent_inv_mv(x, v), accelerations(system, group.retract(q0, x), v, t)[0]
+
+    def step(carry, _):
+        y, t, h = carry
+        shifted = lambda k, f: jax.tree.map(lambda a, b: a + f * h * b, y, k)  # noqa: E731
+        k1 = slope(y, t)
+        k2 = slope(shifted(k1, 0.5), t + h / 2)
+        k3 = slope(shifted(k2, 0.5), t + h / 2)
+        k4 = slope(shifted(k3, 1.0), t + h)
+        y = jax.tree.map(lambda y, a, b, c, d: y + h / 6 * (a + 2 * b + 2 * c + d), y, k1, k2, k3, k4)
+        return (y, t + h, h), slope(y, t + h)[1]
+
+    run = lambda h: jax.lax.scan(step, ((jnp.zeros_like(v0), v0), TIME, h / 10), None, length=20)[1][9::10]  # noqa: E731
+    return jax.vmap(run)(jnp.stack([-h, h]))
+
+
+def test_jerk_is_the_rate_of_the_accelerations(pendulum):
+    model, initial, _, _, condition = pendulum
+    h = 2e-3
+    (b1, b2), (f1, f2) = fly(model, initial.state.q, initial.state.v, jnp.asarray(h))
+    differences = (8 * (f1 - b1) - (f2 - b2)) / (12 * h)
+    size = np.abs(initial.jerk).max()
+    # Rates are below 30 rad/s: the formula errs by (30 h)⁴/30 = 4e-7 of the jerk and round-off by EPS · condition/h, less.
+    assert np.abs(initial.jerk - differences).max() < 2e-6 * size
+    assert size > 1
+
+
+def test_accelerations_of_the_top_are_eulers():
+    """A top on its pivot is a body about a fixed point: I_O Ω̇ + Ω × I_O Ω = moment of the weight, with Steiner's I_O."""
+    rng = np.random.default_rng(4)
+    spin = rng.normal(size=3)
+    body = random_body(rng, angular_velocity=spin)
+    pivot = rng.uniform(-1, 1, 3)
+    arm = np.asarray(body.orientation).T @ (np.asarray(body.position) - pivot)  # pivot to centre, body frame
+    model = lg.Model({"top": body}, {"pivot": lg.SphericalJoint(None, "top", at=pivot)}, {"g": lg.Gravity(GRAVITY)})
+    state = start(model).state
+    mass, inertia = float(body.mass), np.asarray(body.inertia)
+    about_pivot = inertia + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    # The projected spin is that of an impulse at the pivot: I_O Ω = J Ω_ref, for a centre of mass at rest.
+    omega = np.linalg.solve(about_pivot, inertia @ spin)
+    weight = np.asarray(body.orientation).T @ (mass * np.array(GRAVITY))
+    moment = np.cross(arm, weight) - np.cross(omega, about_pivot @ omega)
+    condition = np.linalg.cond(about_pivot)
+    assert condition < 1e3
+    close(state.v[3:], omega, 10 * condition)
+    close(state.vdot[3:], np.linalg.solve(about_pivot, moment), 10 * condition)
+    # The joint's force on the ground, which is body `a`, is what the body's weight and acceleration ask for.
+    close(state.lam, mass * (np.array(GRAVITY) - np.asarray(state.vdot[:3])), 10 * condition)
+
+
+# Assembly.
+
+
+def lift(length) -> lg.Model:
+    """A slider on a vertical rail, on a rod from (1, 0, 0): its height is √(length² − 1)."""
+    body = lg.RigidBody(2.0, (0.1, 0.2, 0.2), position=(0.0, 0.0, 1.0))
+    joints = {
+        "rail": lg.PrismaticJoint(None, "slider", at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0)),
+        "rod": lg.DistanceJoint(None, "slider", at_a=(1.0, 0.0, 0.0), at_b=(0.0, 0.0, 1.0), length=length),
+    }
+    return lg.Model({"slider": body}, joints)
+
+
+@jax.jit
+def height(length):
+    initial = initial_state(lift(length).system(), TIME)
+    return initial.state.q.position[0, 2], initial.violation, initial.result
+
+
+height_rate = jax.jit(jax.jacfwd(lambda length: height(length)[0]))
+height_gradient = jax.jit(jax.grad(lambda length: height(length)[0]))
+
+
+@pytest.mark.parametrize("length", [1.02, 1.3, np.sqrt(2.0), 2.0, 3.5])
+def test_a_rod_of_another_length_is_assembled(length):
+    length = jnp.asarray(length, dtype=float)
+    z, violation, result = height(length)
+    expected = np.sqrt(length**2 - 1)
+    assert result == lg.RESULTS.successful
+    assert np.abs(violation).max() <= 1e-12
+    # Φ to a few round-offs of the length; dz/dL amplifies them by L/z.
+    slope = float(length / expected)
+    close(z, expected, 32, scale=slope * float(length))
+    assert abs(float(height_rate(length)) - slope) <= 100 * EPS * slope**3  # d²z/dL² is about −slope³/L
+    assert abs(float(height_gradient(length)) - slope) <= 100 * EPS * slope**3
+    step = 1e-4
+    ahead, behind = height(length + step)[0], height(length - step)[0]
+    # step² d³z/dL³ / 6, d³z = 3 L/z⁵ ≤ 3 slope⁵/L⁴, and the 32 round-offs above over the step
+    bound = step**2 * slope**5 + 64 * EPS * slope * float(length) / step
+    assert abs(float(ahead - behind) / (2 * step) - slope) <= bound
+
+
+def tripod(lengths) -> lg.Model:
+    """A free body on three rods to the ground, of lengths that it does not have in its reference configuration."""
+    rng = np.random.default_rng(8)
+    body = random_body(rng, position=(0.0, 0.0, 1.0))
+    feet, ends = rng.uniform(-1, 1, (3, 3)) - [0, 0, 2], rng.uniform(-0.3, 0.3, (3, 3)) + [0, 0, 1]
+    distances = np.linalg.norm(ends - feet, axis=1)
+    joints = {
+        f"rod{i}": lg.DistanceJoint(None, "plate", at_a=feet[i], at_b=ends[i], length=distances[i] + lengths[i])
+        for i in range(3)
+    }
+    return lg.Model({"plate": body}, joints)
+
+
+def test_assembly_moves_along_the_constraint_directions():
+    """q = q_ref exp(x̃) with M x in the row space of B(q_ref): what an impulse of the rods would do."""
+    model = tripod(np.array([0.1, -0.05, 0.2]))
+    initial, system = start(model), model.system()
+    assert initial.result == lg.RESULTS.successful
+    assert np.abs(initial.violation).max() <= 1e-12
+    x = np.asarray(system.group.log(system.group.compose(system.group.inverse(system.pose), initial.state.q)))
+    assert np.abs(x).max() > 0.05
+    mass, jacobian = map(np.asarray, matrices(model, system.pose))
+    tangents = null_space(jacobian)
+    # log costs a few round-offs of R, and M multiplies them
+    close(tangents.T @ mass @ x, np.zeros(3), 50, scale=np.linalg.norm(mass))
+    np.testing.assert_allclose(displaced(system.pose, x).position, initial.state.q.position, rtol=0, atol=8 * EPS)
+
+
+def test_autodiff_tangents_serve_as_tangents_of_any_system():
+    """The ready implementation for systems without their own equals the hand-derived ones at a consistent state."""
+    model = double_pendulum(0)
+    state = start(model).state
+    point = (state.q, state.v, state.vdot, state.lam, TIME)
+    expected = jax.jit(lambda m: m.system().tangents(*point))(model)
+    actual = jax.jit(lambda m: autodiff_tangents(m.system(), *point))(model)
+    jax.tree.map(lambda x, y: close(x, y, 500), actual, expected)  # sums of some ten terms, see test_system
+    assert isinstance(state.q, Pose)

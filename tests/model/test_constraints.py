@@ -1,0 +1,170 @@
+"""The basic constraints: closed-form tangents against autodiff, and against differences that share no code."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import GRAVITY, central_difference, close, moved, moved_without_library, random_body, random_point, random_rotation
+
+import lgsens as lg
+from lgsens.model import AbstractConstraint, AbstractJoint, Coincidence, Distance, Frame, InPlane, Orthogonality
+
+KINDS = {"Coincidence": Coincidence, "Orthogonality": Orthogonality, "InPlane": InPlane, "Distance": Distance}
+ROWS = {"Coincidence": 3, "Orthogonality": 1, "InPlane": 1, "Distance": 1}
+POSES = 20
+
+# Points, axes and multipliers are of order 1, |d| lies between 1 and 10, and a formula has up to six products
+# of matrices: some ten round-offs of the largest entry. 200 leaves room and tells any wrong term.
+ULPS = 200
+
+
+def sample(name, seed=0):
+    """`POSES` elements of one kind, two frames each (four metres apart, so that |d| is not small) and multipliers."""
+    rng = np.random.default_rng(seed)
+    fields = {"point_a": 3, "point_b": 3, "axis_a": 3, "axis_b": 3}
+    own = [f for f in fields if f in KINDS[name].__dataclass_fields__]
+    values = {f: jnp.asarray(rng.normal(scale=0.5, size=(POSES, 3))) for f in own}
+    if name == "Distance":
+        values["length"] = jnp.asarray(rng.uniform(1.0, 3.0, POSES))
+    frames = []
+    for offset in (0.0, 4.0):
+        position = rng.normal(scale=0.5, size=(POSES, 3)) + np.array([offset, 0.0, 0.0])
+        frames.append(Frame(jnp.asarray(position), jnp.asarray([random_rotation(rng) for _ in range(POSES)])))
+    return KINDS[name](**values), *frames, jnp.asarray(rng.normal(size=(POSES, ROWS[name])))
+
+
+@eqx.filter_jit
+@eqx.filter_vmap
+def closed_form(element, a, b, lam):
+    return element.value(a, b), element.jacobian(a, b), element.geometric_stiffness(a, b, lam)
+
+
+@eqx.filter_jit
+@eqx.filter_vmap
+def differentiated(element, a, b, lam):
+    """B = ∂Φ/∂x, and ∂/∂x of Bᵀλ where B is itself the derivative at the moved pose."""
+
+    def jacobian(x):
+        first, second = moved(a, x[:6]), moved(b, x[6:])
+        return jax.jacfwd(lambda y: element.value(moved(first, y[:6]), moved(second, y[6:])))(jnp.zeros_like(x))
+
+    zero = jnp.zeros(12, a.position.dtype)
+    return jacobian(zero), jax.jacfwd(lambda x: lam @ jacobian(x))(zero)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_tangents_equal_autodiff(name):
+    element, a, b, lam = sample(name)
+    value, jacobian, stiffness = closed_form(element, a, b, lam)
+    expected_jacobian, expected_stiffness = differentiated(element, a, b, lam)
+    assert value.shape == (POSES, element.num_rows) == (POSES, ROWS[name])
+    close(jacobian, expected_jacobian, ULPS)
+    close(stiffness, expected_stiffness, ULPS)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_tangents_equal_central_differences(name):
+    """Differences of the value, and of Bᵀλ, by rotations from SciPy."""
+    element, a, b, lam = jax.tree.map(lambda leaf: leaf[:1], sample(name, seed=1))
+    _, jacobian, stiffness = closed_form(element, a, b, lam)
+
+    def at(x):
+        first, second = (Frame(*(leaf[0] for leaf in frame)) for frame in (a, b))
+        first, second = moved_without_library(first, x[:6]), moved_without_library(second, x[6:])
+        frames = (Frame(*(jnp.asarray(leaf)[None] for leaf in frame)) for frame in (first, second))
+        value, jacobian, _ = closed_form(element, *frames, lam)
+        return value[0], lam[0] @ jacobian[0]
+
+    # Values up to 10 m and third derivatives of that size: 4e-11 × 10 (see `central_difference`), with a margin of 10.
+    for actual, index in ((jacobian[0], 0), (stiffness[0], 1)):
+        expected = central_difference(lambda x, index=index: at(x)[index], 12)
+        np.testing.assert_allclose(actual, expected, rtol=0, atol=4e-9)
+
+
+# The same joints as a user writes them: a value and nothing else.
+
+
+class UserCoincidence(AbstractConstraint):
+    point_a: jax.Array
+    point_b: jax.Array
+
+    @property
+    def num_rows(self):
+        return 3
+
+    def value(self, a, b):
+        return b.position + b.orientation @ self.point_b - (a.position + a.orientation @ self.point_a)
+
+
+class UserDistance(AbstractConstraint):
+    point_a: jax.Array
+    point_b: jax.Array
+    length: jax.Array
+
+    @property
+    def num_rows(self):
+        return 1
+
+    def value(self, a, b):
+        first = a.position + a.orientation @ self.point_a
+        second = b.position + b.orientation @ self.point_b
+        return jnp.sqrt(jnp.sum((second - first) ** 2, keepdims=True)) - self.length[None]
+
+
+class UserJoint(AbstractJoint):
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at: jax.Array
+
+    @property
+    def assembled(self):
+        return True
+
+    def constraints(self, a, b):
+        return (UserCoincidence(a.orientation.T @ (self.at - a.position), b.orientation.T @ (self.at - b.position)),)
+
+
+class UserRod(AbstractJoint):
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at_a: jax.Array
+    at_b: jax.Array
+
+    @property
+    def assembled(self):
+        return True
+
+    def constraints(self, a, b):
+        point_a = a.orientation.T @ (self.at_a - a.position)
+        point_b = b.orientation.T @ (self.at_b - b.position)
+        return (UserDistance(point_a, point_b, jnp.linalg.norm(self.at_b - self.at_a)),)
+
+
+def users_scene(own: bool):
+    rng = np.random.default_rng(3)
+    bodies = {name: random_body(rng, angular_velocity=rng.normal(size=3)) for name in ("one", "two")}
+    ground, between, end_a, end_b = (jnp.asarray(rng.uniform(-1, 1, 3)) for _ in range(4))
+    ball, rod = (UserJoint, UserRod) if own else (lg.SphericalJoint, lg.DistanceJoint)
+    joints = {
+        "pivot": ball("one", None, at=ground),
+        "ball": ball("one", "two", at=between),
+        "rod": rod(None, "two", at_a=end_a, at_b=end_b),
+    }
+    return lg.Model(bodies, joints, {"gravity": lg.Gravity(GRAVITY)})
+
+
+@eqx.filter_jit
+def evaluate(model, point):
+    system = model.system()
+    return system.residual(*point), system.constraint(point.q), system.tangents(*point)
+
+
+def test_constraint_without_tangents_gets_them():
+    own, library = users_scene(own=True), users_scene(own=False)
+    system = library.system()
+    assert own.system().constraint_names == system.constraint_names
+    for seed in range(3):
+        point = random_point(system, np.random.default_rng(seed))
+        actual, expected = evaluate(own, point), evaluate(library, point)
+        jax.tree.map(lambda x, y: close(x, y, ULPS), actual, expected)
