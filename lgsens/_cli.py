@@ -10,8 +10,8 @@ from typing import NoReturn
 import jax
 
 from lgsens import _cli_optimize, _cli_top
+from lgsens._cli_report import version
 from lgsens._errors import SimulationError
-from lgsens._version import version
 from lgsens.examples import PARAMETERS
 
 BAD_INPUT = 2
@@ -39,38 +39,57 @@ def _count(text: str) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser("lgsens", description="Differentiable constrained multibody dynamics on Lie groups in JAX.")
+    parser = _Parser(
+        "lgsens", description="Differentiable constrained multibody dynamics on Lie groups in JAX."
+    )
     parser.add_argument("--version", action="version", version=f"lgsens {version()}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     optimize = commands.add_parser(
         "optimize",
         help="optimize a suspension",
-        description="Find the suspension whose chassis accelerates least over a bump, its tyre on the road and its "
-        "spring within its travel (Sonneville & Brüls 2014, §9).",
+        description="Find the suspension whose chassis accelerates least over a bump, its tyre on the "
+        "road and its spring within its travel (Sonneville & Brüls 2014, §9).",
     )
     optimize.add_argument("problem", choices=["quarter-car"], help="what to optimize")
-    optimize.add_argument("--out", type=Path, default=Path("out/quarter-car"), metavar="DIR",
-                          help="folder for result.json and the figures, a new one (default: %(default)s)")  # fmt: skip
+    optimize.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/quarter-car"),
+        metavar="DIR",
+        help="new folder for result.json and the figures (default: %(default)s)",
+    )
     optimize.add_argument("--overwrite", action="store_true", help="write into --out even if it exists")
-    optimize.add_argument("--hardpoints", type=Path, metavar="FILE.toml",
-                          help="a suspension of your own (default: the one that ships with lgsens)")  # fmt: skip
-    optimize.add_argument("--parameters", choices=list(PARAMETERS), default="k,c",
-                          help="what to change: stiffness k and damping c, the chassis hardpoints, or all "
-                          "(default: %(default)s)")  # fmt: skip
+    optimize.add_argument(
+        "--hardpoints",
+        type=Path,
+        metavar="FILE.toml",
+        help="a suspension of your own (default: the one that ships with lgsens)",
+    )
+    optimize.add_argument(
+        "--parameters",
+        choices=list(PARAMETERS),
+        default="k,c",
+        help="what to change: stiffness k and damping c, chassis hardpoints, or all (default: %(default)s)",
+    )
     optimize.add_argument("--t1", type=_positive, default=2.0, help="duration [s] (default: %(default)s)")
     optimize.add_argument("--dt", type=_positive, default=2e-3, help="step size [s] (default: %(default)s)")
-    optimize.add_argument("--steps", type=_count, default=60,
-                          help="number of gradients of the optimizer (default: %(default)s)")  # fmt: skip
-    optimize.add_argument("--wheel", choices=["hinged", "locked"], default="hinged",
-                          help="whether the wheel turns on its hinge (default: %(default)s)")  # fmt: skip
+    optimize.add_argument(
+        "--steps", type=_count, default=60, help="gradients that the optimizer takes (default: %(default)s)"
+    )
+    optimize.add_argument(
+        "--wheel",
+        choices=["hinged", "locked"],
+        default="hinged",
+        help="whether the wheel turns on its hinge (default: %(default)s)",
+    )
     optimize.add_argument("--quiet", action="store_true", help="no progress bar and no table")
     optimize.set_defaults(run=_cli_optimize.run)
 
     top = commands.add_parser(
         "top",
         help="differentiate the spinning top",
-        description="The sensitivity of the paper's spinning top (§8) by every method, beside its reference value.",
+        description="The sensitivity of the paper's spinning top (§8) by every method, beside its reference.",
     )
     top.add_argument("--h", type=_positive, default=1e-3, help="step size [s] (default: %(default)s)")
     top.set_defaults(run=_cli_top.run)

@@ -22,7 +22,9 @@ PERTURBATION = 2e-3
 def run(arguments: argparse.Namespace) -> int:
     """Print Ψ and dΨ/dα₀ by DDM, AVM, the explicit AVM and differences."""
     if arguments.h > 0.1:
-        raise ValueError(f"argument --h: must be at most 0.1 s, a tenth of the simulated second, got {arguments.h}")
+        raise ValueError(
+            f"argument --h: must be at most 0.1 s, a tenth of the simulated second, got {arguments.h}"
+        )
     num_steps = max(1, round(1.0 / arguments.h))
     alpha0 = jnp.asarray(math.pi / 4)
 

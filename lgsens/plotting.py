@@ -1,4 +1,4 @@
-"""Figures: time histories with their limits, convergence, the mechanism in space; on matplotlib, imported when used.
+"""Figures: time histories with their limits, convergence, the mechanism in space; matplotlib is imported late.
 
 Figures are made without pyplot, so they need no display and leave no global state; in a notebook they show
 themselves, and `save` writes them.
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 COLOURS = ("#8c8c8c", "#1b62a5", "#d9822b", "#3a8a4d")  # before in grey, after in blue, then others
 LIMIT = "#b3262e"
-ROLES = {"bar": "#1b62a5", "solid": "#3a8a4d", "wheel": "#3c3c3c", "spring": "#d9822b", "damper": "#7a4b9a"}
+ROLES = {"link": "#1b62a5", "body": "#3a8a4d", "wheel": "#3c3c3c", "spring": "#d9822b", "damper": "#7a4b9a"}
 
 
 class Panel(NamedTuple):
@@ -32,11 +32,11 @@ class Panel(NamedTuple):
 
     label: str
     series: Mapping[str, Any]
-    limits: Mapping[str, float] = {}  # noqa: RUF012 (read only)
+    limits: Mapping[str, float] = {}
 
 
 def figure(width: float = 7.0, height: float = 4.5) -> "Figure":
-    """An empty figure of this size [inch]. Raises `ImportError` saying what to install where matplotlib is missing."""
+    """An empty figure of this size [inch]. Raises `ImportError` that says what to install, if need be."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -98,7 +98,9 @@ def time_histories(t, panels: Sequence[Panel], title: str = "") -> "Figure":
     return fig
 
 
-def convergence(history: Any, *, tolerance: float, best: int | None = None, objective: str = "objective") -> "Figure":
+def convergence(
+    history: Any, *, tolerance: float, best: int | None = None, objective: str = "objective"
+) -> "Figure":
     """The objective, the worst constraint and the projected gradient over the steps of a minimization.
 
     Arguments:
@@ -123,8 +125,7 @@ def convergence(history: Any, *, tolerance: float, best: int | None = None, obje
         high = max(high, 10 * tolerance)
         middle.axhspan(tolerance, high, color=LIMIT, alpha=0.10, linewidth=0)
         middle.set_ylim(low, high)
-        middle.annotate("violated", (1.0, 1.0), xycoords="axes fraction", xytext=(-4, -4),
-                        textcoords="offset points", ha="right", va="top", color=LIMIT, fontsize=9)  # fmt: skip
+        middle.text(0.99, 0.97, "violated", transform=middle.transAxes, ha="right", va="top", color=LIMIT)
     if best is not None:
         values = (history.objective, history.worst_constraint, history.gradient_norm)
         for axes, value in zip((top, middle, bottom), values):
@@ -140,11 +141,13 @@ def convergence(history: Any, *, tolerance: float, best: int | None = None, obje
     return fig
 
 
-def mechanism(models: Mapping[str, Model], title: str = "", view: tuple[float, float] = (18.0, -38.0)) -> "Figure":
-    """Mechanisms in their reference configuration, in space and with equal axes: the last in colour, the others grey.
+def mechanism(
+    models: Mapping[str, Model], title: str = "", view: tuple[float, float] = (18.0, -38.0)
+) -> "Figure":
+    """Mechanisms in their reference configuration, in space; the last in colour, those before it in grey.
 
     A body is drawn from the points at which joints hold it: two make a bar, more a solid; one with a tyre
-    is a wheel. Springs are coils, dampers tubes with a rod.
+    is a wheel. The axes are equal. Springs are coils, dampers tubes with a rod.
 
     Arguments:
         models: scenes by name, drawn over each other.
@@ -162,7 +165,11 @@ def mechanism(models: Mapping[str, Model], title: str = "", view: tuple[float, f
         if not last:
             handles += axes.plot([], [], [], color=COLOURS[0], linewidth=3, label=name)
         elif len(models) > 1:
-            handles += axes.plot([], [], [], color=ROLES["bar"], linewidth=3, label=name)
+            handles += axes.plot([], [], [], color=ROLES["link"], linewidth=3, label=name)
+        else:
+            handles += [
+                axes.plot([], [], [], color=c, linewidth=3, label=role)[0] for role, c in ROLES.items()
+            ]
     points = np.asarray(points)
     low, high = points.min(axis=0), points.max(axis=0)
     margin = 0.03 * np.max(high - low)
@@ -186,7 +193,9 @@ def _draw(axes: Any, model: Model, colours: Mapping[str, str]) -> list[np.ndarra
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     held, drawn = _joint_points(model), []
-    wheels = {force.body: np.asarray(force.at) for force in model.forces.values() if isinstance(force, TyreSpring)}
+    wheels = {
+        force.body: np.asarray(force.at) for force in model.forces.values() if isinstance(force, TyreSpring)
+    }
     for name, points in held.items():
         drawn += points
         if name in wheels:
@@ -195,12 +204,14 @@ def _draw(axes: Any, model: Model, colours: Mapping[str, str]) -> list[np.ndarra
             axes.plot(*circle.T, color=colours["wheel"], linewidth=2.5, alpha=0.8)
             drawn += list(circle)
         elif len(points) == 2:
-            axes.plot(*np.transpose(points), color=colours["bar"], linewidth=4.5, solid_capstyle="round")
+            axes.plot(*np.transpose(points), color=colours["link"], linewidth=4.5, solid_capstyle="round")
         elif len(points) > 2:
             faces = _hull(np.asarray(points))
-            axes.add_collection3d(Poly3DCollection(faces, facecolor=colours["solid"], alpha=0.16, linewidth=0))
+            axes.add_collection3d(Poly3DCollection(faces, facecolor=colours["body"], alpha=0.16, linewidth=0))
             for face in faces if len(faces) > 1 else ():
-                axes.plot(*np.concatenate([face, face[:1]]).T, color=colours["solid"], linewidth=0.4, alpha=0.5)
+                axes.plot(
+                    *np.concatenate([face, face[:1]]).T, color=colours["body"], linewidth=0.4, alpha=0.5
+                )
     for force in model.forces.values():
         if isinstance(force, SpringDamper):
             a, b = np.asarray(force.at_a), np.asarray(force.at_b)
@@ -208,19 +219,21 @@ def _draw(axes: Any, model: Model, colours: Mapping[str, str]) -> list[np.ndarra
                 axes.plot(*_coil(a, b).T, color=colours["spring"], linewidth=1.8)
             else:
                 axes.plot(*np.transpose([a, b]), color=colours["damper"], linewidth=1.8)
-                axes.plot(*np.transpose([a, a + 0.6 * (b - a)]), color=colours["damper"], linewidth=6, alpha=0.45)
+                axes.plot(
+                    *np.transpose([a, a + 0.6 * (b - a)]), color=colours["damper"], linewidth=6, alpha=0.45
+                )
             drawn += [a, b]
     joints = np.asarray([point for points in held.values() for point in points])
     if joints.size:
-        axes.scatter(*joints.T, color="white", edgecolors=colours["bar"], s=24, depthshade=False, zorder=5)
+        axes.scatter(*joints.T, color="white", edgecolors=colours["link"], s=24, depthshade=False, zorder=5)
     return drawn
 
 
 def _joint_points(model: Model) -> dict[str, list[np.ndarray]]:
     """The points of each body at which a joint connects it to another one.
 
-    Not those to the ground (a guide of the chassis says nothing of its shape), nor those of springs (which would
-    make a solid of a bar).
+    Not those to the ground (a guide of the chassis says nothing of its shape), nor those of springs (which
+    would make a solid of a bar).
     """
     held: dict[str, list[np.ndarray]] = {name: [] for name in model.bodies}
     for joint in model.joints.values():

@@ -54,12 +54,13 @@ class Part(eqx.Module):
 
 
 class QuarterCar(eqx.Module):
-    """A quarter-car with a five-link suspension: its data, all numbers leaves. `QuarterCar.load()` reads them.
+    """A quarter-car with a five-link suspension: its data, all numbers leaves. `QuarterCar.load()` reads
+    them.
 
     Five links, knuckle, wheel and chassis are eight rigid bodies. Each link has a universal joint at the
-    chassis and a spherical joint at the knuckle; the wheel turns on a hinge of the knuckle or is locked to it;
-    the chassis heaves only. With 48 coordinates and 45 (46) constraints the mechanism has 3 (2) degrees of
-    freedom. Frame: x forward, y left, z up; SI units.
+    chassis and a spherical joint at the knuckle; the wheel turns on a hinge of the knuckle or is locked to
+    it; the chassis heaves only. With 48 coordinates and 45 (46) constraints the mechanism has 3 (2) degrees
+    of freedom. Frame: x forward, y left, z up; SI units.
 
     Source: Sonneville & Brüls (2014), §9; hardpoints, masses and rates from BPMinaker/eom_pkg,
     input_5link.m (R. Rieveley 2009).
@@ -82,8 +83,9 @@ class QuarterCar(eqx.Module):
     def load(path: str | Path | None = None) -> "QuarterCar":
         """Read a suspension from a TOML file; None: the one that ships with lgsens.
 
-        The shipped file, `lgsens/examples/data/five_link_suspension.toml`, shows the format. Raises `ValueError`
-        naming the file and the key (or the line) for a file that cannot be read or is incomplete.
+        The shipped file, `lgsens/examples/data/five_link_suspension.toml`, shows the format. Raises
+        `ValueError` naming the file and the key (or the line) for a file that cannot be read or is
+        incomplete.
         """
         return _parse(*_read(path))
 
@@ -92,8 +94,8 @@ class QuarterCar(eqx.Module):
 
         Arguments:
             wheel: "hinged" (45 constraints, 3 degrees of freedom) or "locked" (46 and 2).
-            free_length: free length of the spring [m]. None: the preloads of spring and tyre are those that hold
-                the car at the design position, whatever the parameters, and so are their derivatives.
+            free_length: free length of the spring [m]. None: the preloads of spring and tyre are those that
+                hold the car at the design position, whatever the parameters, and so are their derivatives.
             free_radius: free radius of the tyre [m], with `free_length`.
 
         Raises `ValueError` for an unknown kind of wheel.
@@ -180,7 +182,9 @@ class _Reader:
 
     def _get(self, key: str) -> Any:
         if key not in self._table:
-            raise self._fail(key, "is missing; see lgsens/examples/data/five_link_suspension.toml for the format.")
+            raise self._fail(
+                key, "is missing; see lgsens/examples/data/five_link_suspension.toml for the format."
+            )
         return self._table[key]
 
     def table(self, key: str) -> "_Reader":
@@ -202,16 +206,26 @@ class _Reader:
 
     def vector(self, key: str, scale: float = 1.0) -> Array:
         value = self._get(key)
-        is_number = [isinstance(x, int | float) and not isinstance(x, bool) for x in value] if isinstance(value, list) else []
+        is_number = (
+            [isinstance(x, int | float) and not isinstance(x, bool) for x in value]
+            if isinstance(value, list)
+            else []
+        )
         if len(is_number) != 3 or not all(is_number):
             raise self._fail(key, f"must be three numbers [x, y, z], got {value!r}.")
         return as_float([x * scale for x in value], (3,), key)
 
     def interval(self, key: str) -> tuple[Array, Array]:
         value = self._get(key)
-        is_number = [isinstance(x, int | float) and not isinstance(x, bool) for x in value] if isinstance(value, list) else []
+        is_number = (
+            [isinstance(x, int | float) and not isinstance(x, bool) for x in value]
+            if isinstance(value, list)
+            else []
+        )
         if len(is_number) != 2 or not all(is_number) or not 0 < value[0] < value[1]:
-            raise self._fail(key, f"must be two numbers [lower, upper] with 0 < lower < upper, got {value!r}.")
+            raise self._fail(
+                key, f"must be two numbers [lower, upper] with 0 < lower < upper, got {value!r}."
+            )
         return as_float(value[0], (), key), as_float(value[1], (), key)
 
     def choice(self, key: str, known) -> str:
@@ -243,11 +257,15 @@ def _parse(document: dict, path: str) -> QuarterCar:
     metre, kilogram = float(units.number("length")), float(units.number("mass"))
     table = root.table("links")
     if len(table.names()) != 5:
-        raise ValueError(f"Hardpoint file {path!r}, key 'links': five links are needed, got {sorted(table.names())}.")
+        raise ValueError(
+            f"Hardpoint file {path!r}, key 'links': five links are needed, got {sorted(table.names())}."
+        )
     links = {}
     for name in table.names():
         link = table.table(name)
-        links[name] = Link(link.vector("chassis", metre), link.vector("knuckle", metre), link.number("mass", kilogram))
+        links[name] = Link(
+            link.vector("chassis", metre), link.vector("knuckle", metre), link.number("mass", kilogram)
+        )
 
     def part(key: str, centre: str) -> Part:
         body = root.table(key)

@@ -22,7 +22,7 @@ PARAMETERS = {
 
 
 class DesignLimits(eqx.Module):
-    """The limits of a suspension design; `DesignLimits.load()` reads the table `[design]` of a hardpoint file.
+    """The limits of a suspension design, the table `[design]` of a hardpoint file; `DesignLimits.load()`.
 
     Attributes:
         minimum_tyre_force: F_min of eq. (48) [N].
@@ -42,15 +42,16 @@ class DesignLimits(eqx.Module):
     def load(path: str | Path | None = None) -> "DesignLimits":
         """Read the limits from a TOML file; None: the one that ships with lgsens.
 
-        Raises `ValueError` naming the file and the key for a table that is missing, incomplete or contradictory.
+        Raises `ValueError` naming the file and the key for a table that is missing, incomplete or
+        contradictory.
         """
         document, name = _read(path)
         table = _Reader(document, name).table("design")
         shortest, longest = table.number("minimum_spring_length"), table.number("maximum_spring_length")
         if not shortest < longest:
             raise ValueError(
-                f"Hardpoint file {name!r}, key 'design.maximum_spring_length': must exceed minimum_spring_length = "
-                f"{float(shortest)}, got {float(longest)}."
+                f"Hardpoint file {name!r}, key 'design.maximum_spring_length': must exceed "
+                f"minimum_spring_length = {float(shortest)}, got {float(longest)}."
             )
         return DesignLimits(
             table.number("minimum_tyre_force", positive=False),
@@ -83,16 +84,17 @@ class Response(NamedTuple):
 
 
 class SuspensionDesign(eqx.Module):
-    """Find the most comfortable quarter-car over a bump that keeps its tyre on the road and its travel in bounds.
+    """The most comfortable quarter-car over a bump that keeps its tyre on the road and within its travel.
 
         min Ψ₀ = ∫ v̇_z² dt of the chassis                    (47)
         Ψ₁(t) = F_min − F(t) ≤ 0   over the static tyre force  (48)
         Ψ₂(t) = l_min − l(t) ≤ 0   over l_max − l_min          (49)
         Ψ₃(t) = l(t) − l_max ≤ 0   over l_max − l_min          (50)
 
-    at every time step. The design is a dict: `stiffness` k [N/m] and `damping` c [N s/m] of shape (), `hardpoints`
-    [m] of shape (5, 3), the chassis ends of the links in sorted order of their names, or all three. Whatever the
-    design, the preloads of spring and tyre are those that hold the car at rest at the design position.
+    at every time step. The design is a dict: `stiffness` k [N/m] and `damping` c [N s/m] of shape (),
+    `hardpoints` [m] of shape (5, 3), the chassis ends of the links in sorted order of their names, or all
+    three. Whatever the design, the preloads of spring and tyre are those that hold the car at rest at the
+    design position.
 
     Arguments:
         car: the suspension to start from.
@@ -102,15 +104,20 @@ class SuspensionDesign(eqx.Module):
         t1: duration [s]. num_steps: its number of steps, static.
 
     The limits that ship with lgsens, and why:
-      - the start (k = 109 kN/m, c = 4.9 kN s/m, as in the source) is a firm production set-up: motion ratios 0.60
-        and 0.89 give 40 N/mm at the wheel, the body at 1.4 Hz with 0.49 of critical damping;
+      - the start (k = 109 kN/m, c = 4.9 kN s/m, as in the source) is a firm production set-up: motion ratios
+        0.60 and 0.89 give 40 N/mm at the wheel, the body at 1.4 Hz with 0.49 of critical damping;
       - F_min = 650 N is 15 % of the static 4,428 N: some grip is left on the far side of the bump;
-      - l_min = 254 mm is 35 mm of wheel travel over the design position (275 mm), where a jounce bumper begins, which a
-        bump as common as this one should not touch; l_max = 300 mm is 41 mm of travel down to the rebound stop;
-      - k from 50 to 200 kN/m is the body at 1.0 to 1.8 Hz: below, 100 kg over this corner sink it by more than
-        5 cm and need levelling; above lie sports cars;
+      - l_min = 254 mm is 35 mm of wheel travel over the design position (275 mm), where a jounce bumper
+        begins, which a bump as common as this one should not touch; l_max = 300 mm is 41 mm of travel down to
+        the rebound stop;
+      - k from 50 to 200 kN/m is the body at 1.0 to 1.8 Hz: below, 100 kg over this corner sink it by more
+        than 5 cm and need levelling; above lie sports cars;
       - c from 1.5 to 10 kN s/m is 0.15 to 1 of critical damping at the start's stiffness;
       - ±30 mm is the room that a subframe usually leaves around a link's bush.
+
+    Hardpoints change the motion ratios too, and by them the rates at the wheel: with the paper's constraints
+        alone
+    that is what their optimum uses. Links keep their masses.
 
     Raises `ValueError` for unknown parameters. Source: Sonneville & Brüls (2014), §9.
     """
@@ -161,7 +168,9 @@ class SuspensionDesign(eqx.Module):
             car = eqx.tree_at(lambda c: c.damper.rate, car, design["damping"])
         if "hardpoints" in design:
             names = sorted(car.links)
-            car = eqx.tree_at(lambda c: [c.links[name].chassis for name in names], car, list(design["hardpoints"]))
+            car = eqx.tree_at(
+                lambda c: [c.links[name].chassis for name in names], car, list(design["hardpoints"])
+            )
         return car
 
     def simulate(self, design: dict[str, Array], throw: bool = True) -> Trajectory:
@@ -175,7 +184,12 @@ class SuspensionDesign(eqx.Module):
         acceleration = trajectory.body("chassis").acceleration[:, 2]
         length, force = trajectory.force("spring").length, trajectory.force("tyre")
         car = self.car
-        masses = [car.chassis.mass, car.knuckle.mass, car.wheel.mass, *(link.mass for link in car.links.values())]
+        masses = [
+            car.chassis.mass,
+            car.knuckle.mass,
+            car.wheel.mass,
+            *(link.mass for link in car.links.values()),
+        ]
         static_force = GRAVITY * jnp.sum(jnp.stack(masses))
         travel = limits.maximum_spring_length - limits.minimum_spring_length
         constraints = (

@@ -21,7 +21,9 @@ class Box(NamedTuple):
 
     def _ends(self):
         safe = lambda bound: jnp.log(jnp.where(self.log, bound, 1.0))  # noqa: E731
-        return jnp.where(self.log, safe(self.lower), self.lower), jnp.where(self.log, safe(self.upper), self.upper)
+        return jnp.where(self.log, safe(self.lower), self.lower), jnp.where(
+            self.log, safe(self.upper), self.upper
+        )
 
     def scaled(self, x):
         lower, upper = self._ends()
@@ -45,7 +47,8 @@ def checked_box(x0, lower, upper, log_scale) -> tuple[Array, Callable[[Array], P
     def vector(tree, what: str, convert) -> Array:
         if jax.tree.structure(tree) != jax.tree.structure(x0):
             raise ValueError(
-                f"`{what}` must be a pytree like `x0`, {jax.tree.structure(x0)}, got {jax.tree.structure(tree)}."
+                f"`{what}` must be a pytree like `x0`, {jax.tree.structure(x0)}, "
+                f"got {jax.tree.structure(tree)}."
             )
 
         def leaf(path, x, value):
@@ -67,18 +70,19 @@ def checked_box(x0, lower, upper, log_scale) -> tuple[Array, Callable[[Array], P
     values = (np.asarray(box.lower), np.asarray(box.upper), np.asarray(x), np.asarray(box.log))
     for name, low, high, value, log in zip(names, *values):
         if not low < high:
-            raise ValueError(f"`lower` must be below `upper`, got {low} and {high} for x{name}.")
+            raise ValueError(f"`lower` must be below `upper`, got {low} and {high} for {name}.")
         if not low <= value <= high:
-            raise ValueError(f"`x0` must lie within the bounds: x{name} = {value} is outside [{low}, {high}].")
+            raise ValueError(f"`x0` must lie within the bounds: {name} = {value} is outside [{low}, {high}].")
         if log and not low > 0:
-            raise ValueError(f"A logarithmic scale needs positive bounds, got {low} for x{name}.")
+            raise ValueError(f"A logarithmic scale needs positive bounds, got {low} for {name}.")
     return x, unravel, box
 
 
 def entry_names(tree) -> list[str]:
-    """A name for each number of a pytree, in the order of `ravel_pytree`: ['stiffness'], ['points'][0, 2]."""
+    """Names for the numbers of a pytree, in the order of `ravel_pytree`: stiffness, points[0, 2], x[1]."""
     return [
-        jax.tree_util.keystr(path) + (str(list(map(int, index))) if index else "")
+        (jax.tree_util.keystr(path, simple=True, separator=".") or "x")
+        + (str(list(map(int, index))) if index else "")
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
         for index in np.ndindex(np.shape(leaf))
     ]

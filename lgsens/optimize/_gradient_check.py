@@ -46,8 +46,8 @@ def check_gradient(
     Arguments:
         fun: x ↦ f, shape ().
         x: where, a pytree of arrays.
-        scale: the size of a large change of x, a pytree as x whose leaves have the shape of x's or (); None: the
-            largest absolute entry of each leaf.
+        scale: the size of a large change of x, a pytree as x whose leaves have the shape of x's or (); None:
+            the largest absolute entry of each leaf.
         step: h as a fraction of the scale; None: the cube root of round-off, where truncation (h²) and
             round-off (ε/h) are of one size.
         max_directions: with more entries than this, so many random directions of unit length (in scaled
@@ -56,8 +56,8 @@ def check_gradient(
         value_and_grad: x ↦ (f, ∇f), to use one that is compiled already; None: that of `fun`.
 
     Returns the comparison as data; nothing is raised where they differ. The difference of two f that agree to
-    ε loses digits, so an error of about ε^(2/3), some 1e-9 in 64 bits, is as good as it gets. Raises `ValueError`
-    for an f that is not a scalar, or a step that is not positive.
+    ε loses digits, so an error of about ε^(2/3), some 1e-9 in 64 bits, is as good as it gets. Raises
+    `ValueError` for an f that is not a scalar, or a step that is not positive.
     """
     x = jax.tree.map(lambda leaf: as_float(leaf, None, "`x`"), x)
     flat, unravel = ravel_pytree(x)

@@ -1,12 +1,13 @@
 """Bounded minimization under path constraints, on optax.
 
-With many constraints g_i(x) ≤ 0 (every time step of a trajectory is one, paper eqs. 48–50) and few active, the augmented
-Lagrangian needs one gradient per step, whatever their number:
+With many constraints g_i(x) ≤ 0 (every time step of a trajectory is one, paper eqs. 48–50) and few active,
+the augmented Lagrangian needs one gradient per step, whatever their number:
 
     L(x; μ, ρ) = f(x)/|f(x₀)| + Σ_i [max(0, μ_i + ρ g_i)² − μ_i²] / (2ρ),      μ_i ← max(0, μ_i + ρ g_i)
 
 Adam with a decaying rate descends on L in variables scaled to [0, 1] between the bounds, clipped to them; the
-multipliers follow every few steps, and ρ grows while the violation does not fall (Nocedal & Wright 2006, §17.4).
+multipliers follow every few steps, and ρ grows while the violation does not fall (Nocedal & Wright 2006,
+§17.4).
 """
 
 import operator
@@ -24,9 +25,12 @@ from lgsens.optimize._box import Box, checked_box
 
 PENALTY = 30.0  # ρ at first: f and g are both scaled to about 1
 PENALTY_GROWTH = 2.0
+LARGEST_PENALTY = 100.0  # a larger one makes L so stiff that Adam only zigzags; μ does the rest
 PERIOD = 5  # steps of Adam between two updates of the multipliers
+LARGEST_GRADIENT = 1.0  # f is scaled to 1: longer gradients are those of a violation, which Adam would remember
 DECAY = 0.02  # the last learning rate over the first
-ADAM_DECAYS = (0.5, 0.9)  # shorter memories than its own: these gradients carry no noise, and L changes with μ
+# Shorter memories than Adam's own: these gradients carry no noise, and L changes with μ.
+ADAM_DECAYS = (0.5, 0.99)
 
 
 class History(NamedTuple):
@@ -35,7 +39,8 @@ class History(NamedTuple):
     Attributes:
         objective: f, shape (n,).
         worst_constraint: max g, shape (n,); −∞ without constraints.
-        gradient_norm: length of the projected gradient step clip(z − ∇L) − z in the scaled variables z, shape (n,).
+        gradient_norm: length of the projected gradient step clip(z − ∇L) − z in the scaled variables z, shape
+            (n,).
         design: x, its leaves with a leading axis n.
     """
 
@@ -49,8 +54,8 @@ class OptimizationResult(NamedTuple):
     """The outcome of `minimize`.
 
     Attributes:
-        x: the best design: the lowest objective among those that satisfy the constraints to tolerance, or, where none
-            does, the one that violates them least.
+        x: the best design: the lowest objective among those that satisfy the constraints to tolerance, or,
+            where none does, the one that violates them least.
         objective: f(x).
         constraints: g(x), in the shape `fun` gave them.
         feasible: whether max g(x) ≤ constraint_tolerance.
@@ -100,21 +105,21 @@ def minimize(
     """min f(x) subject to g(x) ≤ 0 and lower ≤ x ≤ upper.
 
     Arguments:
-        fun: x ↦ (f, g): the objective, shape (), and the constraints, an array of any shape, each scaled so that 1 is a
-            large violation; an empty array for none. Traced once, differentiated in reverse mode.
+        fun: x ↦ (f, g): the objective, shape (), and the constraints, an array of any shape, each scaled so
+            that 1 is a large violation; an empty array for none. Traced once, differentiated in reverse mode.
         x0: where to start, a pytree of arrays within the bounds. It need not satisfy g ≤ 0.
         lower, upper: the bounds, pytrees as x0; a leaf of shape () bounds every entry.
         num_steps: number of evaluations of f, g and one gradient; the first is at x0.
         learning_rate: first step of Adam as a fraction of the distance between the bounds.
-        log_scale: whether to search by the logarithm, a bool or a pytree of bools as x0; for positive rates whose
-            bounds are a decade apart.
+        log_scale: whether to search by the logarithm, a bool or a pytree of bools as x0; for positive rates
+            whose bounds are a decade apart.
         constraint_tolerance: the g up to which a design satisfies its constraints.
         progress: show a bar, if tqdm is installed (`pip install "lgsens[plot]"`).
         callback: called after each step with (step, f, max g).
 
-    A step into a region where f, g or the gradient is not finite is halved until they are. Raises `ValueError` for
-    bounds of another shape than x0, lower ≥ upper, x0 outside them, a logarithmic scale over 0, `num_steps` < 1, a
-    rate or tolerance that is not positive, and an f or g that is not finite at x0.
+    A step into a region where f, g or the gradient is not finite is halved until they are. Raises
+    `ValueError` for bounds of another shape than x0, lower ≥ upper, x0 outside them, a logarithmic scale over
+    0, `num_steps` < 1, a rate or tolerance that is not positive, and an f or g that is not finite at x0.
     """
     try:
         num_steps = operator.index(num_steps)
@@ -127,7 +132,7 @@ def minimize(
             raise ValueError(f"`{name}` must be positive, got {value}.")
     x, unravel, box = checked_box(x0, lower, upper, log_scale)
     schedule = optax.cosine_decay_schedule(learning_rate, num_steps, DECAY)
-    optimizer = optax.adam(schedule, *ADAM_DECAYS)
+    optimizer = optax.chain(optax.clip_by_global_norm(LARGEST_GRADIENT), optax.adam(schedule, *ADAM_DECAYS))
     started = time.perf_counter()
     flat_fun = jax.jit(lambda x: fun(unravel(x)))  # jit keeps its trace: shapes and gradient come from one
     shape = jax.eval_shape(flat_fun, x)
@@ -212,7 +217,9 @@ def _make_step(fun, box: Box, optimizer: optax.GradientTransformation, tolerance
             last_finite=carry.z,
             optimizer=state,
             multipliers=jnp.where(update, pushed, carry.multipliers),
-            penalty=jnp.where(update & stalled, PENALTY_GROWTH, 1.0) * carry.penalty,
+            penalty=jnp.where(
+                update & stalled, jnp.minimum(PENALTY_GROWTH * carry.penalty, LARGEST_PENALTY), carry.penalty
+            ),
             violation=jnp.where(update, worst, carry.violation),
             scale=scale,
         )

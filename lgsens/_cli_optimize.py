@@ -1,0 +1,165 @@
+"""`lgsens optimize quarter-car`: the suspension of the paper's §9, optimized, checked and drawn."""
+
+import argparse
+import contextlib
+import json
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from lgsens import plotting
+from lgsens._cli_report import document, table
+from lgsens.dynamics import RESULTS
+from lgsens.examples import DesignLimits, QuarterCar, Response, SuspensionDesign
+from lgsens.optimize import GradientCheck, OptimizationResult, check_gradient, minimize
+
+TOLERANCE = 1e-3  # of the scale of a constraint
+CHECKED_DIRECTIONS = 4
+
+
+class Outcome(NamedTuple):
+    """What report and figures are made of; `before` and `after` are of the start and the best design."""
+
+    design: SuspensionDesign
+    result: OptimizationResult
+    before: Response
+    after: Response
+    checks: dict[str, GradientCheck]
+    seconds: dict[str, float]
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Optimize, write `result.json` and the figures, print a table; 1 if no design met the constraints."""
+    out: Path = arguments.out
+    if out.exists() and not (arguments.overwrite and out.is_dir()):
+        remedy = "choose another --out DIR, or give --overwrite to replace the files in it"
+        raise ValueError(f"output directory {str(out)!r} exists already: {remedy}")
+    num_steps = round(arguments.t1 / arguments.dt)
+    if num_steps < 1 or abs(num_steps * arguments.dt / arguments.t1 - 1) > 1e-6:
+        raise ValueError(
+            f"--t1 must be a whole number of steps --dt, got t1 = {arguments.t1} s and dt = {arguments.dt} s"
+        )
+    plotting.figure()  # asks for matplotlib now, not after minutes
+    design = SuspensionDesign(
+        QuarterCar.load(arguments.hardpoints),
+        DesignLimits.load(arguments.hardpoints),
+        arguments.parameters,
+        arguments.wheel,
+        arguments.t1,
+        num_steps,
+    )
+    created = not out.exists()
+    out.mkdir(parents=True, exist_ok=True)  # asks for the right to write now, too
+    try:
+        outcome = _optimize(design, arguments.steps, progress=not arguments.quiet)
+    except BaseException:
+        if created:
+            with contextlib.suppress(OSError):
+                out.rmdir()
+        raise
+    settings = {name: value for name, value in vars(arguments).items() if name not in ("run", "command")}
+    text = json.dumps(document(outcome, settings, TOLERANCE), indent=2, default=str, allow_nan=False)
+    (out / "result.json").write_text(text + "\n", encoding="utf-8")
+    _figures(outcome, out)
+    if not arguments.quiet:
+        print(table(outcome, TOLERANCE))
+        print(f"\nwritten to {out}: {', '.join(sorted(path.name for path in out.iterdir()))}")
+    return 0 if outcome.result.feasible else 1
+
+
+def _optimize(design: SuspensionDesign, steps: int, progress: bool) -> Outcome:
+    """The start design, the search, the best design, and the gradients at both against differences."""
+
+    def criteria(x):
+        trajectory = design.simulate(x, throw=False)
+        response = design.response(trajectory)
+        return response.objective, (response, trajectory.result)
+
+    started = time.perf_counter()
+    evaluate = jax.jit(jax.value_and_grad(criteria, has_aux=True)).lower(design.start).compile()
+    compiled = time.perf_counter()
+    # A move of one box or one magnitude is a large change of the design.
+    scale = {name: abs(value) for name, value in design.start.items() if name != "hardpoints"}
+    if "hardpoints" in design.start:
+        scale["hardpoints"] = design.limits.hardpoint_box
+
+    def objective_and_gradient(x):
+        (objective, _), gradient = evaluate(x)
+        return objective, gradient
+
+    def look(x) -> tuple[Response, GradientCheck]:
+        (_, (response, result)), _ = evaluate(x)
+        if int(result) != RESULTS.successful:
+            raise ValueError(f"the suspension cannot be simulated: {RESULTS(int(result)).message}")
+        check = check_gradient(
+            lambda x: design(x)[0],
+            x,
+            scale=scale,
+            max_directions=CHECKED_DIRECTIONS,
+            value_and_grad=objective_and_gradient,
+        )
+        return jax.tree.map(np.asarray, response), check
+
+    before, check_before = look(design.start)
+    lower, upper = design.bounds
+    result = minimize(
+        design,
+        design.start,
+        lower=lower,
+        upper=upper,
+        num_steps=steps,
+        log_scale=design.log_scale,
+        constraint_tolerance=TOLERANCE,
+        progress=progress,
+    )
+    after, check_after = look(result.x)
+    seconds = {
+        "compilation": compiled - started + result.compile_seconds,
+        "optimization": result.run_seconds,
+        "one gradient": result.run_seconds / steps,
+        "total": time.perf_counter() - started,
+    }
+    return Outcome(design, result, before, after, {"start": check_before, "optimum": check_after}, seconds)
+
+
+def _figures(outcome: Outcome, out: Path) -> None:
+    """Responses, convergence and mechanism as PNG files in `out`."""
+    design, before, after = outcome.design, outcome.before, outcome.after
+    limits = design.limits
+    panels = [
+        plotting.Panel(
+            "chassis acceleration\n[m/s²]", {"before": before.acceleration, "after": after.acceleration}
+        ),
+        plotting.Panel(
+            "suspension length\n[mm]",
+            {"before": 1e3 * before.spring_length, "after": 1e3 * after.spring_length},
+            {
+                "$l_{min}$": 1e3 * float(limits.minimum_spring_length),
+                "$l_{max}$": 1e3 * float(limits.maximum_spring_length),
+            },
+        ),
+        plotting.Panel(
+            "tyre force\n[kN]",
+            {"before": before.tyre_force / 1e3, "after": after.tyre_force / 1e3},
+            {"$F_{min}$": float(limits.minimum_tyre_force) / 1e3},
+        ),
+    ]
+    reduction = 100 * (1 - outcome.result.objective / float(before.objective))
+    change = f"{float(before.objective):.3f} to {outcome.result.objective:.3f} m²/s³ (−{reduction:.0f} %)"
+    title = f"Quarter-car over a bump: $\\Psi_0$ from {change}"
+    plotting.save(plotting.time_histories(before.t, panels, title), out / "response.png")
+    fig = plotting.convergence(
+        outcome.result.history, tolerance=TOLERANCE, best=outcome.result.step, objective="$\\Psi_0$ [m²/s³]"
+    )
+    plotting.save(fig, out / "convergence.png")
+    cars = {"before": design.car}
+    if "hardpoints" in design.start:  # k and c do not show
+        cars["after"] = design.with_design(outcome.result.x)
+    # Preloads do not show either; with any free length they are not computed.
+    models = {
+        name: car.model(wheel=design.wheel, free_length=1.0, free_radius=1.0) for name, car in cars.items()
+    }
+    plotting.save(plotting.mechanism(models, title=design.car.name), out / "mechanism.png")

@@ -1,0 +1,148 @@
+"""What `lgsens optimize` says: the document of `result.json` and the table on the terminal."""
+
+import platform
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+
+# Name, quantity of the Response, limit of the DesignLimits, unit; in the order of `Response.constraints`.
+CONSTRAINTS = (
+    ("minimum tyre force", "tyre_force", "minimum_tyre_force", "N"),
+    ("minimum spring length", "spring_length", "minimum_spring_length", "m"),
+    ("maximum spring length", "spring_length", "maximum_spring_length", "m"),
+)
+UNITS = {"stiffness": "N/m", "damping": "N s/m", "hardpoints": "m"}
+
+
+def version(distribution: str = "lgsens") -> str:
+    """The version of an installed distribution; "unknown" for a source tree that is not installed."""
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return "unknown"
+
+
+def document(outcome: Any, settings: dict[str, Any], tolerance: float) -> dict[str, Any]:
+    """Everything about an outcome, as JSON: SI units, finite numbers only."""
+    design, result, before = outcome.design, outcome.result, outcome.before
+    lower, upper = design.bounds
+    return {
+        "problem": "quarter-car",
+        "suspension": design.car.name,
+        "design": {
+            name: {
+                "unit": UNITS[name],
+                "before": _values(design, name, value),
+                "after": _values(design, name, result.x[name]),
+                "lower": _values(design, name, lower[name]),
+                "upper": _values(design, name, upper[name]),
+            }
+            for name, value in design.start.items()
+        },
+        "objective": {
+            "name": "Psi_0, integral of the squared vertical acceleration of the chassis",
+            "unit": "m^2/s^3",
+            "before": float(before.objective),
+            "after": result.objective,
+            "reduction": 1 - result.objective / float(before.objective),
+        },
+        "constraints": constraints(outcome, tolerance),
+        "constraint_tolerance": tolerance,
+        "feasible": result.feasible,
+        "gradient_check": {
+            where: {
+                "what": "dPsi_0 per change of the design by its scale: adjoint method and differences",
+                "directions": list(check.directions),
+                "gradient": check.exact.tolist(),
+                "central_differences": check.difference.tolist(),
+                "relative_error": check.error.tolist(),
+                "step": check.step,
+            }
+            for where, check in outcome.checks.items()
+        },
+        "history": {
+            "kept_step": result.step,
+            "objective": _finite(result.history.objective),
+            "worst_constraint": _finite(result.history.worst_constraint),
+            "gradient_norm": _finite(result.history.gradient_norm),
+        },
+        "settings": settings,
+        "seconds": outcome.seconds,
+        "versions": {"python": platform.python_version()}
+        | {name: version(name) for name in ("lgsens", "jax", "jaxlib", "optax", "numpy")},
+    }
+
+
+def constraints(outcome: Any, tolerance: float) -> list[dict[str, Any]]:
+    """The worst moment of each path constraint before and after, and whether it is active at the end."""
+    rows = []
+    for i, (name, quantity, limit, unit) in enumerate(CONSTRAINTS):
+        row = {"name": name, "unit": unit, "limit": float(getattr(outcome.design.limits, limit))}
+        for label, response in (("before", outcome.before), ("after", outcome.after)):
+            worst = int(np.argmax(response.constraints[:, i]))
+            row[label] = {
+                "worst_value": float(getattr(response, quantity)[worst]),
+                "time": float(response.t[worst]),
+                "violation_over_scale": float(response.constraints[worst, i]),
+            }
+        row["active"] = abs(row["after"]["violation_over_scale"]) <= tolerance
+        rows.append(row)
+    return rows
+
+
+def _values(design: Any, name: str, value: Any) -> Any:
+    if name != "hardpoints":
+        return float(value)
+    return {link: np.asarray(point).tolist() for link, point in zip(sorted(design.car.links), value)}
+
+
+def _finite(values: np.ndarray) -> list[float | None]:
+    """JSON has no NaN; a step whose simulation failed is null."""
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+def table(outcome: Any, tolerance: float) -> str:
+    """The design, the objective, the constraints and the gradient check, before and after."""
+    design, result = outcome.design, outcome.result
+    lower, upper = design.bounds
+    lines = [f"{'':<36}{'before':>13}{'after':>13}   limits", "-" * 92]
+
+    def line(name, before, after, note, digits):
+        lines.append(f"{name:<36}{before:>13.{digits}f}{after:>13.{digits}f}   {note}")
+
+    for name, value in design.start.items():
+        if name != "hardpoints":
+            bounds = f"{float(lower[name]):.0f} .. {float(upper[name]):.0f}"
+            line(f"{name} [{UNITS[name]}]", float(value), float(result.x[name]), bounds, 0)
+            continue
+        box = 1e3 * float(design.limits.hardpoint_box)
+        for link, old, new in zip(sorted(design.car.links), value, result.x[name]):
+            for axis, a, b in zip("xyz", np.asarray(old), np.asarray(new)):
+                at_bound = ", at the bound" if box - abs(1e3 * (b - a)) < 1e-3 * box else ""
+                line(f"{link} {axis} [mm]", 1e3 * a, 1e3 * b, f"+-{box:.0f} mm{at_bound}", 1)
+    reduction = 100 * (1 - result.objective / float(outcome.before.objective))
+    line("Psi_0 [m^2/s^3]", float(outcome.before.objective), result.objective, f"{-reduction:+.1f} %", 4)
+    for row in constraints(outcome, tolerance):
+        factor, unit = (1e3, "mm") if row["unit"] == "m" else (1.0, row["unit"])
+        violation = row["after"]["violation_over_scale"]
+        state = "active" if row["active"] else "satisfied" if violation <= tolerance else "VIOLATED"
+        line(
+            f"{row['name']} [{unit}]",
+            factor * row["before"]["worst_value"],
+            factor * row["after"]["worst_value"],
+            f"{factor * row['limit']:g}, {state} ({violation:+.1e} of scale)",
+            2,
+        )
+    lines.append("-" * 92)
+    errors = {where: float(np.max(check.error)) for where, check in outcome.checks.items()}
+    lines.append(
+        "gradient against central differences: relative error "
+        + ", ".join(f"{error:.1e} at the {where}" for where, error in errors.items())
+    )
+    lines.append(", ".join(f"{name} {value:.2f} s" for name, value in outcome.seconds.items()))
+    if not result.feasible:
+        lines.append(
+            "No design satisfied the path constraints; this one violates them least. Try more --steps."
+        )
+    return "\n".join(lines)

@@ -1,0 +1,141 @@
+"""The layers of the library, from its import statements; and what it must not do when it is imported."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import lgsens
+
+ROOT = Path(lgsens.__file__).parent
+# What each package may import besides itself. `_validate` is the one module below all of them.
+BELOW = {
+    "liegroups": set(),
+    "dynamics": {"liegroups"},
+    "model": {"liegroups", "dynamics"},
+    "integrate": {"liegroups", "dynamics"},
+    "sensitivity": {"liegroups", "dynamics", "integrate"},
+}
+FOUNDATION = "lgsens._validate"
+MAX_LINES = 350
+
+
+def module_name(path: Path) -> str:
+    parts = ("lgsens", *path.relative_to(ROOT).with_suffix("").parts)
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+FILES = {module_name(path): path for path in sorted(ROOT.rglob("*.py"))}
+TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FILES.items()}
+
+
+def imports(name: str) -> set[str]:
+    """The modules of lgsens that a module imports anywhere in it, also inside functions and relative ones."""
+    package = name if FILES[name].name == "__init__.py" else name.rpartition(".")[0]
+    found = set()
+    for node in ast.walk(TREES[name]):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            module = ".".join([*base, *(node.module or "").split(".")]).rstrip(".")
+            # `from lgsens import x`: x may be a module or a name of the package
+            found |= {full if (full := f"{module}.{alias.name}") in FILES else module for alias in node.names}
+    return {module for module in found if module == "lgsens" or module.startswith("lgsens.")}
+
+
+def layer(name: str) -> str:
+    """The package of a module, or "" for the modules above the packages."""
+    parts = name.split(".")
+    return parts[1] if len(parts) > 1 and parts[1] in BELOW else ""
+
+
+def test_the_parser_sees_what_there_is():
+    assert set(BELOW) <= {layer(name) for name in FILES}
+    assert imports("lgsens.liegroups._products") == {"lgsens.liegroups._base"}  # a relative import
+    assert {"lgsens.dynamics", "lgsens.model", "lgsens._errors"} <= imports("lgsens._simulate")
+    assert "lgsens._simulate" in imports("lgsens")
+
+
+@pytest.mark.parametrize("name", [name for name in FILES if layer(name)])
+def test_imports_go_downwards(name):
+    own = layer(name)
+    for imported in imports(name) - {FOUNDATION}:
+        assert layer(imported) in BELOW[own] | {own}, f"{name} imports {imported}"
+    assert FOUNDATION not in imports(name) or own != "liegroups"
+
+
+def test_foundation_imports_nothing_of_the_library():
+    assert imports(FOUNDATION) == set()
+
+
+def test_packages_import_only_public_names_of_each_other():
+    """A private module belongs to its package (examples and the command line may look into the library's own top)."""
+    for name in FILES:
+        for imported in imports(name) - {FOUNDATION}:
+            private = imported.rpartition(".")[2].startswith("_")
+            if private and layer(imported):
+                assert layer(name) == layer(imported), f"{name} imports {imported}"
+
+
+def test_no_import_cycles():
+    done, path = set(), []
+
+    def visit(name):
+        assert name not in path, f"cycle: {' → '.join([*path[path.index(name) :], name])}"
+        if name in done:
+            return
+        path.append(name)
+        for imported in sorted(imports(name) & set(FILES)):
+            visit(imported)
+        path.pop()
+        done.add(name)
+
+    for name in FILES:
+        visit(name)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_modules_are_small(name):
+    assert len(FILES[name].read_text(encoding="utf-8").splitlines()) <= MAX_LINES
+
+
+def touches_config(tree) -> bool:
+    """`jax.config…`, `from jax import config`, `from jax.config import …`, `jax.enable_x64…`."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "jax":
+            if node.attr in ("config", "enable_x64"):
+                return True
+        if isinstance(node, ast.ImportFrom) and node.module is not None and node.module.split(".")[0] == "jax":
+            if "config" in node.module.split(".") or {alias.name for alias in node.names} & {"config", "enable_x64"}:
+                return True
+    return False
+
+
+def test_config_is_recognized():
+    for source in ("jax.config.update('x', 1)", "from jax import config", "def f():\n  with jax.enable_x64(True): pass"):
+        assert touches_config(ast.parse(source))
+    assert not touches_config(ast.parse("import jax\njax.jit(config.update)"))
+
+
+@pytest.mark.parametrize("name", [name for name in FILES if not name.rpartition(".")[2].startswith("_cli")])
+def test_the_library_never_touches_jaxs_config(name):
+    assert not touches_config(TREES[name])
+
+
+def test_import_creates_no_arrays():
+    """An array made at import is float32 where x64 is switched on later; and a user picks the device after the import."""
+    code = """
+import jax
+import lgsens, lgsens.examples
+assert not jax.config.jax_enable_x64
+assert jax.live_arrays() == [], jax.live_arrays()
+jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp
+leaves = jax.tree.leaves(lgsens.examples.spinning_top(jnp.asarray(0.7)))
+assert all(leaf.dtype == jnp.float64 for leaf in leaves)
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr

@@ -1,0 +1,102 @@
+"""Figures: what is on them and that they are written; how they look is for the eye."""
+
+import sys
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+import lgsens as lg
+from lgsens import plotting
+from lgsens.examples import QuarterCar
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture
+def car():
+    # Any free length: the preload, which would be computed else, is not drawn.
+    return QuarterCar.load().model(free_length=1.0, free_radius=1.0)
+
+
+def is_png(path):
+    return path.read_bytes().startswith(PNG) and path.stat().st_size > 10_000  # an empty canvas has some 3 kB
+
+
+def test_time_histories(tmp_path):
+    t = np.linspace(0, 2, 101)
+    panels = [
+        plotting.Panel("tyre force [kN]", {"before": np.cos(t), "after": np.sin(t)}, {"F_min": -0.5}),
+        plotting.Panel("length [mm]", {"before": t}, {"l_min": 0.1, "l_max": 1.9}),
+    ]
+    fig = plotting.time_histories(t, panels, title="a title")
+    top, bottom = fig.axes
+    assert [axes.get_ylabel() for axes in fig.axes] == ["tyre force [kN]", "length [mm]"]
+    assert bottom.get_xlabel() == "time [s]"
+    assert fig.get_suptitle() == "a title"
+    assert [text.get_text() for text in top.get_legend().get_texts()] == ["before", "after"]
+    np.testing.assert_array_equal(top.lines[1].get_ydata(), np.sin(t))
+    assert {text.get_text() for text in bottom.texts} == {"l_min", "l_max"}
+    low, high = bottom.get_ylim()
+    assert low < 0.1 and high > 1.9  # the limits are in sight
+    assert is_png(plotting.save(fig, tmp_path / "a.png"))
+
+
+@pytest.mark.parametrize("constrained", [True, False])
+def test_convergence(constrained, tmp_path):
+    worst = np.geomspace(1.0, 1e-4, 20) if constrained else np.full(20, -np.inf)
+    history = SimpleNamespace(
+        objective=np.linspace(3, 1, 20), worst_constraint=worst, gradient_norm=np.geomspace(1, 1e-3, 20)
+    )
+    fig = plotting.convergence(history, tolerance=1e-3, best=17, objective="cost [€]")
+    assert fig.axes[0].get_ylabel() == "cost [€]"
+    assert all("[" in axes.get_ylabel() for axes in fig.axes)  # each has a unit
+    assert fig.axes[2].get_xlabel() == "step"
+    marked = fig.axes[0].lines[-1]
+    assert marked.get_label() == "design kept"
+    assert (marked.get_xdata()[0], marked.get_ydata()[0]) == (17, history.objective[17])
+    assert is_png(plotting.save(fig, tmp_path / "a.png"))
+
+
+def test_mechanism_of_the_quarter_car(car, tmp_path):
+    fig = plotting.mechanism({"the car": car}, title="five links")
+    (axes,) = fig.axes
+    assert axes.get_xlabel() == "x [m], forward"
+    roles = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert roles == list(plotting.ROLES)
+    # Equal axes: a metre is as long along x, y and z.
+    extents = [np.ptp(limits) for limits in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
+    metre = axes._box_aspect / extents  # matplotlib has no public getter of the aspect of a box in space
+    np.testing.assert_allclose(metre, metre[0], rtol=1e-12)
+    bars = [np.transpose(line.get_data_3d()) for line in axes.lines if len(line.get_data_3d()[0]) == 2]
+    for name in ("wishbone", "track_strut"):
+        ends = np.asarray([car.joints[f"{name}_chassis"].at, car.joints[f"{name}_knuckle"].at])
+        assert any(np.allclose(bar, ends) for bar in bars), name
+    assert is_png(plotting.save(fig, tmp_path / "a.png"))
+
+
+def test_before_and_after_are_told_apart(car):
+    fig = plotting.mechanism({"before": car, "after": car})
+    legend = fig.axes[0].get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == ["before", "after"]
+    colours = [line.get_color() for line in legend.get_lines()]
+    assert colours == [plotting.COLOURS[0], plotting.ROLES["link"]]
+
+
+def test_a_mechanism_in_a_plane_or_with_one_body_is_drawn():
+    corners = jnp.asarray([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+    plate = lg.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), position=(0.5, 0.5, 0.0))
+    frame = lg.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0))
+    joints = {f"corner{i}": lg.SphericalJoint("frame", "plate", at=at) for i, at in enumerate(corners)}
+    fig = plotting.mechanism({"plate": lg.Model({"plate": plate, "frame": frame}, joints)})
+    FigureCanvasAgg(fig).draw()
+    (polygon, _) = fig.axes[0].collections[:2]
+    assert polygon.get_facecolor().shape[0] == 1  # the hull of a plane would fail
+
+
+def test_a_missing_matplotlib_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ImportError, match=r'pip install "lgsens\[plot\]"'):
+        plotting.time_histories(np.zeros(2), [])
