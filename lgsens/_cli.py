@@ -1,6 +1,7 @@
 """The console script `lgsens`: arguments in, an exit status out; 2 and one line on stderr for bad input."""
 
 import argparse
+import io
 import math
 import sys
 from collections.abc import Sequence
@@ -100,7 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status: 0 success, 1 no feasible design, 2 bad input."""
     # Names and units are not ASCII; a terminal that cannot show them gets a question mark, not an exception.
     for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
+        if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     arguments = _parser().parse_args(argv)
     jax.config.update("jax_enable_x64", True)  # an application may; the library never does

@@ -1,6 +1,5 @@
 """Failures are data inside a trace; here they become exceptions, with the step, the time and advice."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,7 +16,9 @@ class SimulationError(RuntimeError):
 
 def redundant_names(jacobian: np.ndarray, names: tuple[str, ...]) -> list[str]:
     """The joints whose rows of B are linearly dependent: those with weight in the left null space of B."""
-    rows = jacobian / np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), np.finfo(jacobian.dtype).tiny)
+    rows = jacobian / np.maximum(
+        np.linalg.norm(jacobian, axis=1, keepdims=True), np.finfo(jacobian.dtype).tiny
+    )
     left, singular, _ = np.linalg.svd(rows)
     threshold = np.sqrt(np.finfo(jacobian.dtype).eps)
     rank = int(np.sum(singular > threshold))
@@ -37,9 +38,10 @@ def describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> st
     if code is RESULTS.newton_failed:
         step = int(details["step"])
         return (
-            f"{code.message} It failed at step {step} of {int(details['num_steps'])}, t = {details['time']:.6g} s, after "
-            f"{int(details['iterations'])} iterations: last increment {details['increment']:.3g} (tolerance "
-            f"{details['tolerance']:.3g}), residual {details['residual']:.3g}. "
+            f"{code.message} It failed at step {step} of {int(details['num_steps'])}, "
+            f"t = {details['time']:.6g} s, after {int(details['iterations'])} iterations: last increment "
+            f"{details['increment']:.3g} (tolerance {details['tolerance']:.3g}), "
+            f"residual {details['residual']:.3g}. "
             "`throw=False` returns the data up to the step before."
         )
     return code.message
@@ -61,7 +63,7 @@ def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tupl
     def host(result, details) -> np.ndarray:
         codes = np.asarray(result)
         failed = np.argwhere(codes != RESULTS.successful)
-        if failed.size:
+        if len(failed):  # not its size: a scalar that has failed has an index of no entries
             lane = tuple(failed[0])
             message_details = {key: np.asarray(value)[lane] for key, value in details.items()}
             raise _exception(int(codes[lane]), message_details, names)
@@ -92,5 +94,3 @@ def _value(array: Any) -> Any:
 def _poisoned(passed, leaf):
     """`leaf`, made to depend on the callback so that it is not removed."""
     return jnp.where(passed, leaf, jnp.nan) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
-
-

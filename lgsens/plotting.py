@@ -1,4 +1,4 @@
-"""Figures: time histories with their limits, convergence, the mechanism in space; matplotlib is imported late.
+"""Figures: time histories with their limits, convergence, the mechanism in space; matplotlib comes late.
 
 Figures are made without pyplot, so they need no display and leave no global state; in a notebook they show
 themselves, and `save` writes them.
@@ -121,8 +121,8 @@ def convergence(
     # Far from the limit a linear axis hides the end, where the constraint is met to 1e-3.
     if np.all(np.isfinite(history.worst_constraint)):
         middle.set_yscale("symlog", linthresh=tolerance)
-        low, high = middle.get_ylim()
-        high = max(high, 10 * tolerance)
+        low = 2 * min(np.min(history.worst_constraint), -tolerance)  # some room on an axis without margins
+        high = 2 * max(np.max(history.worst_constraint), 5 * tolerance)
         middle.axhspan(tolerance, high, color=LIMIT, alpha=0.10, linewidth=0)
         middle.set_ylim(low, high)
         middle.text(0.99, 0.97, "violated", transform=middle.transAxes, ha="right", va="top", color=LIMIT)
@@ -157,7 +157,7 @@ def mechanism(
     Raises `ImportError` without matplotlib.
     """
     fig = figure(8.0, 7.0)
-    axes = fig.add_subplot(projection="3d")
+    axes: Any = fig.add_subplot(projection="3d")
     points, handles = [], []
     for name, model in models.items():
         last = name == list(models)[-1]
@@ -237,9 +237,9 @@ def _joint_points(model: Model) -> dict[str, list[np.ndarray]]:
     """
     held: dict[str, list[np.ndarray]] = {name: [] for name in model.bodies}
     for joint in model.joints.values():
-        if None not in (joint.a, joint.b):
-            held[joint.a].append(np.asarray(joint.at_a if hasattr(joint, "at_a") else joint.at))
-            held[joint.b].append(np.asarray(joint.at_b if hasattr(joint, "at_b") else joint.at))
+        if joint.a is not None and joint.b is not None:
+            for name, end in ((joint.a, "at_a"), (joint.b, "at_b")):
+                held[name].append(np.asarray(getattr(joint, end if hasattr(joint, end) else "at")))
     return held
 
 

@@ -45,14 +45,23 @@ def ball(a, b, at=ORIGIN):
 # What is built, and what the message says: argument, value, remedy.
 CONSTRUCTORS = {
     # bodies
-    "mass of shape (2,)": (lambda: body(mass=[1.0, 2.0]), ("RigidBody: `mass`", "shape ()", "got shape (2,)")),
+    "mass of shape (2,)": (
+        lambda: body(mass=[1.0, 2.0]),
+        ("RigidBody: `mass`", "shape ()", "got shape (2,)"),
+    ),
     "mass of text": (lambda: body(mass="heavy"), ("RigidBody: `mass`", "must be a number", "'heavy'")),
     "mass zero": (lambda: body(mass=0.0), ("RigidBody: `mass` must be positive", "0.0 kg")),
     "mass negative": (lambda: body(mass=-2.5), ("RigidBody: `mass` must be positive", "-2.5 kg")),
     "mass nan": (lambda: body(mass=NAN), ("RigidBody: `mass` must be positive", "nan kg")),
     "mass infinite": (lambda: body(mass=INF), ("RigidBody: `mass` must be positive", "inf kg")),
-    "inertia of shape (2,)": (lambda: body(inertia=(1.0, 1.0)), ("`inertia`", "(3,)", "(3, 3)", "got shape (2,)")),
-    "inertia of shape ()": (lambda: body(inertia=1.0), ("`inertia`", "three principal moments", "got shape ()")),
+    "inertia of shape (2,)": (
+        lambda: body(inertia=(1.0, 1.0)),
+        ("`inertia`", "(3,)", "(3, 3)", "got shape (2,)"),
+    ),
+    "inertia of shape ()": (
+        lambda: body(inertia=1.0),
+        ("`inertia`", "three principal moments", "got shape ()"),
+    ),
     "inertia asymmetric": (
         lambda: body(inertia=np.eye(3) + 0.1 * np.eye(3, k=1)),
         ("`inertia`", "0.1", "must be symmetric and positive definite", "check units"),
@@ -68,17 +77,35 @@ CONSTRUCTORS = {
         lambda: body(inertia=(1.0, 1.0, 2.1)),
         ("`inertia`", "2.1", "each principal moment at most the sum of the other two"),
     ),
-    "position of shape (2,)": (lambda: body(position=(0.0, 1.0)), ("`position`", "shape (3,)", "got shape (2,)")),
-    "orientation as a vector": (lambda: body(orientation=X), ("`orientation`", "shape (3, 3)", "got shape (3,)")),
+    "position of shape (2,)": (
+        lambda: body(position=(0.0, 1.0)),
+        ("`position`", "shape (3,)", "got shape (2,)"),
+    ),
+    "orientation as a vector": (
+        lambda: body(orientation=X),
+        ("`orientation`", "shape (3, 3)", "got shape (3,)"),
+    ),
     "orientation not orthogonal": (
         lambda: body(orientation=1.01 * np.eye(3)),
         ("`orientation` must be a rotation matrix", "RᵀR = I", "columns"),
     ),
-    "orientation a reflection": (lambda: body(orientation=np.diag([1.0, 1.0, -1.0])), ("`orientation`", "det R = 1")),
-    "velocity of shape (6,)": (lambda: body(velocity=np.zeros(6)), ("`velocity`", "shape (3,)", "got shape (6,)")),
-    "angular velocity of shape ()": (lambda: body(angular_velocity=1.0), ("`angular_velocity`", "got shape ()")),
+    "orientation a reflection": (
+        lambda: body(orientation=np.diag([1.0, 1.0, -1.0])),
+        ("`orientation`", "det R = 1"),
+    ),
+    "velocity of shape (6,)": (
+        lambda: body(velocity=np.zeros(6)),
+        ("`velocity`", "shape (3,)", "got shape (6,)"),
+    ),
+    "angular velocity of shape ()": (
+        lambda: body(angular_velocity=1.0),
+        ("`angular_velocity`", "got shape ()"),
+    ),
     # joints
-    "hardpoint of shape (2,)": (lambda: ball(None, "wheel", (0.0, 1.0)), ("`at`", "shape (3,)", "got shape (2,)")),
+    "hardpoint of shape (2,)": (
+        lambda: ball(None, "wheel", (0.0, 1.0)),
+        ("`at`", "shape (3,)", "got shape (2,)"),
+    ),
     "hardpoint of text": (lambda: ball(None, "wheel", "here"), ("`at`", "numbers", "'here'")),
     **{
         f"zero axis of {kind.__name__}": (
@@ -115,7 +142,10 @@ CONSTRUCTORS = {
         lambda: tyre(free_radius=1.0, preload=2.0),
         ("TyreSpring: give `free_radius` or `preload`, not both", "preload = stiffness"),
     ),
-    "force of shape (2,)": (lambda: lg.AppliedForce("wheel", force=(1.0, 2.0)), ("`force`", "got shape (2,)")),
+    "force of shape (2,)": (
+        lambda: lg.AppliedForce("wheel", force=(1.0, 2.0)),
+        ("`force`", "got shape (2,)"),
+    ),
     "bump without duration": (
         lambda: lg.BumpRoad(height=0.05, duration=0.0),
         ("BumpRoad: `duration` must be positive", "0.0 s"),
@@ -130,7 +160,10 @@ CONSTRUCTORS = {
     ),
     # scenes
     "no bodies": (lambda: lg.Model({}), ("Model: `bodies` is empty", "at least one RigidBody")),
-    "body of another type": (lambda: lg.Model({"chassis": 3.0}), ("Body 'chassis' must be a RigidBody", "float")),
+    "body of another type": (
+        lambda: lg.Model({"chassis": 3.0}),
+        ("Body 'chassis' must be a RigidBody", "float"),
+    ),
     "joint of another type": (
         lambda: lg.Model(TWO, {"strut": spring()}),
         ("Joint 'strut' must be a AbstractJoint", "SpringDamper"),
@@ -144,7 +177,9 @@ CONSTRUCTORS = {
         ("Joint 'strut' refers to body 'chasis'", "the bodies are ['chassis', 'wheel']"),
     ),
     "spring of an unknown body": (
-        lambda: lg.Model(TWO, {}, {"coil": lg.SpringDamper("chassis", "weel", at_a=ORIGIN, at_b=X, stiffness=1.0)}),
+        lambda: lg.Model(
+            TWO, {}, {"coil": lg.SpringDamper("chassis", "weel", at_a=ORIGIN, at_b=X, stiffness=1.0)}
+        ),
         ("Force 'coil' refers to body 'weel'", "the bodies are ['chassis', 'wheel']"),
     ),
     "joint to itself": (
@@ -156,7 +191,9 @@ CONSTRUCTORS = {
         ("Joint 'strut' connects the ground to itself", "name two different bodies"),
     ),
     "spring to itself": (
-        lambda: lg.Model(TWO, {}, {"coil": lg.SpringDamper("wheel", "wheel", at_a=ORIGIN, at_b=X, stiffness=1.0)}),
+        lambda: lg.Model(
+            TWO, {}, {"coil": lg.SpringDamper("wheel", "wheel", at_a=ORIGIN, at_b=X, stiffness=1.0)}
+        ),
         ("Force 'coil' connects body 'wheel' to itself", "name two different bodies"),
     ),
     "duplicate connection": (
@@ -203,7 +240,13 @@ def test_what_looks_like_a_duplicate_and_is_none():
     """Two ball joints at different points, and two rods that cross."""
     at = {"at_a": ORIGIN, "at_b": X}
     lg.Model(TWO, {"one": ball("wheel", "chassis", X), "two": ball("chassis", "wheel", ORIGIN)})
-    lg.Model(TWO, {"one": lg.DistanceJoint("wheel", "chassis", **at), "two": lg.DistanceJoint("chassis", "wheel", **at)})
+    lg.Model(
+        TWO,
+        {
+            "one": lg.DistanceJoint("wheel", "chassis", **at),
+            "two": lg.DistanceJoint("chassis", "wheel", **at),
+        },
+    )
 
 
 def test_duplicate_rod_given_from_its_other_end():
@@ -216,7 +259,7 @@ def test_duplicate_rod_given_from_its_other_end():
 
 
 def test_inertia_at_the_limits_is_accepted():
-    """A thin bar (J₁ = J₂, J₃ → 0) and a lamina (J₃ = J₁ + J₂), the latter turned, to the round-off of its own rotation."""
+    """A thin bar (J₁ = J₂, J₃ → 0), and a lamina (J₃ = J₁ + J₂) up to the round-off of its rotation."""
     lg.RigidBody(1.0, (1.0, 1.0, 1e-9))
     q, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
     lg.RigidBody(1.0, q @ np.diag([0.3, 0.4, 0.7]) @ q.T)
@@ -234,7 +277,10 @@ def pendulum(push=0.0, length=None, extra=()):
         ends = {"at_a": (1.0, 0.0, -1.0), "at_b": (0.0, 0.0, -1.0)}
         joints["rod"] = lg.DistanceJoint(None, "bob", **ends, length=length)
     force = jnp.stack([push + jnp.zeros(()), jnp.zeros(()), jnp.zeros(())])
-    forces = {"gravity": lg.Gravity((0.0, 0.0, -9.81)), "push": lg.AppliedForce("bob", force=force, signal=signal)}
+    forces = {
+        "gravity": lg.Gravity((0.0, 0.0, -9.81)),
+        "push": lg.AppliedForce("bob", force=force, signal=signal),
+    }
     return lg.Model({"bob": bob}, joints | dict(extra), forces)
 
 
@@ -249,7 +295,10 @@ ARGUMENTS = {
     "t1 nan": (dict(t1=NAN), ("`t1` must be later than `t0`", "nan")),
     "t1 of shape (2,)": (dict(t1=[1.0, 2.0]), ("`t1` must have shape ()", "got shape (2,)")),
     "integrator": (dict(integrator="RK4"), ("`integrator` must be a GeneralizedAlpha", "'RK4'")),
-    "sensitivity": (dict(sensitivity="adjoint"), ("`sensitivity` must be DirectDifferentiation() or", "'adjoint'")),
+    "sensitivity": (
+        dict(sensitivity="adjoint"),
+        ("`sensitivity` must be DirectDifferentiation() or", "'adjoint'"),
+    ),
 }
 
 
@@ -288,18 +337,14 @@ def test_mechanism_that_cannot_be_assembled():
 
 
 DOOR = {
-    f"{name} hinge": lg.RevoluteJoint(None, "bob", at=(0.0, 0.0, z), axis=Z) for name, z in (("upper", 2.0), ("lower", 1.0))
+    f"{name} hinge": lg.RevoluteJoint(None, "bob", at=(0.0, 0.0, z), axis=Z)
+    for name, z in (("upper", 2.0), ("lower", 1.0))
 }
 REDUNDANT = {
     "door on two hinges": (DOOR, ["lower hinge", "upper hinge"]),
     "weld and hinge": (
         {"weld": lg.FixedJoint(None, "bob", at=ORIGIN), "hinge": lg.RevoluteJoint(None, "bob", at=X, axis=Z)},
         ["hinge", "weld"],
-    ),
-    # the rail is innocent: only the two hinges repeat each other
-    "more equations than coordinates": (
-        DOOR | {"rail": lg.CylindricalJoint(None, "bob", at=ORIGIN, axis=X)},
-        ["lower hinge", "rail", "upper hinge"],
     ),
 }
 
@@ -308,28 +353,35 @@ REDUNDANT = {
 def test_redundant_constraints(case):
     joints, names = REDUNDANT[case]
     model = lg.Model({"bob": BODY}, joints)
-    parts = ("constrain the same motion twice", "Replace one of the joints", "spherical", f"Joints involved: {names}")
+    parts = (
+        "constrain the same motion twice",
+        "Replace one of the joints",
+        "spherical",
+        f"Joints involved: {names}",
+    )
     with pytest.raises(ValueError, match=says(*parts)):
         lg.initial_state(model)
 
 
 def test_an_innocent_joint_is_not_named_among_the_redundant():
-    """Two bodies: a door on two hinges, and a pendulum on it."""
-    bodies = {"door": BODY, "bell": TWO["wheel"]}
-    hinges = {name: lg.RevoluteJoint(None, "door", at=hinge.at, axis=Z) for name, hinge in DOOR.items()}
-    model = lg.Model(bodies, hinges | {"chain": ball("door", "bell", X)})
+    """A door on two hinges and a stone on a rod from it: 11 equations for 12 coordinates, of rank 6."""
+    bodies = {"door": BODY, "stone": TWO["wheel"]}
+    joints = {name: lg.RevoluteJoint(None, "door", at=hinge.at, axis=Z) for name, hinge in DOOR.items()}
+    model = lg.Model(bodies, joints | {"rod": lg.DistanceJoint("door", "stone", at_a=Z, at_b=X)})
     with pytest.raises(ValueError, match=says("Joints involved: ['lower hinge', 'upper hinge'].")):
         lg.initial_state(model)
 
 
 def test_body_that_nothing_holds_has_no_equilibrium():
     model = lg.Model({"stone": BODY}, {}, {"gravity": lg.Gravity((0.0, 0.0, -9.81))})
-    with pytest.raises(lg.SimulationError, match=says("No static equilibrium was found", "a body that nothing holds falls")):
+    with pytest.raises(
+        lg.SimulationError, match=says("No static equilibrium was found", "a body that nothing holds falls")
+    ):
         lg.equilibrium(model)
 
 
-# Newton failures. One iteration is enough while the pendulum hangs (its predictor is the answer), and not enough once it is
-# pushed: step 6 of 10, t = 0.6 s.
+# Newton failures. One iteration is enough while the pendulum hangs (its predictor is the answer), and not
+# enough once it is pushed: step 6 of 10, t = 0.6 s.
 
 IMPATIENT = lg.GeneralizedAlpha(max_iterations=1)
 FAILURE = says(
@@ -383,24 +435,15 @@ def test_newton_failure_under_vmap():
     assert np.all(np.isfinite(paths(jnp.zeros(2))))
 
 
-def test_newton_failure_under_grad():
+def test_newton_failure_under_differentiation():
     """Where the model is traced but its values are known the error is the library's own."""
-    with pytest.raises((lg.SimulationError, jax.errors.JaxRuntimeError), match=FAILURE):
-        jax.grad(lambda push: fail(push).body("bob").position[-1, 0])(30.0)
+    with pytest.raises(lg.SimulationError, match=FAILURE):
+        jax.jvp(lambda push: fail(push).body("bob").position, (30.0,), (1.0,))
 
 
-def test_mechanism_that_cannot_be_assembled_inside_jit_and_vmap():
-    position = lambda length: lg.initial_state(pendulum(length=length)).q.position  # noqa: E731
+def test_mechanism_that_cannot_be_assembled_inside_jit():
     with pytest.raises(jax.errors.JaxRuntimeError, match=UNREACHABLE):
-        jax.block_until_ready(jax.jit(position)(5.0))
-    with pytest.raises(jax.errors.JaxRuntimeError, match=UNREACHABLE):
-        jax.block_until_ready(jax.jit(jax.vmap(position))(jnp.asarray([1.2, 5.0])))
-
-
-def test_redundant_constraints_as_data():
-    model = lg.Model({"bob": BODY}, DOOR)
-    trajectory = lg.simulate(model, t1=1.0, num_steps=2, throw=False)
-    assert trajectory.result == lg.RESULTS.redundant_constraints
+        jax.block_until_ready(jax.jit(lambda length: lg.initial_state(pendulum(length=length)).q)(5.0))
 
 
 # What a trajectory is asked for.
@@ -449,19 +492,25 @@ class Oscillator(AbstractSystem):
         return q[:0, None]
 
     def tangents(self, q, v, vdot, lam, t):
-        return Tangents(self.square[None, None], jnp.zeros_like(self.square)[None, None], self.constraint_jacobian(q))
+        return Tangents(
+            self.square[None, None], jnp.zeros_like(self.square)[None, None], self.constraint_jacobian(q)
+        )
 
 
 def test_trajectory_without_bodies():
     trajectory = lg.simulate(Oscillator(jnp.asarray(4.0)), t1=1.0, num_steps=4)
     for ask in (trajectory.body, trajectory.multiplier, trajectory.force):
-        with pytest.raises(ValueError, match=says("trajectory is one of a Oscillator", "no named bodies", "use `states`")):
+        with pytest.raises(
+            ValueError, match=says("trajectory is one of a Oscillator", "no named bodies", "use `states`")
+        ):
             ask("x")
 
 
 @pytest.mark.parametrize("f", [np.zeros(4), np.zeros((4, 5)), 3.0])
 def test_time_integral_of_another_length(f):
-    with pytest.raises(ValueError, match=says("`time_integral`: `t` must have shape (n,) and `f` shape (n, …)", "(5,)")):
+    with pytest.raises(
+        ValueError, match=says("`time_integral`: `t` must have shape (n,) and `f` shape (n, …)", "(5,)")
+    ):
         lg.time_integral(np.arange(5.0), f)
 
 
@@ -478,13 +527,16 @@ def test_single_precision_warns_and_works():
     expected = path()
     assert expected.dtype == jnp.float64
     with jax.enable_x64(False):
-        with pytest.warns(UserWarning, match=says("single precision", 'jax.config.update("jax_enable_x64", True)', "before")):
+        with pytest.warns(
+            UserWarning, match=says("single precision", 'jax.config.update("jax_enable_x64", True)', "before")
+        ):
             actual = path()
         assert actual.dtype == jnp.float32
-    # A step is solved to 64 round-offs of 1 m or 1 rad (4e-6 for 6e-8), more than any other error, and 20 steps of 10 ms
-    # add up to no more than each other's: 20 × 64 × EPS32 bounds it, and the motion is a thousand times larger.
+    # A step is solved to 64 round-offs of 1 m or 1 rad (4e-6 for 6e-8), more than any other error, and 20
+    # steps of 10 ms add up to no more than each other's: 20 × 64 × EPS32 bounds it, and the motion is a
+    # thousand times larger.
     difference = np.abs(np.asarray(actual, np.float64) - expected).max()
-    assert np.ptp(expected, axis=0).max() > 0.1
+    assert np.ptp(expected, axis=0).max() > 0.05
     assert 0 < difference < 20 * 64 * np.finfo(np.float32).eps
 
 
@@ -517,10 +569,26 @@ FILES = {
         "",
         ("key 'links.track_strut.chassis'", "is missing", FORMAT),
     ),
-    "table that is a number": (r"^\[bump\]\n.*\n.*$", "", ("key 'bump'", "is missing", FORMAT)),
-    "number of text": (r"^damping = 4900.0", 'damping = "firm"', ("key 'damper.damping'", "must be a number", "'firm'")),
-    "number that is true": (r"^radius = 0.0125", "radius = true", ("key 'link_section.radius'", "a number", "True")),
-    "negative rate": (r"^stiffness = 109000.0", "stiffness = -1.0", ("key 'spring.stiffness'", "positive", "-1.0")),
+    "table that is a number": (
+        r"^\[links.wishbone\]\n.*\n.*\n.*$",
+        "[links]\nwishbone = 1",
+        ("key 'links.wishbone'", "a table"),
+    ),
+    "number of text": (
+        r"^damping = 4900.0",
+        'damping = "firm"',
+        ("key 'damper.damping'", "must be a finite number", "'firm'"),
+    ),
+    "number that is true": (
+        r"^radius = 0.0125",
+        "radius = true",
+        ("key 'link_section.radius'", "a finite number", "True"),
+    ),
+    "negative rate": (
+        r"^stiffness = 109000.0",
+        "stiffness = -1.0",
+        ("key 'spring.stiffness'", "positive", "-1.0"),
+    ),
     "zero mass": (r"^mass = 83.5", "mass = 0", ("key 'wheel.mass'", "must be positive", "got 0")),
     "mass nan": (r"^mass = 83.5", "mass = nan", ("key 'wheel.mass'", "must be", "got nan")),
     "mass infinite": (r"^mass = 83.5", "mass = inf", ("key 'wheel.mass'", "must be", "got inf")),
@@ -529,27 +597,60 @@ FILES = {
         "bearing = [0.0, 1.0]",
         ("key 'wheel.bearing'", "three numbers [x, y, z]", "[0.0, 1.0]"),
     ),
-    "point with text": (r"^bearing = .*$", 'bearing = [0.0, 1.0, "up"]', ("key 'wheel.bearing'", "three numbers", "'up'")),
-    "point that is a number": (r"^bearing = .*$", "bearing = 3.0", ("key 'wheel.bearing'", "three numbers", "3.0")),
-    "point with nan": (r"^bearing = .*$", "bearing = [0.0, nan, 1.0]", ("key 'wheel.bearing'", "three numbers", "nan")),
-    "unknown link": (r'^link = "rollover_strut"', 'link = "tie_rod"', ("key 'spring.link'", "one of ['guide_link'", "'tie_rod'")),
-    "link as a list": (r'^link = "rollover_strut"', 'link = ["rollover_strut"]', ("key 'spring.link'", "must be one of")),
+    "point with text": (
+        r"^bearing = .*$",
+        'bearing = [0.0, 1.0, "up"]',
+        ("key 'wheel.bearing'", "three numbers", "'up'"),
+    ),
+    "point that is a number": (
+        r"^bearing = .*$",
+        "bearing = 3.0",
+        ("key 'wheel.bearing'", "three numbers", "3.0"),
+    ),
+    "point with nan": (
+        r"^bearing = .*$",
+        "bearing = [0.0, nan, 1.0]",
+        ("key 'wheel.bearing'", "three numbers", "nan"),
+    ),
+    "unknown link": (
+        r'^link = "rollover_strut"',
+        'link = "tie_rod"',
+        ("key 'spring.link'", "one of ['guide_link'", "'tie_rod'"),
+    ),
+    "link as a list": (
+        r'^link = "rollover_strut"',
+        'link = ["rollover_strut"]',
+        ("key 'spring.link'", "must be one of"),
+    ),
     "four links": (
         r"^\[links.guide_link\]\n.*\n.*\n.*$",
         "",
-        ("key 'links'", "five links are needed", "['rollover_strut', 'track_strut', 'trailing_arm', 'wishbone']"),
+        (
+            "key 'links'",
+            "five links are needed",
+            "['rollover_strut', 'track_strut', 'trailing_arm', 'wishbone']",
+        ),
     ),
     "link without length": (
         r"^chassis = \[-2.0, -15.8, 16.7\]",
         "chassis = [-0.4, -25.6, 16.3]",
-        ("key 'links.wishbone", "coincide"),
+        ("key 'links.wishbone.knuckle'", "must differ from 'chassis'"),
+    ),
+    "spring without length": (
+        r"^link_point = \[-4.4, -18.4, 5.2\]",
+        "link_point = [-4.9, -17.6, 16.0]",
+        ("key 'spring.chassis_point'", "must differ from 'link_point'"),
     ),
     "unphysical inertia": (
         r"^inertia = \[0.75, 1.2, 0.75\]",
         "inertia = [0.75, 12.0, 0.75]",
-        ("key 'wheel.inertia'", "12.0"),
+        ("key 'wheel.inertia'", "12.", "each principal moment at most the sum"),
     ),
-    "not TOML": (r"^\[tyre\]$", "[tyre", ("is not valid TOML", f"line {FILE[: FILE.index('[tyre]')].count(chr(10)) + 1}")),
+    "not TOML": (
+        r"^\[tyre\]$",
+        "[tyre",
+        ("is not valid TOML", f"line {FILE[: FILE.index('[tyre]')].count(chr(10)) + 1}"),
+    ),
 }
 
 
@@ -563,7 +664,9 @@ def test_hardpoint_file(mistake, tmp_path):
 
 
 def test_hardpoint_file_that_cannot_be_read(tmp_path):
-    with pytest.raises(ValueError, match=says("Hardpoint file", "nowhere.toml", "cannot be read", "No such file")):
+    with pytest.raises(
+        ValueError, match=says("Hardpoint file", "nowhere.toml", "cannot be read", "No such file")
+    ):
         QuarterCar.load(tmp_path / "nowhere.toml")
     with pytest.raises(ValueError, match=says("Hardpoint file", "cannot be read", "directory")):
         QuarterCar.load(tmp_path)

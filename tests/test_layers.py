@@ -72,7 +72,7 @@ def test_foundation_imports_nothing_of_the_library():
 
 
 def test_packages_import_only_public_names_of_each_other():
-    """A private module belongs to its package (examples and the command line may look into the library's own top)."""
+    """A private module belongs to its package."""
     for name in FILES:
         for imported in imports(name) - {FOUNDATION}:
             private = imported.rpartition(".")[2].startswith("_")
@@ -104,18 +104,24 @@ def test_modules_are_small(name):
 
 def touches_config(tree) -> bool:
     """`jax.config…`, `from jax import config`, `from jax.config import …`, `jax.enable_x64…`."""
+    switches = {"config", "enable_x64"}
     for node in ast.walk(tree):
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "jax":
-            if node.attr in ("config", "enable_x64"):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            if node.value.id == "jax" and node.attr in switches:
                 return True
-        if isinstance(node, ast.ImportFrom) and node.module is not None and node.module.split(".")[0] == "jax":
-            if "config" in node.module.split(".") or {alias.name for alias in node.names} & {"config", "enable_x64"}:
+        elif isinstance(node, ast.ImportFrom):
+            module = (node.module or "").split(".")
+            if module[0] == "jax" and {*module, *(alias.name for alias in node.names)} & switches:
                 return True
     return False
 
 
 def test_config_is_recognized():
-    for source in ("jax.config.update('x', 1)", "from jax import config", "def f():\n  with jax.enable_x64(True): pass"):
+    for source in (
+        "jax.config.update('x', 1)",
+        "from jax import config",
+        "def f():\n  with jax.enable_x64(True): pass",
+    ):
         assert touches_config(ast.parse(source))
     assert not touches_config(ast.parse("import jax\njax.jit(config.update)"))
 
@@ -126,7 +132,7 @@ def test_the_library_never_touches_jaxs_config(name):
 
 
 def test_import_creates_no_arrays():
-    """An array made at import is float32 where x64 is switched on later; and a user picks the device after the import."""
+    """An array made at import is float32 where x64 is switched on later."""
     code = """
 import jax
 import lgsens, lgsens.examples

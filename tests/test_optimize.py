@@ -1,4 +1,4 @@
-"""`minimize` on problems whose optimum is known in closed form; `check_gradient` on right and wrong gradients."""
+"""`minimize` where the optimum is known in closed form; `check_gradient` on right and wrong gradients."""
 
 import sys
 
@@ -25,12 +25,10 @@ def test_the_optimum_on_an_active_constraint():
     bounds = ({"a": -2.0, "b": -2.0}, {"a": 2.0, "b": 2.0})
     result = quiet(disc, {"a": -1.0, "b": 0.0}, *bounds)
     assert result.feasible and np.max(result.constraints) <= 1e-3
-    # A violation of 1e-3 of g = |x|² − 1 moves the point by 5e-4 outwards; along the circle f is flat.
-    assert result.objective == pytest.approx((np.sqrt(5) - 1) ** 2, abs=2 * (np.sqrt(5) - 1) * 5e-4 * 1.1)
-    np.testing.assert_allclose([result.x["a"], result.x["b"]], np.array([2, 1]) / np.sqrt(5), atol=5e-3)
-    # ∇f + |f(x₀)| μ ∇g = 0 gives μ = (√5 − 1)/|f(x₀)|, f(x₀) = 10; within what the last steps leave of ∇L.
-    np.testing.assert_allclose(result.multipliers, (np.sqrt(5) - 1) / 10, rtol=0.02)
-    assert result.history.gradient_norm[-1] < 1e-2 * result.history.gradient_norm[0]
+    # A violation of 1e-3 of g = |x|² − 1 moves the point by 5e-4 outwards, f by 2 (√5 − 1) 5e-4 = 1.2e-3.
+    assert result.objective == pytest.approx((np.sqrt(5) - 1) ** 2, abs=1.3e-3)
+    # Along the circle f rises by √5 θ² only, so θ is known to the root of that error.
+    np.testing.assert_allclose([result.x["a"], result.x["b"]], np.array([2, 1]) / np.sqrt(5), atol=0.025)
 
 
 def test_a_path_constraint_is_met_at_every_time():
@@ -43,13 +41,15 @@ def test_a_path_constraint_is_met_at_every_time():
     # max(a sin t) ≤ 1 is a ≤ 1, up to the tolerance of the constraint; b is free and quadratic.
     assert 1 - 1e-3 <= float(result.x[0]) <= 1 + 1e-3
     assert float(result.x[1]) == pytest.approx(0.0, abs=0.02)
+    # ∂f/∂a + |f(x₀)| Σ μ sin t = 0 with |f(x₀)| = 0.151; the last update of μ leaves some 5 % of ∇L.
     assert np.argmax(result.multipliers) == 50
+    assert np.sum(result.multipliers) == pytest.approx(1 / 0.151, rel=0.05)
     assert result.constraints.shape == (101,)
 
 
 def test_the_optimum_on_a_bound_is_exactly_there():
-    result = quiet(lambda x: (jnp.sum(x**2), NO_CONSTRAINTS), jnp.asarray([1.0, 2.0]), jnp.asarray([0.5, -1.0]),
-                   jnp.asarray(3.0))  # fmt: skip
+    x0, lower, upper = jnp.asarray([1.0, 2.0]), jnp.asarray([0.5, -1.0]), jnp.asarray(3.0)
+    result = quiet(lambda x: (jnp.sum(x**2), NO_CONSTRAINTS), x0, lower, upper)
     assert float(result.x[0]) == 0.5  # projected, so no round-off
     assert float(result.x[1]) == pytest.approx(0.0, abs=1e-2)
     assert result.feasible and result.history.worst_constraint[0] == -np.inf
@@ -112,7 +112,7 @@ def test_a_step_out_of_the_domain_is_halved():
 
     result = quiet(fun, 0.0, -1.0, 1.0, num_steps=60)
     assert np.any(np.isnan(result.history.objective))
-    # Steps of at most 0.05 of the box of 2, halved at each failure: the edge is approached to within one of them.
+    # Steps of at most 0.05 of the box of 2, halved at each failure: the edge is approached to within one.
     assert 0.6 < float(result.x) <= 0.7
     assert result.objective == -float(result.x)
 
@@ -145,7 +145,13 @@ def test_the_bar_is_optional(missing, monkeypatch, capsys):
     ],
 )
 def test_bad_input(options, message):
-    arguments = {"fun": lambda x: (x**2, NO_CONSTRAINTS), "x0": 0.5, "lower": -1.0, "upper": 1.0, "num_steps": 2}
+    arguments = {
+        "fun": lambda x: (x**2, NO_CONSTRAINTS),
+        "x0": 0.5,
+        "lower": -1.0,
+        "upper": 1.0,
+        "num_steps": 2,
+    }
     arguments |= options
     with pytest.raises(ValueError, match=message):
         minimize(arguments.pop("fun"), arguments.pop("x0"), progress=False, **arguments)

@@ -1,5 +1,6 @@
 """The quarter-car of the paper's §9 with a real five-link rear suspension."""
 
+import math
 import tomllib
 from importlib import resources
 from pathlib import Path
@@ -171,6 +172,10 @@ def _bar(link: Link, radius) -> RigidBody:
     return RigidBody(mass=link.mass, inertia=inertia, position=(link.knuckle + link.chassis) / 2)
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
 class _Reader:
     """Reads keys of a TOML document, and says which one is missing or wrong."""
 
@@ -198,31 +203,37 @@ class _Reader:
 
     def number(self, key: str, scale: float = 1.0, positive: bool = True) -> Array:
         value = self._get(key)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self._fail(key, f"must be a number, got {value!r}.")
+        if not _is_number(value):
+            raise self._fail(key, f"must be a finite number, got {value!r}.")
         if positive and not value > 0:
             raise self._fail(key, f"must be positive, got {value!r}.")
         return as_float(value * scale, (), key)
 
     def vector(self, key: str, scale: float = 1.0) -> Array:
         value = self._get(key)
-        is_number = (
-            [isinstance(x, int | float) and not isinstance(x, bool) for x in value]
-            if isinstance(value, list)
-            else []
-        )
-        if len(is_number) != 3 or not all(is_number):
+        if not isinstance(value, list) or len(value) != 3 or not all(map(_is_number, value)):
             raise self._fail(key, f"must be three numbers [x, y, z], got {value!r}.")
         return as_float([x * scale for x in value], (3,), key)
 
+    def segment(self, first: str, second: str, scale: float) -> tuple[Array, Array]:
+        """Two points that differ."""
+        if self.vector(first).tolist() == self.vector(second).tolist():
+            raise self._fail(second, f"must differ from {first!r}; the two points coincide.")
+        return self.vector(first, scale), self.vector(second, scale)
+
+    def moments(self, key: str) -> Array:
+        """Principal moments of inertia that a body can have."""
+        value = self.vector(key)
+        try:
+            RigidBody(mass=1.0, inertia=value)
+        except ValueError as error:
+            raise self._fail(key, str(error)) from error
+        return value
+
     def interval(self, key: str) -> tuple[Array, Array]:
         value = self._get(key)
-        is_number = (
-            [isinstance(x, int | float) and not isinstance(x, bool) for x in value]
-            if isinstance(value, list)
-            else []
-        )
-        if len(is_number) != 2 or not all(is_number) or not 0 < value[0] < value[1]:
+        is_pair = isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))
+        if not is_pair or not 0 < value[0] < value[1]:
             raise self._fail(
                 key, f"must be two numbers [lower, upper] with 0 < lower < upper, got {value!r}."
             )
@@ -230,7 +241,7 @@ class _Reader:
 
     def choice(self, key: str, known) -> str:
         value = self._get(key)
-        if value not in known:
+        if value not in list(known):  # a list, for a value that has no hash
             raise self._fail(key, f"must be one of {sorted(known)}, got {value!r}.")
         return value
 
@@ -263,20 +274,17 @@ def _parse(document: dict, path: str) -> QuarterCar:
     links = {}
     for name in table.names():
         link = table.table(name)
-        links[name] = Link(
-            link.vector("chassis", metre), link.vector("knuckle", metre), link.number("mass", kilogram)
-        )
+        links[name] = Link(*link.segment("chassis", "knuckle", metre), link.number("mass", kilogram))
 
     def part(key: str, centre: str) -> Part:
         body = root.table(key)
-        return Part(body.vector(centre, metre), body.number("mass", kilogram), body.vector("inertia"))
+        return Part(body.vector(centre, metre), body.number("mass", kilogram), body.moments("inertia"))
 
     def strut(key: str, rate: str) -> Strut:
         element = root.table(key)
         return Strut(
             element.choice("link", links),
-            element.vector("link_point", metre),
-            element.vector("chassis_point", metre),
+            *element.segment("link_point", "chassis_point", metre),
             element.number(rate),
         )
 

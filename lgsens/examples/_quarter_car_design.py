@@ -1,7 +1,7 @@
 """The suspension design problem of the paper's §9: comfort, under bounds on tyre force and spring length."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -132,6 +132,27 @@ class SuspensionDesign(eqx.Module):
     def __check_init__(self):
         if self.parameters not in PARAMETERS:
             raise ValueError(f"`parameters`: {suggestion(self.parameters, PARAMETERS)}.")
+
+    @staticmethod
+    def load(path: str | Path | None = None, **settings: Any) -> "SuspensionDesign":
+        """The design problem of a hardpoint file; None: the one that ships with lgsens.
+
+        Arguments:
+            path: the TOML file.
+            settings: `parameters`, `wheel`, `t1`, `num_steps` as above.
+
+        Raises `ValueError` naming the file and the key for a file that cannot be read, is incomplete, or
+        starts outside its own bounds.
+        """
+        car, limits = QuarterCar.load(path), DesignLimits.load(path)
+        for key, value in (("stiffness", car.spring.rate), ("damping", car.damper.rate)):
+            lower, upper = map(float, getattr(limits, key))
+            if not lower <= float(value) <= upper:
+                raise ValueError(
+                    f"Hardpoint file {_read(path)[1]!r}, key 'design.{key}': the start, {float(value)}, lies "
+                    f"outside [{lower}, {upper}]."
+                )
+        return SuspensionDesign(car, limits, **settings)
 
     def _members(self, stiffness, damping, hardpoints) -> dict[str, Array]:
         members = {"stiffness": stiffness, "damping": damping, "hardpoints": hardpoints}

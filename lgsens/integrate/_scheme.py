@@ -63,13 +63,13 @@ class GeneralizedAlpha(eqx.Module):
                 f"GeneralizedAlpha: `rho_inf` must be a number in [0, 1), got {self.rho_inf!r}; 0.9 damps little, "
                 "0 most."
             )
-        if not (self.tolerance > 0.0 and math.isfinite(self.tolerance)):
+        if not isinstance(self.tolerance, int | float) or not 0.0 < self.tolerance < math.inf:
             raise ValueError(
                 f"GeneralizedAlpha: `tolerance` must be positive, got {self.tolerance!r}; 1e-10 is the default."
             )
-        if self.max_iterations < 1:
+        if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
             raise ValueError(
-                f"GeneralizedAlpha: `max_iterations` must be at least 1, got {self.max_iterations!r}."
+                f"GeneralizedAlpha: `max_iterations` must be an int, at least 1, got {self.max_iterations!r}."
             )
 
     @property
@@ -112,13 +112,15 @@ def advance(scheme: GeneralizedAlpha, system: AbstractSystem, previous: State, u
     """What follows from the unknown u = a_{n+1}."""
     x = increment(scheme, previous, u, h)
     v = previous.v + h * ((1.0 - scheme.gamma) * previous.a + scheme.gamma * u)
-    vdot = (
-        (1.0 - scheme.alpha_m) * u + scheme.alpha_m * previous.a - scheme.alpha_f * previous.vdot
-    ) / (1.0 - scheme.alpha_f)
+    vdot = ((1.0 - scheme.alpha_m) * u + scheme.alpha_m * previous.a - scheme.alpha_f * previous.vdot) / (
+        1.0 - scheme.alpha_f
+    )
     return Motion(x, system.group.retract(previous.q, x), v, vdot)
 
 
-def factorize_iteration_matrix(scheme: GeneralizedAlpha, system: AbstractSystem, tangents: Tangents, mass, x, h):
+def factorize_iteration_matrix(
+    scheme: GeneralizedAlpha, system: AbstractSystem, tangents: Tangents, mass, x, h
+):
     """The factors of S above: one LU, which serves Newton, the DDM, and transposed, the AVM."""
     group = system.group
     k = mass.shape[0]
@@ -126,8 +128,6 @@ def factorize_iteration_matrix(scheme: GeneralizedAlpha, system: AbstractSystem,
     rows = jnp.concatenate([tangents.stiffness, tangents.constraint_jacobian])
     rows = jax.vmap(lambda row: group.tangent_rmv(x, row))(rows)
     dynamic = (
-        scheme.inertia_factor * mass
-        + (scheme.gamma * h) * tangents.damping
-        + (scheme.beta * h**2) * rows[:k]
+        scheme.inertia_factor * mass + (scheme.gamma * h) * tangents.damping + (scheme.beta * h**2) * rows[:k]
     )
     return Factors.of(dynamic, tangents.constraint_jacobian.T, rows[k:], mass_scale(mass))

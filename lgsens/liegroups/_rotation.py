@@ -23,6 +23,19 @@ _QUATERNION[1:, 1:] = (
 _QUATERNION[1:, 1:] -= _EYE[:, :, None, None] * _EYE[None, None, :, :]
 
 
+def nearest_rotation(R: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
+    """The rotation matrix nearest to `R`, for a matrix that is one but for a small error (an optimizer's step, say).
+
+    The orthogonal factor of the polar decomposition by Newton-Schulz, `R <- R (3 I - R^T R) / 2`: four steps take an
+    error of 0.1 below round-off, and leave a rotation as it is. The derivative is the projection on the tangent space.
+    Source: Higham, Functions of Matrices (2008), eq. (8.20).
+    """
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=R.dtype), R.shape)
+    for _ in range(4):
+        R = 0.5 * R @ (3.0 * eye - jnp.swapaxes(R, -1, -2) @ R)
+    return R
+
+
 def _components(x):
     return tuple(lax.index_in_dim(x, i, keepdims=False) for i in range(3))
 

@@ -1,6 +1,8 @@
 """The scene: bodies, joints and forces by name."""
 
+import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -8,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lgsens._validate import is_concrete
-from lgsens.liegroups import Pose
+from lgsens.liegroups import Pose, nearest_rotation
 from lgsens.model._body import RigidBody
 from lgsens.model._forces import AbstractForce
 from lgsens.model._frames import Frame, ground_frame
@@ -52,7 +54,9 @@ class Model(eqx.Module):
         ):
             for name, member in members.items():
                 if not isinstance(member, kind):
-                    raise ValueError(f"{what} {name!r} must be a {kind.__name__}, got {type(member).__name__}.")
+                    raise ValueError(
+                        f"{what} {name!r} must be a {kind.__name__}, got {type(member).__name__}."
+                    )
         for name, joint in self.joints.items():
             self._check_connection(f"Joint {name!r}", (joint.a, joint.b))
         for name, force in self.forces.items():
@@ -72,13 +76,11 @@ class Model(eqx.Module):
         for i, first in enumerate(names):
             for second in names[i + 1 :]:
                 one, other = self.joints[first], self.joints[second]
-                same_type = type(one) is type(other) and {one.a, one.b} == {other.a, other.b}
-                if same_type and is_concrete(one, other):
-                    if all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other))):
-                        raise ValueError(
-                            f"Joints {first!r} and {second!r} are the same {type(one).__name__} between "
-                            f"{one.a!r} and {one.b!r} at the same place; remove one of them."
-                        )
+                if is_concrete(one, other) and _is_same_connection(one, other):
+                    raise ValueError(
+                        f"Joints {first!r} and {second!r} are the same {type(one).__name__} between "
+                        f"{one.a!r} and {one.b!r} at the same place; remove one of them."
+                    )
 
     def system(self) -> MultibodySystem:
         """The equations of motion, elements stacked by type.
@@ -88,7 +90,12 @@ class Model(eqx.Module):
         """
         names = tuple(sorted(self.bodies))
         number = {None: None} | {name: i for i, name in enumerate(names)}
-        bodies = {name: self.bodies[name] for name in names}
+        # An optimizer that updates a whole model leaves SO(3) by the square of its step.
+        rotations = nearest_rotation(jnp.stack([self.bodies[name].orientation for name in names]))
+        bodies = {
+            name: eqx.tree_at(lambda body: body.orientation, self.bodies[name], rotation)
+            for name, rotation in zip(names, rotations)
+        }
         ordered = list(bodies.values())
         dtype = ordered[0].mass.dtype
         ground = ground_frame(dtype)
@@ -111,7 +118,7 @@ class Model(eqx.Module):
             inertia=jnp.stack([body.inertia_matrix for body in ordered]),
             pose=Pose(
                 jnp.stack([body.position for body in ordered]),
-                jnp.stack([body.orientation for body in ordered]),
+                rotations,
             ),
             velocity=jnp.concatenate(
                 [part for body in ordered for part in (body.velocity, body.angular_velocity)]
@@ -121,3 +128,19 @@ class Model(eqx.Module):
             body_names=names,
             assembled=all(joint.assembled for joint in self.joints.values()),
         )
+
+
+def _is_same_connection(one: AbstractJoint, other: AbstractJoint) -> bool:
+    """Whether two joints have one type, the same two bodies (in either order) and the same numbers."""
+    if type(one) is not type(other) or {one.a, one.b} != {other.a, other.b}:
+        return False
+    numbers, others = _numbers(one, exchanged=False), _numbers(other, exchanged=one.a != other.a)
+    same_structure = jax.tree.structure(numbers) == jax.tree.structure(others)
+    return same_structure and jax.tree.all(jax.tree.map(np.array_equal, numbers, others))
+
+
+def _numbers(joint: AbstractJoint, *, exchanged: bool) -> dict[str, Any]:
+    """The numbers of a joint by field; `exchanged`: those of its end a (`at_a`) under the name for b."""
+    swap = {"_a": "_b", "_b": "_a"} if exchanged else {}
+    names = [field.name for field in dataclasses.fields(joint) if field.name not in ("a", "b")]
+    return {name[:-2] + swap.get(name[-2:], name[-2:]): getattr(joint, name) for name in names}

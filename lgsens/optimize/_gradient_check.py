@@ -61,10 +61,9 @@ def check_gradient(
     """
     x = jax.tree.map(lambda leaf: as_float(leaf, None, "`x`"), x)
     flat, unravel = ravel_pytree(x)
-    if step is None:
-        step = float(np.finfo(flat.dtype).eps) ** (1 / 3)
-    if not step > 0:
-        raise ValueError(f"`step` must be positive, got {step}.")
+    h: float = np.cbrt(float(np.finfo(flat.dtype).eps)) if step is None else step
+    if not h > 0:
+        raise ValueError(f"`step` must be positive, got {h}.")
     if scale is None:
         scale = jax.tree.map(lambda leaf: jnp.max(jnp.abs(leaf)), x)
         scale = jax.tree.map(lambda size: jnp.where(size > 0, size, 1.0), scale)
@@ -88,7 +87,7 @@ def check_gradient(
         return float(value_and_grad(unravel(flat + jnp.asarray(offset * size, flat.dtype)))[0])
 
     exact = directions @ scaled_gradient
-    difference = np.array([(at(step * d) - at(-step * d)) / (2 * step) for d in directions])
+    difference = np.array([(at(h * d) - at(-h * d)) / (2 * h) for d in directions])
     largest = np.max(np.abs(exact))
     error = np.abs(exact - difference) / (largest if largest > 0 else 1.0)
-    return GradientCheck(names, exact, difference, error, step)
+    return GradientCheck(names, exact, difference, error, float(h))

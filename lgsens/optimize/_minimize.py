@@ -27,7 +27,9 @@ PENALTY = 30.0  # ρ at first: f and g are both scaled to about 1
 PENALTY_GROWTH = 2.0
 LARGEST_PENALTY = 100.0  # a larger one makes L so stiff that Adam only zigzags; μ does the rest
 PERIOD = 5  # steps of Adam between two updates of the multipliers
-LARGEST_GRADIENT = 1.0  # f is scaled to 1: longer gradients are those of a violation, which Adam would remember
+LARGEST_GRADIENT = (
+    1.0  # f is scaled to 1: longer gradients are those of a violation, which Adam would remember
+)
 DECAY = 0.02  # the last learning rate over the first
 # Shorter memories than Adam's own: these gradients carry no noise, and L changes with μ.
 ADAM_DECAYS = (0.5, 0.99)
@@ -152,7 +154,8 @@ def minimize(
     step = jax.jit(step).lower(carry, jnp.asarray(False)).compile()
     compiled = time.perf_counter()
 
-    records, best = [], None
+    records: list[tuple] = []
+    best: Any = None  # rank, step, x, f, g
     with _bar(num_steps, progress) as bar:
         for i in range(num_steps):
             carry, (x, f, g, worst, norm) = step(carry, jnp.asarray(i % PERIOD == PERIOD - 1))
@@ -182,7 +185,12 @@ def minimize(
         constraints=g,
         feasible=not infeasible,
         step=i,
-        history=History(*columns[:3], jax.tree.map(np.asarray, jax.vmap(unravel)(jnp.asarray(columns[3])))),
+        history=History(
+            objective=columns[0],
+            worst_constraint=columns[1],
+            gradient_norm=columns[2],
+            design=jax.tree.map(np.asarray, jax.vmap(unravel)(jnp.asarray(columns[3]))),
+        ),
         multipliers=np.asarray(carry.multipliers),
         compile_seconds=compiled - started,
         run_seconds=finished - compiled,
@@ -210,10 +218,11 @@ def _make_step(fun, box: Box, optimizer: optax.GradientTransformation, tolerance
 
         with jax.numpy_dtype_promotion("standard"):  # optax takes powers of a float to its int32 count
             updates, state = optimizer.update(gradient, carry.optimizer)
+        z = optax.apply_updates(carry.z, updates)
         update = update_multipliers & finite
         stalled = (worst > tolerance) & (worst > carry.violation / 2)
         moved = _Carry(
-            z=optax.projections.projection_box(carry.z + updates, 0.0, 1.0),
+            z=optax.projections.projection_box(z, 0.0, 1.0),
             last_finite=carry.z,
             optimizer=state,
             multipliers=jnp.where(update, pushed, carry.multipliers),

@@ -1,4 +1,4 @@
-"""Consistent initial states, assembly and accelerations against their defining equations and independent motions."""
+"""Consistent initial states, assembly and accelerations against their defining equations."""
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +13,11 @@ from lgsens.dynamics._initial import assemble
 
 
 def double_pendulum(seed) -> lg.Model:
-    """A body on a ball joint, another hinged to it with a damper between them, and velocities that fit neither joint."""
+    """A body on a ball joint, another hinged to it, a damper, and velocities that fit neither joint."""
     rng = np.random.default_rng(seed)
     upper, lower = (
-        random_body(rng, velocity=rng.normal(size=3), angular_velocity=3 * rng.normal(size=3)) for _ in range(2)
+        random_body(rng, velocity=rng.normal(size=3), angular_velocity=3 * rng.normal(size=3))
+        for _ in range(2)
     )
     joints = {
         "ball": lg.SphericalJoint(None, "upper", at=rng.uniform(-1, 1, 3)),
@@ -26,7 +27,9 @@ def double_pendulum(seed) -> lg.Model:
     forces = {
         "gravity": lg.Gravity(GRAVITY),
         "damper": lg.SpringDamper("upper", "lower", **ends, stiffness=20.0, damping=1.0),
-        "push": lg.AppliedForce("lower", force=rng.normal(size=3), signal=lg.BumpRoad(height=5.0, duration=1.0)),
+        "push": lg.AppliedForce(
+            "lower", force=rng.normal(size=3), signal=lg.BumpRoad(height=5.0, duration=1.0)
+        ),
     }
     return lg.Model({"upper": upper, "lower": lower}, joints, forces)
 
@@ -45,7 +48,7 @@ def matrices(model, state):
 
 @pytest.fixture(scope="module", params=range(3))
 def pendulum(request):
-    """A model, its initial state, M, B, r, and the amplification of round-off by the equations that gave the state."""
+    """A model, its initial state, M, B, r, and by how much the equations of the state amplify round-off."""
     model = double_pendulum(request.param)
     initial = start(model)
     mass, jacobian, residual = map(np.asarray, matrices(model, initial.state))
@@ -61,7 +64,7 @@ def test_reference_of_joints_is_kept(pendulum):
 
 
 def test_velocity_is_the_closest_that_the_joints_allow(pendulum):
-    """B v = 0, and M (v − v_ref) does no work on any velocity that they allow: v is nearest in kinetic energy."""
+    """B v = 0, and M (v − v_ref) does no work on a velocity that they allow: v is nearest in energy."""
     model, initial, mass, jacobian, _, condition = pendulum
     wanted, v = np.asarray(model.system().velocity), np.asarray(initial.state.v)
     size = np.abs(wanted).max()
@@ -102,7 +105,10 @@ def along(model, state):
 def test_constraints_hold_to_their_second_derivative(pendulum):
     model, initial, _, jacobian, _, condition = pendulum
     for order, derivative in enumerate(along(model, initial.state)):
-        scale = np.linalg.norm(jacobian) * (1.0, np.abs(initial.state.v).max(), np.abs(initial.state.vdot).max())[order]
+        scale = (
+            np.linalg.norm(jacobian)
+            * (1.0, np.abs(initial.state.v).max(), np.abs(initial.state.vdot).max())[order]
+        )
         close(derivative, np.zeros(8), 10 * condition, scale=scale)
 
 
@@ -114,7 +120,7 @@ def slope(model, q0, x, v, t):
 
 
 def fly(model, q0, v, h, count):
-    """v̇ after each of `count` Runge-Kutta steps of size h: index 1 and fourth order, nothing in it is the integrator's."""
+    """v̇ after each of `count` Runge-Kutta steps of size h: nothing in it is the integrator's."""
     y, t, seen = np.stack([np.zeros_like(v), v]), float(TIME), []
     rate = lambda y, t: np.stack(slope(model, q0, *y, jnp.asarray(t)))  # noqa: E731
     for _ in range(count):
@@ -134,19 +140,22 @@ def test_jerk_is_the_rate_of_the_accelerations(pendulum):
     differences = (8 * (f1 - b1) - (f2 - b2)) / (12 * h)
     size = np.abs(initial.jerk).max()
     assert size > 1
-    # Rates w are below 30 rad/s: the formula errs by (w h)⁴/30 < 3e-8 of the jerk, a Runge-Kutta step by (w h)⁵/120
-    # of the velocity, that is w² (w h)⁴/120 /w² of the jerk: less. Round-off: EPS · condition/h of the accelerations, 1e-8.
+    # Rates w are below 30 rad/s: the formula errs by (w h)⁴/30 < 3e-8 of the jerk, a Runge-Kutta step by (w
+    # h)⁵/120 of the velocity, that is w² (w h)⁴/120 /w² of the jerk: less. Round-off: EPS · condition/h of
+    # the accelerations, 1e-8.
     assert np.abs(initial.jerk - differences).max() < 1e-7 * size
 
 
 def test_accelerations_of_the_top_are_eulers():
-    """A top on its pivot is a body about a fixed point: I_O Ω̇ + Ω × I_O Ω = moment of the weight, with Steiner's I_O."""
+    """About a fixed point I_O Ω̇ + Ω × I_O Ω is the moment of the weight, with Steiner's I_O."""
     rng = np.random.default_rng(4)
     spin = rng.normal(size=3)
     body = random_body(rng, angular_velocity=spin)
     pivot = rng.uniform(-1, 1, 3)
     arm = np.asarray(body.orientation).T @ (np.asarray(body.position) - pivot)  # pivot to centre, body frame
-    model = lg.Model({"top": body}, {"pivot": lg.SphericalJoint(None, "top", at=pivot)}, {"g": lg.Gravity(GRAVITY)})
+    model = lg.Model(
+        {"top": body}, {"pivot": lg.SphericalJoint(None, "top", at=pivot)}, {"g": lg.Gravity(GRAVITY)}
+    )
     state = start(model).state
     mass, inertia = float(body.mass), np.asarray(body.inertia)
     about_pivot = inertia + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
@@ -204,13 +213,17 @@ def test_a_rod_of_another_length_is_assembled(length):
 
 
 def tripod(lengths) -> lg.Model:
-    """A free body on three rods to the ground, of lengths that it does not have in its reference configuration."""
+    """A free body on three rods to the ground, longer or shorter than in its reference configuration."""
     rng = np.random.default_rng(8)
     body = random_body(rng, position=(0.0, 0.0, 1.0))
-    feet, ends = rng.uniform(-1, 1, (3, 3)) - [0, 0, 2], rng.uniform(-0.3, 0.3, (3, 3)) + [0, 0, 1]
+    feet, ends = rng.uniform(-1, 1, (3, 3)), rng.uniform(-0.3, 0.3, (3, 3))
+    feet[:, 2] -= 2.0
+    ends[:, 2] += 1.0
     distances = np.linalg.norm(ends - feet, axis=1)
     joints = {
-        f"rod{i}": lg.DistanceJoint(None, "plate", at_a=feet[i], at_b=ends[i], length=distances[i] + lengths[i])
+        f"rod{i}": lg.DistanceJoint(
+            None, "plate", at_a=feet[i], at_b=ends[i], length=distances[i] + lengths[i]
+        )
         for i in range(3)
     }
     return lg.Model({"plate": body}, joints)

@@ -1,14 +1,31 @@
-"""The basic constraints: closed-form tangents against autodiff, and against differences that share no code."""
+"""The basic constraints: tangents against autodiff, and against differences that share no code."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import GRAVITY, central_difference, close, moved, moved_without_library, random_body, random_point, random_rotation
+from helpers import (
+    GRAVITY,
+    central_difference,
+    close,
+    moved,
+    moved_without_library,
+    random_body,
+    random_point,
+    random_rotation,
+)
 
 import lgsens as lg
-from lgsens.model import AbstractConstraint, AbstractJoint, Coincidence, Distance, Frame, InPlane, Orthogonality
+from lgsens.model import (
+    AbstractConstraint,
+    AbstractJoint,
+    Coincidence,
+    Distance,
+    Frame,
+    InPlane,
+    Orthogonality,
+)
 
 KINDS = {"Coincidence": Coincidence, "Orthogonality": Orthogonality, "InPlane": InPlane, "Distance": Distance}
 ROWS = {"Coincidence": 3, "Orthogonality": 1, "InPlane": 1, "Distance": 1}
@@ -20,7 +37,7 @@ ULPS = 200
 
 
 def sample(name, seed=0):
-    """`POSES` elements of one kind, two frames each (four metres apart, so that |d| is not small) and multipliers."""
+    """`POSES` elements of one kind, two frames each (4 m apart, so that |d| is not small) and multipliers."""
     rng = np.random.default_rng(seed)
     fields = {"point_a": 3, "point_b": 3, "axis_a": 3, "axis_b": 3}
     own = [f for f in fields if f in KINDS[name].__dataclass_fields__]
@@ -47,7 +64,9 @@ def differentiated(element, a, b, lam):
 
     def jacobian(x):
         first, second = moved(a, x[:6]), moved(b, x[6:])
-        return jax.jacfwd(lambda y: element.value(moved(first, y[:6]), moved(second, y[6:])))(jnp.zeros_like(x))
+        return jax.jacfwd(lambda y: element.value(moved(first, y[:6]), moved(second, y[6:])))(
+            jnp.zeros_like(x)
+        )
 
     zero = jnp.zeros(12, a.position.dtype)
     return jacobian(zero), jax.jacfwd(lambda x: lam @ jacobian(x))(zero)
@@ -76,7 +95,8 @@ def test_tangents_equal_central_differences(name):
         value, jacobian, _ = closed_form(element, *frames, lam)
         return value[0], lam[0] @ jacobian[0]
 
-    # Values up to 10 m and third derivatives of that size: 4e-11 × 10 (see `central_difference`), with a margin of 10.
+    # Values up to 10 m and third derivatives of that size: 4e-11 × 10 (see `central_difference`), with a
+    # margin of 10.
     for actual, index in ((jacobian[0], 0), (stiffness[0], 1)):
         expected = central_difference(lambda x, index=index: at(x)[index], 12)
         np.testing.assert_allclose(actual, expected, rtol=0, atol=4e-9)
@@ -122,7 +142,11 @@ class UserJoint(AbstractJoint):
         return True
 
     def constraints(self, a, b):
-        return (UserCoincidence(a.orientation.T @ (self.at - a.position), b.orientation.T @ (self.at - b.position)),)
+        return (
+            UserCoincidence(
+                a.orientation.T @ (self.at - a.position), b.orientation.T @ (self.at - b.position)
+            ),
+        )
 
 
 class UserRod(AbstractJoint):

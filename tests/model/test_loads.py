@@ -5,14 +5,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import Drag, DragForce, central_difference, close, moved, moved_without_library, random_body, random_point, random_rotation
+from helpers import (
+    Drag,
+    DragForce,
+    central_difference,
+    close,
+    moved,
+    moved_without_library,
+    random_body,
+    random_point,
+    random_rotation,
+)
 
 import lgsens as lg
 from lgsens.model import AbstractForce, AbstractLoad, Attached, Frame, SpringDamperLoad, TyreLoad
 from lgsens.model._loads import PointForce, Weight
 
 COUNT = 20
-# Stiffnesses, lengths and forces are of order 1 to 10 and |d| is at least 1: some tens of round-offs of the largest entry.
+# Stiffnesses, lengths and forces are of order 1 to 10 and |d| is at least 1: some tens of round-offs of the
+# largest entry.
 ULPS = 300
 
 SIGNALS = {
@@ -81,11 +92,14 @@ def test_position_tangent_equals_central_differences(name):
     actual = np.zeros((12, 12)) if tangents.position is None else tangents.position[0]
 
     def force(x):
-        frames = [moved_without_library(Frame(*(leaf[0] for leaf in f)), w) for f, w in ((a, x[:6]), (b, x[6:]))]
+        frames = [
+            moved_without_library(Frame(*(leaf[0] for leaf in f)), w) for f, w in ((a, x[:6]), (b, x[6:]))
+        ]
         frames = [Frame(*(jnp.asarray(leaf)[None] for leaf in f)) for f in frames]
         return closed_form(load, *frames, va, vb, t)[0][0]
 
-    # Forces and their third derivatives are below 100: 4e-11 × 100 (see `central_difference`), with a margin of 5.
+    # Forces and their third derivatives are below 100: 4e-11 × 100 (see `central_difference`), with a
+    # margin of 5.
     np.testing.assert_allclose(actual, central_difference(force, 12), rtol=0, atol=2e-8)
 
 
@@ -112,7 +126,9 @@ def force_energy(load, a, b, t):
 
 def energy_of(name):
     family = name.partition("-")[0]
-    return {"spring": spring_energy, "tyre": tyre_energy, "weight": weight_energy, "force": force_energy}[family]
+    return {"spring": spring_energy, "tyre": tyre_energy, "weight": weight_energy, "force": force_energy}[
+        family
+    ]
 
 
 def without(load, field):
@@ -161,16 +177,14 @@ def test_power_of_a_spring_damper():
 def test_moment_of_an_applied_force_is_fixed_in_the_body():
     load, a, b, va, vb, t = sample("force", seed=4)
     force, _ = closed_form(load, a, b, va, vb, t)
-    factor = np.array([float(signal(time)) for signal, time in _unstacked(load.signal, t)])
+    factor = np.asarray(jax.vmap(lambda signal, t: signal(t))(load.signal, t))
     arm = np.einsum("nij,nj->ni", b.orientation, load.point_b)
-    moment = np.einsum("nij,nj->ni", np.swapaxes(b.orientation, 1, 2), np.cross(arm, load.vector)) + load.moment
+    moment = (
+        np.einsum("nij,nj->ni", np.swapaxes(b.orientation, 1, 2), np.cross(arm, load.vector)) + load.moment
+    )
     close(force[:, 6:9], factor[:, None] * load.vector, ULPS)
     close(force[:, 9:], factor[:, None] * moment, ULPS)
     np.testing.assert_array_equal(force[:, :6], np.zeros((COUNT, 6)))
-
-
-def _unstacked(tree, *rest):
-    return [jax.tree.map(lambda leaf: leaf[i], (tree, *rest)) for i in range(COUNT)]
 
 
 def test_spring_of_coinciding_points_is_finite():
@@ -260,10 +274,21 @@ def springs(own: bool):
     rng = np.random.default_rng(5)
     bodies = {name: random_body(rng) for name in ("one", "two")}
     forces = {}
-    for name, ends in {"between": ("two", "one"), "to ground": ("one", None), "from ground": (None, "two")}.items():
-        numbers = {"at_a": rng.uniform(1, 2, 3), "at_b": rng.uniform(-2, -1, 3), "stiffness": 5.0, "damping": 2.0}
+    for name, ends in {
+        "between": ("two", "one"),
+        "to ground": ("one", None),
+        "from ground": (None, "two"),
+    }.items():
+        numbers = {
+            "at_a": rng.uniform(1, 2, 3),
+            "at_b": rng.uniform(-2, -1, 3),
+            "stiffness": 5.0,
+            "damping": 2.0,
+        }
         numbers = {key: jnp.asarray(value, dtype=float) for key, value in numbers.items()}
-        forces[name] = UserSpringForce(*ends, **numbers) if own else lg.SpringDamper(*ends, **numbers, free_length=1.0)
+        forces[name] = (
+            UserSpringForce(*ends, **numbers) if own else lg.SpringDamper(*ends, **numbers, free_length=1.0)
+        )
     return lg.Model(bodies, {}, forces)
 
 
@@ -283,7 +308,9 @@ def test_load_without_tangents_gets_them():
 def test_tangents_of_a_users_drag():
     """C_t of −c|ẋ|ẋ is c (|ẋ| I + ẋẋᵀ/|ẋ|); its moment −c Rᵀ(sin t x) gives K_t = c sin t [Rᵀ, (Rᵀx)~]."""
     rng = np.random.default_rng(6)
-    model = lg.Model({"kite": random_body(rng)}, {}, {"drag": DragForce("kite", jnp.asarray(0.3, dtype=float))})
+    model = lg.Model(
+        {"kite": random_body(rng)}, {}, {"drag": DragForce("kite", jnp.asarray(0.3, dtype=float))}
+    )
     system = model.system()
     point = random_point(system, rng)
     _, (stiffness, damping, _) = evaluate(model, point)

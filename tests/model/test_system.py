@@ -1,11 +1,21 @@
-"""The assembled system: tangents, mass matrix and gyroscopic forces against definitions, order and stacking."""
+"""The assembled system: tangents, mass and gyroscopic forces against definitions; order and stacking."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import BODIES, GRAVITY, PointMasses, central_difference, close, displaced, everything, random_body, random_point
+from helpers import (
+    BODIES,
+    GRAVITY,
+    PointMasses,
+    central_difference,
+    close,
+    displaced,
+    everything,
+    random_body,
+    random_point,
+)
 
 import lgsens as lg
 from lgsens.dynamics import accelerations, autodiff_tangents
@@ -55,7 +65,8 @@ def test_tangents_equal_central_differences(system):
 
     k = system.group.dim
     position, damping = central_difference(by_position, k), central_difference(by_velocity, k)
-    # Residuals and their third derivatives are of order 100: 4e-11 × 100 (see `central_difference`), margin of 10.
+    # Residuals and their third derivatives are of order 100: 4e-11 × 100 (see `central_difference`), margin
+    # of 10.
     np.testing.assert_allclose(tangents.stiffness, position[:k], rtol=0, atol=4e-8)
     np.testing.assert_allclose(tangents.constraint_jacobian, position[k:], rtol=0, atol=4e-8)
     np.testing.assert_allclose(tangents.damping, damping, rtol=0, atol=4e-8)
@@ -160,10 +171,14 @@ def test_multipliers_of_a_joint(system):
     rows = {name: system.multiplier_rows(name) for name in joints}
     assert {name: len(found) for name, found in rows.items()} == sizes
     assert sorted(np.concatenate(list(rows.values()))) == list(range(28))
-    jacobian = np.asarray(evaluate(system, random_point(system, np.random.default_rng(6)))[2].constraint_jacobian)
+    jacobian = np.asarray(
+        evaluate(system, random_point(system, np.random.default_rng(6)))[2].constraint_jacobian
+    )
     for name, joint in joints.items():
         loaded = np.abs(jacobian[rows[name]]).reshape(len(rows[name]), len(BODIES), 6).max(axis=(0, 2)) > 0
-        assert {body for body, touched in zip(system.body_names, loaded) if touched} == {joint.a, joint.b} - {None}
+        assert {body for body, touched in zip(system.body_names, loaded) if touched} == {joint.a, joint.b} - {
+            None
+        }
 
 
 # Stacking.
@@ -183,7 +198,7 @@ def chain(count) -> lg.Model:
 
 
 def test_what_is_compiled_does_not_grow_with_the_number_of_elements():
-    """One kernel for joints on the ground, one for those between bodies; the jaxprs have equally many operations."""
+    """One kernel for joints on the ground, one for those between bodies; as many operations in the jaxprs."""
     groups, operations = [], []
     for count in (2, 10):
         system = chain(count).system()
@@ -213,8 +228,12 @@ def test_leaves_are_strongly_typed_floats(system):
     model = everything()
     assert strongly_typed_floats(model)
     assert strongly_typed_floats(system)
-    integers = lg.Model(  # Python ints, lists and NumPy arrays of any type become leaves of the same type
-        {"block": lg.RigidBody(2, [1, 1, 1], position=np.arange(3), velocity=np.ones(3, np.float32))},
+    others = lg.Model(  # ints, lists, NumPy arrays and weakly typed numbers become leaves of the same type
+        {
+            "block": lg.RigidBody(
+                jnp.asarray(2.0), [1, 1, 1], position=np.arange(3), velocity=np.ones(3, np.float32)
+            )
+        },
         {"rod": lg.DistanceJoint(None, "block", at_a=[0, 0, 3], at_b=[0, 1, 2], length=2)},
         {
             "spring": lg.SpringDamper("block", None, at_a=[0, 1, 2], at_b=[1, 1, 1], stiffness=3, preload=1),
@@ -222,7 +241,8 @@ def test_leaves_are_strongly_typed_floats(system):
             "push": lg.AppliedForce("block", force=[1, 2, 3], signal=lg.BumpRoad(height=1, duration=2)),
         },
     )
-    assert strongly_typed_floats(integers)
+    assert jnp.asarray(2.0).weak_type
+    assert strongly_typed_floats(others)
     # What a gradient step gives is again such a model.
     updated = jax.jit(lambda model: jax.tree.map(lambda x, g: x - 0.1 * g, model, model))(model)
     assert jax.tree.structure(updated) == jax.tree.structure(model)
