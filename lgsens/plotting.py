@@ -182,7 +182,7 @@ def mechanism(
         axis.set_pane_color((0.98, 0.98, 0.98))
         axis.labelpad = 8
     if handles:
-        axes.legend(handles=handles, frameon=False, loc="upper left", fontsize=11)
+        axes.legend(handles=handles, frameon=False, loc="upper center", ncols=len(handles), columnspacing=1.2)
     if title:
         fig.suptitle(title)
     return fig

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._validate import suggestion
+from lgsens._validate import as_float, suggestion
 from lgsens.model._forces import SpringDamper, TyreSpring
 from lgsens.model._model import Model
 
@@ -34,21 +34,28 @@ def static_preload(
             springs = [n for n, f in model.forces.items() if isinstance(f, SpringDamper | TyreSpring)]
             raise ValueError(f"`static_preload`: {suggestion(name, springs)}.")
 
-    def preloaded(values) -> Model:
-        members = dict(model.forces)
-        for i, name in enumerate(forces):
-            members[name] = _with_preload(members[name], values[i])
-        return eqx.tree_at(lambda m: m.forces, model, members)
+    values, unbalanced = _solve(model, tuple(forces), as_float(t0, (), "`t0`"))
+    return _preloaded(model, forces, values), unbalanced
 
+
+def _preloaded(model: Model, forces: Sequence[str], values) -> Model:
+    members = dict(model.forces)
+    for name, value in zip(forces, values):
+        members[name] = _with_preload(members[name], value)
+    return eqx.tree_at(lambda m: m.forces, model, members)
+
+
+@eqx.filter_jit  # outside a jit the many small operations would be compiled one by one: 17 s instead of 2
+def _solve(model: Model, forces: tuple[str, ...], t):
+    """The preloads, and the largest force or moment they leave unbalanced."""
     rest = model.system()
     q, v = rest.reference()
     zero = jnp.zeros_like(v)
     jacobian = rest.constraint_jacobian(q)
     lam = jnp.zeros(jacobian.shape[0], v.dtype)
-    t = jnp.asarray(t0, v.dtype)
 
     def residual(values):
-        return preloaded(values).system().residual(q, zero, zero, lam, t)
+        return _preloaded(model, forces, values).system().residual(q, zero, zero, lam, t)
 
     no_preload = jnp.zeros(len(forces), v.dtype)
     unbalanced, by_preload = residual(no_preload), jax.jacfwd(residual)(no_preload)
@@ -56,7 +63,7 @@ def static_preload(
     k, n = a.shape
     matrix = jnp.block([[jnp.eye(k, dtype=v.dtype), a], [a.T, jnp.zeros((n, n), v.dtype)]])
     solution = jnp.linalg.solve(matrix, jnp.concatenate([-unbalanced, jnp.zeros(n, v.dtype)]))
-    return preloaded(solution[k + len(lam) :]), jnp.max(jnp.abs(solution[:k]))
+    return solution[k + len(lam) :], jnp.max(jnp.abs(solution[:k]))
 
 
 def _with_preload(force: SpringDamper | TyreSpring, value):
