@@ -155,7 +155,10 @@ def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0):
     h = (t1 - t0) / num_steps
     if state0 is None:
         initial = _initial(system, t0)
-        state0 = _started(integrator, system, initial, h)
+        usable = initial.result == RESULTS.successful
+        state0 = jax.tree.map(
+            lambda leaf: jnp.where(usable, leaf, jnp.nan), _started(integrator, system, initial, h)
+        )
         result, violation = initial.result, initial.violation
     else:
         result, violation = jnp.zeros((), jnp.int32), system.constraint(state0.q)
