@@ -40,9 +40,7 @@ def _count(text: str) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        "lgsens", description="Differentiable constrained multibody dynamics on Lie groups in JAX."
-    )
+    parser = _Parser("lgsens", description="Differentiable constrained multibody dynamics on Lie groups in JAX.")
     parser.add_argument("--version", action="version", version=f"lgsens {version()}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 

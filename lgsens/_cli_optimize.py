@@ -131,9 +131,7 @@ def _figures(outcome: Outcome, out: Path) -> None:
     design, before, after = outcome.design, outcome.before, outcome.after
     limits = design.limits
     panels = [
-        plotting.Panel(
-            "chassis acceleration\n[m/s²]", {"before": before.acceleration, "after": after.acceleration}
-        ),
+        plotting.Panel("chassis acceleration\n[m/s²]", {"before": before.acceleration, "after": after.acceleration}),
         plotting.Panel(
             "suspension length\n[mm]",
             {"before": 1e3 * before.spring_length, "after": 1e3 * after.spring_length},
@@ -160,7 +158,5 @@ def _figures(outcome: Outcome, out: Path) -> None:
     if "hardpoints" in design.start:  # k and c do not show
         cars["after"] = design.with_design(outcome.result.x)
     # Preloads do not show either; with any free length they are not computed.
-    models = {
-        name: car.model(wheel=design.wheel, free_length=1.0, free_radius=1.0) for name, car in cars.items()
-    }
+    models = {name: car.model(wheel=design.wheel, free_length=1.0, free_radius=1.0) for name, car in cars.items()}
     plotting.save(plotting.mechanism(models, title=design.car.name), out / "mechanism.png")

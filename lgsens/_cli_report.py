@@ -142,7 +142,5 @@ def table(outcome: Any, tolerance: float) -> str:
     )
     lines.append(", ".join(f"{name} {value:.2f} s" for name, value in outcome.seconds.items()))
     if not result.feasible:
-        lines.append(
-            "No design satisfied the path constraints; this one violates them least. Try more --steps."
-        )
+        lines.append("No design satisfied the path constraints; this one violates them least. Try more --steps.")
     return "\n".join(lines)

@@ -22,13 +22,11 @@ PERTURBATION = 2e-3
 def run(arguments: argparse.Namespace) -> int:
     """Print Ψ and dΨ/dα₀ by DDM, AVM, the explicit AVM and differences."""
     if arguments.h > 0.1:
-        raise ValueError(
-            f"argument --h: must be at most 0.1 s, a tenth of the simulated second, got {arguments.h}"
-        )
+        raise ValueError(f"argument --h: must be at most 0.1 s, a tenth of the simulated second, got {arguments.h}")
     num_steps = max(1, round(1.0 / arguments.h))
     alpha0 = jnp.asarray(math.pi / 4)
 
-    def psi(alpha0, sensitivity: AbstractSensitivity = DirectDifferentiation()):  # noqa: B008 (stateless)
+    def psi(alpha0, sensitivity: AbstractSensitivity = DirectDifferentiation()):
         trajectory = simulate(spinning_top(alpha0), t1=1.0, num_steps=num_steps, sensitivity=sensitivity)
         return time_integral(trajectory.t, trajectory.body("top").position[:, 0] ** 2)
 

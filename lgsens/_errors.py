@@ -16,9 +16,7 @@ class SimulationError(RuntimeError):
 
 def redundant_names(jacobian: np.ndarray, names: tuple[str, ...]) -> list[str]:
     """The joints whose rows of B are linearly dependent: those with weight in the left null space of B."""
-    rows = jacobian / np.maximum(
-        np.linalg.norm(jacobian, axis=1, keepdims=True), np.finfo(jacobian.dtype).tiny
-    )
+    rows = jacobian / np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), np.finfo(jacobian.dtype).tiny)
     left, singular, _ = np.linalg.svd(rows)
     threshold = np.sqrt(np.finfo(jacobian.dtype).eps)
     rank = int(np.sum(singular > threshold))

@@ -156,9 +156,7 @@ def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0):
     if state0 is None:
         initial = _initial(system, t0)
         usable = initial.result == RESULTS.successful
-        state0 = jax.tree.map(
-            lambda leaf: jnp.where(usable, leaf, jnp.nan), _started(integrator, system, initial, h)
-        )
+        state0 = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), _started(integrator, system, initial, h))
         result, violation = initial.result, initial.violation
     else:
         result, violation = jnp.zeros((), jnp.int32), system.constraint(state0.q)

@@ -73,7 +73,12 @@ class Trajectory(eqx.Module):
         states = self.states
         v, vdot = (x.reshape(x.shape[0], count, 2, 3)[:, index] for x in (states.v, states.vdot))
         return BodyMotion(
-            states.q.position[:, index], states.q.orientation[:, index], v[:, 0], v[:, 1], vdot[:, 0], vdot[:, 1]
+            states.q.position[:, index],
+            states.q.orientation[:, index],
+            v[:, 0],
+            v[:, 1],
+            vdot[:, 0],
+            vdot[:, 1],
         )
 
     def multiplier(self, joint: str) -> Float[Array, "n+1 rows"]:

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 from lgsens._validate import as_float
 
 
-def time_integral(t: Float[Array, " n"], f: Float[Array, "n *shape"]) -> Float[Array, "*shape"]:
+def time_integral(t: Float[Array, " n"], f: Float[Array, " n ..."]) -> Float[Array, " ..."]:
     """∫ f dt by the trapezoidal rule, second order like the integrator.
 
         Ψ = Σ_n (t_{n+1} − t_n) (f_n + f_{n+1})/2

@@ -98,9 +98,7 @@ def time_histories(t, panels: Sequence[Panel], title: str = "") -> "Figure":
     return fig
 
 
-def convergence(
-    history: Any, *, tolerance: float, best: int | None = None, objective: str = "objective"
-) -> "Figure":
+def convergence(history: Any, *, tolerance: float, best: int | None = None, objective: str = "objective") -> "Figure":
     """The objective, the worst constraint and the projected gradient over the steps of a minimization.
 
     Arguments:
@@ -141,9 +139,7 @@ def convergence(
     return fig
 
 
-def mechanism(
-    models: Mapping[str, Model], title: str = "", view: tuple[float, float] = (18.0, -38.0)
-) -> "Figure":
+def mechanism(models: Mapping[str, Model], title: str = "", view: tuple[float, float] = (18.0, -38.0)) -> "Figure":
     """Mechanisms in their reference configuration, in space; the last in colour, those before it in grey.
 
     A body is drawn from the points at which joints hold it: two make a bar, more a solid; one with a tyre
@@ -167,9 +163,7 @@ def mechanism(
         elif len(models) > 1:
             handles += axes.plot([], [], [], color=ROLES["link"], linewidth=3, label=name)
         else:
-            handles += [
-                axes.plot([], [], [], color=c, linewidth=3, label=role)[0] for role, c in ROLES.items()
-            ]
+            handles += [axes.plot([], [], [], color=c, linewidth=3, label=role)[0] for role, c in ROLES.items()]
     points = np.asarray(points)
     low, high = points.min(axis=0), points.max(axis=0)
     margin = 0.03 * np.max(high - low)
@@ -193,9 +187,7 @@ def _draw(axes: Any, model: Model, colours: Mapping[str, str]) -> list[np.ndarra
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     held, drawn = _joint_points(model), []
-    wheels = {
-        force.body: np.asarray(force.at) for force in model.forces.values() if isinstance(force, TyreSpring)
-    }
+    wheels = {force.body: np.asarray(force.at) for force in model.forces.values() if isinstance(force, TyreSpring)}
     for name, points in held.items():
         drawn += points
         if name in wheels:
@@ -209,9 +201,7 @@ def _draw(axes: Any, model: Model, colours: Mapping[str, str]) -> list[np.ndarra
             faces = _hull(np.asarray(points))
             axes.add_collection3d(Poly3DCollection(faces, facecolor=colours["body"], alpha=0.16, linewidth=0))
             for face in faces if len(faces) > 1 else ():
-                axes.plot(
-                    *np.concatenate([face, face[:1]]).T, color=colours["body"], linewidth=0.4, alpha=0.5
-                )
+                axes.plot(*np.concatenate([face, face[:1]]).T, color=colours["body"], linewidth=0.4, alpha=0.5)
     for force in model.forces.values():
         if isinstance(force, SpringDamper):
             a, b = np.asarray(force.at_a), np.asarray(force.at_b)
@@ -219,9 +209,7 @@ def _draw(axes: Any, model: Model, colours: Mapping[str, str]) -> list[np.ndarra
                 axes.plot(*_coil(a, b).T, color=colours["spring"], linewidth=1.8)
             else:
                 axes.plot(*np.transpose([a, b]), color=colours["damper"], linewidth=1.8)
-                axes.plot(
-                    *np.transpose([a, a + 0.6 * (b - a)]), color=colours["damper"], linewidth=6, alpha=0.45
-                )
+                axes.plot(*np.transpose([a, a + 0.6 * (b - a)]), color=colours["damper"], linewidth=6, alpha=0.45)
             drawn += [a, b]
     joints = np.asarray([point for points in held.values() for point in points])
     if joints.size:

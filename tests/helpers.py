@@ -134,9 +134,7 @@ def everything(seed=0, order=BODIES) -> lg.Model:
     forces = {
         "gravity": lg.Gravity(GRAVITY),
         "spring": lg.SpringDamper("a", "c", at_a=at(), at_b=at(), stiffness=50.0, damping=3.0, preload=-7.0),
-        "anchor": lg.SpringDamper(
-            None, "d", at_a=at(), at_b=at(), stiffness=40.0, damping=2.0, free_length=0.4
-        ),
+        "anchor": lg.SpringDamper(None, "d", at_a=at(), at_b=at(), stiffness=40.0, damping=2.0, free_length=0.4),
         "stay": lg.SpringDamper("e", None, at_a=at(), at_b=at(), stiffness=30.0),
         "tyre": lg.TyreSpring("b", at=at(), stiffness=90.0, road=bump, preload=5.0),
         "track": lg.TyreSpring("f", at=at(), stiffness=70.0, road=bump, free_radius=0.3),

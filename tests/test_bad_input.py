@@ -177,9 +177,7 @@ CONSTRUCTORS = {
         ("Joint 'strut' refers to body 'chasis'", "the bodies are ['chassis', 'wheel']"),
     ),
     "spring of an unknown body": (
-        lambda: lg.Model(
-            TWO, {}, {"coil": lg.SpringDamper("chassis", "weel", at_a=ORIGIN, at_b=X, stiffness=1.0)}
-        ),
+        lambda: lg.Model(TWO, {}, {"coil": lg.SpringDamper("chassis", "weel", at_a=ORIGIN, at_b=X, stiffness=1.0)}),
         ("Force 'coil' refers to body 'weel'", "the bodies are ['chassis', 'wheel']"),
     ),
     "joint to itself": (
@@ -191,9 +189,7 @@ CONSTRUCTORS = {
         ("Joint 'strut' connects the ground to itself", "name two different bodies"),
     ),
     "spring to itself": (
-        lambda: lg.Model(
-            TWO, {}, {"coil": lg.SpringDamper("wheel", "wheel", at_a=ORIGIN, at_b=X, stiffness=1.0)}
-        ),
+        lambda: lg.Model(TWO, {}, {"coil": lg.SpringDamper("wheel", "wheel", at_a=ORIGIN, at_b=X, stiffness=1.0)}),
         ("Force 'coil' connects body 'wheel' to itself", "name two different bodies"),
     ),
     "duplicate connection": (
@@ -492,9 +488,7 @@ class Oscillator(AbstractSystem):
         return q[:0, None]
 
     def tangents(self, q, v, vdot, lam, t):
-        return Tangents(
-            self.square[None, None], jnp.zeros_like(self.square)[None, None], self.constraint_jacobian(q)
-        )
+        return Tangents(self.square[None, None], jnp.zeros_like(self.square)[None, None], self.constraint_jacobian(q))
 
 
 def test_trajectory_without_bodies():
@@ -664,9 +658,7 @@ def test_hardpoint_file(mistake, tmp_path):
 
 
 def test_hardpoint_file_that_cannot_be_read(tmp_path):
-    with pytest.raises(
-        ValueError, match=says("Hardpoint file", "nowhere.toml", "cannot be read", "No such file")
-    ):
+    with pytest.raises(ValueError, match=says("Hardpoint file", "nowhere.toml", "cannot be read", "No such file")):
         QuarterCar.load(tmp_path / "nowhere.toml")
     with pytest.raises(ValueError, match=says("Hardpoint file", "cannot be read", "directory")):
         QuarterCar.load(tmp_path)

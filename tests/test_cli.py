@@ -11,9 +11,7 @@ import pytest
 from lgsens._cli import main
 
 PNG = b"\x89PNG\r\n\x1a\n"
-SHIPPED = (resources.files("lgsens.examples") / "data" / "five_link_suspension.toml").read_text(
-    encoding="utf-8"
-)
+SHIPPED = (resources.files("lgsens.examples") / "data" / "five_link_suspension.toml").read_text(encoding="utf-8")
 
 
 def run(capsys, *arguments):
@@ -61,9 +59,7 @@ def test_the_report_is_complete(optimized):
         "result.json",
     ]
     for path in out.glob("*.png"):
-        assert (
-            path.read_bytes().startswith(PNG) and path.stat().st_size > 20_000
-        )  # an empty canvas has some 3 kB
+        assert path.read_bytes().startswith(PNG) and path.stat().st_size > 20_000  # an empty canvas has some 3 kB
     assert result["design"]["stiffness"]["before"] == 109000.0
     assert result["design"]["damping"]["before"] == 4900.0
     for where in ("start", "optimum"):
@@ -103,15 +99,11 @@ def test_every_choice_of_parameters_at_full_resolution(parameters, tmp_path, cap
         assert "active" in text
     else:
         points = result["design"]["hardpoints"]
-        moves = [
-            b - a for link in points["after"] for a, b in zip(points["before"][link], points["after"][link])
-        ]
+        moves = [b - a for link in points["after"] for a, b in zip(points["before"][link], points["after"][link])]
         assert len(moves) == 15
         assert max(map(abs, moves)) == pytest.approx(0.030, rel=1e-9)
     for check in result["gradient_check"].values():
-        assert (
-            max(check["relative_error"]) < 1e-5
-        )  # round-off of Ψ₀ over the step, 1e-12/3e-5 at h = 2e-3, times 10
+        assert max(check["relative_error"]) < 1e-5  # round-off of Ψ₀ over the step, 1e-12/3e-5 at h = 2e-3, times 10
 
 
 def edited(old, new):
@@ -173,9 +165,7 @@ def test_bad_arguments_give_one_line(arguments, message, tmp_path, capsys):
     assert not out.exists()
 
 
-@pytest.mark.parametrize(
-    "arguments", [[], ["optimise"], ["optimize"], ["optimize", "half-car"], ["top", "--h", "0.5"]]
-)
+@pytest.mark.parametrize("arguments", [[], ["optimise"], ["optimize"], ["optimize", "half-car"], ["top", "--h", "0.5"]])
 def test_bad_commands_give_one_line(arguments, capsys):
     status, _, err = run(capsys, *arguments)
     assert status == 2
@@ -191,10 +181,7 @@ def test_a_missing_matplotlib_is_told_before_the_work(tmp_path, capsys, monkeypa
 
 def sensitivities(text):
     """The derivatives that `lgsens top` prints, by method."""
-    return {
-        name.strip(): float(value)
-        for name, value in re.findall(r"^(\S.*?)  +(-0\.\d{15,})", text, re.MULTILINE)
-    }
+    return {name.strip(): float(value) for name, value in re.findall(r"^(\S.*?)  +(-0\.\d{15,})", text, re.MULTILINE)}
 
 
 def test_top_agrees_with_the_reference_as_its_order_says(capsys):
@@ -217,7 +204,5 @@ def test_top_agrees_with_the_reference_as_its_order_says(capsys):
 
 def test_the_module_is_the_script():
     for arguments, text in ((["--version"], r"^lgsens \S+\n$"), (["--help"], r"optimize[\s\S]*top")):
-        done = subprocess.run(
-            [sys.executable, "-m", "lgsens", *arguments], capture_output=True, text=True, check=True
-        )
+        done = subprocess.run([sys.executable, "-m", "lgsens", *arguments], capture_output=True, text=True, check=True)
         assert re.search(text, done.stdout)

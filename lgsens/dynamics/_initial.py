@@ -42,7 +42,7 @@ def kkt_solve(mass, jacobian, force, rate) -> tuple[Float[Array, " k"], Float[Ar
 def split_velocity(system: AbstractSystem, q, v) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
     """v as the sum of what the constraints allow and what they do not, M-orthogonal to each other.
 
-        [[M, Bᵀ], [B, 0]] [v_tangential; μ] = [M v; 0]
+    [[M, Bᵀ], [B, 0]] [v_tangential; μ] = [M v; 0]
     """
     mass, jacobian = system.mass_matrix(), system.constraint_jacobian(q)
     tangential, _ = kkt_solve(mass, jacobian, mass @ v, jnp.zeros(jacobian.shape[0], v.dtype))
@@ -52,7 +52,7 @@ def split_velocity(system: AbstractSystem, q, v) -> tuple[Float[Array, " k"], Fl
 def accelerations(system: AbstractSystem, q, v, t):
     """v̇ and λ of the motion through (q, v) at time t, eq. (41).
 
-        M v̇ + Bᵀλ = ad(v)ᵀ M v − f(q, v, t),     B v̇ = −Ḃ v = −D(B v)·(q ṽ)|_v
+    M v̇ + Bᵀλ = ad(v)ᵀ M v − f(q, v, t),     B v̇ = −Ḃ v = −D(B v)·(q ṽ)|_v
     """
     jacobian = system.constraint_jacobian(q)
     zero, lam_zero = jnp.zeros_like(v), jnp.zeros(jacobian.shape[0], v.dtype)
@@ -111,7 +111,10 @@ def assemble(system: AbstractSystem):
         return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(rhs)), rhs)
 
     mu = lax.custom_root(
-        lambda mu: system.constraint(place(mu)), jnp.zeros(jacobian.shape[0], v_ref.dtype), newton, tangent_solve
+        lambda mu: system.constraint(place(mu)),
+        jnp.zeros(jacobian.shape[0], v_ref.dtype),
+        newton,
+        tangent_solve,
     )
     q = place(mu)
     return q, system.constraint(q)

@@ -17,7 +17,21 @@ _AXIAL = 1e-2  # axial over transverse moment of inertia of a rod; planar motion
 
 
 def four_bar(
-    a=0.3, b=0.8, c=0.7, d=0.9, m2=1.0, m3=2.0, m4=1.5, k=200.0, cd=2.0, l0=0.4, w0=5.0, g=9.81, th0=1.2, px=0.45, py=1.1
+    a=0.3,
+    b=0.8,
+    c=0.7,
+    d=0.9,
+    m2=1.0,
+    m3=2.0,
+    m4=1.5,
+    k=200.0,
+    cd=2.0,
+    l0=0.4,
+    w0=5.0,
+    g=9.81,
+    th0=1.2,
+    px=0.45,
+    py=1.1,
 ) -> Model:
     """Ground pivots A = (0, 0) and D = (d, 0), crank AB, coupler BC, rocker DC with C above BD, in the xy-plane.
 

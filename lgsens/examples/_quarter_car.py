@@ -187,9 +187,7 @@ class _Reader:
 
     def _get(self, key: str) -> Any:
         if key not in self._table:
-            raise self._fail(
-                key, "is missing; see lgsens/examples/data/five_link_suspension.toml for the format."
-            )
+            raise self._fail(key, "is missing; see lgsens/examples/data/five_link_suspension.toml for the format.")
         return self._table[key]
 
     def table(self, key: str) -> "_Reader":
@@ -234,9 +232,7 @@ class _Reader:
         value = self._get(key)
         is_pair = isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))
         if not is_pair or not 0 < value[0] < value[1]:
-            raise self._fail(
-                key, f"must be two numbers [lower, upper] with 0 < lower < upper, got {value!r}."
-            )
+            raise self._fail(key, f"must be two numbers [lower, upper] with 0 < lower < upper, got {value!r}.")
         return as_float(value[0], (), key), as_float(value[1], (), key)
 
     def choice(self, key: str, known) -> str:
@@ -268,9 +264,7 @@ def _parse(document: dict, path: str) -> QuarterCar:
     metre, kilogram = float(units.number("length")), float(units.number("mass"))
     table = root.table("links")
     if len(table.names()) != 5:
-        raise ValueError(
-            f"Hardpoint file {path!r}, key 'links': five links are needed, got {sorted(table.names())}."
-        )
+        raise ValueError(f"Hardpoint file {path!r}, key 'links': five links are needed, got {sorted(table.names())}.")
     links = {}
     for name in table.names():
         link = table.table(name)

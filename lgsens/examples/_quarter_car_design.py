@@ -189,9 +189,7 @@ class SuspensionDesign(eqx.Module):
             car = eqx.tree_at(lambda c: c.damper.rate, car, design["damping"])
         if "hardpoints" in design:
             names = sorted(car.links)
-            car = eqx.tree_at(
-                lambda c: [c.links[name].chassis for name in names], car, list(design["hardpoints"])
-            )
+            car = eqx.tree_at(lambda c: [c.links[name].chassis for name in names], car, list(design["hardpoints"]))
         return car
 
     def simulate(self, design: dict[str, Array], throw: bool = True) -> Trajectory:

@@ -19,11 +19,7 @@ def spinning_top(alpha0, mass=15.0, inertia=(0.2, 0.4, 0.2), length=1.0, spin=10
     """
     axis = jnp.stack([jnp.zeros_like(alpha0), jnp.cos(alpha0), jnp.sin(alpha0)])
     return Model(
-        bodies={
-            "top": RigidBody(
-                mass=mass, inertia=inertia, position=length * axis, angular_velocity=spin * axis
-            )
-        },
+        bodies={"top": RigidBody(mass=mass, inertia=inertia, position=length * axis, angular_velocity=spin * axis)},
         joints={"pivot": SphericalJoint(None, "top", at=jnp.zeros_like(axis))},
         forces={"gravity": Gravity(jnp.stack([jnp.zeros_like(gravity), jnp.zeros_like(gravity), -gravity]))},
     )

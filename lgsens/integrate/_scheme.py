@@ -118,16 +118,12 @@ def advance(scheme: GeneralizedAlpha, system: AbstractSystem, previous: State, u
     return Motion(x, system.group.retract(previous.q, x), v, vdot)
 
 
-def factorize_iteration_matrix(
-    scheme: GeneralizedAlpha, system: AbstractSystem, tangents: Tangents, mass, x, h
-):
+def factorize_iteration_matrix(scheme: GeneralizedAlpha, system: AbstractSystem, tangents: Tangents, mass, x, h):
     """The factors of S above: one LU, which serves Newton, the DDM, and transposed, the AVM."""
     group = system.group
     k = mass.shape[0]
     # A T(x) for the rows of K_t and B together
     rows = jnp.concatenate([tangents.stiffness, tangents.constraint_jacobian])
     rows = jax.vmap(lambda row: group.tangent_rmv(x, row))(rows)
-    dynamic = (
-        scheme.inertia_factor * mass + (scheme.gamma * h) * tangents.damping + (scheme.beta * h**2) * rows[:k]
-    )
+    dynamic = scheme.inertia_factor * mass + (scheme.gamma * h) * tangents.damping + (scheme.beta * h**2) * rows[:k]
     return Factors.of(dynamic, tangents.constraint_jacobian.T, rows[k:], mass_scale(mass))

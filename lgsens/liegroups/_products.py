@@ -123,9 +123,7 @@ class Power(AbstractLieGroup):
         if not isinstance(self.group, AbstractLieGroup):
             raise ValueError(f"Power: `group` is not a Lie group (such as SO3()); got {self.group!r}.")
         if not isinstance(self.n, int) or self.n < 1:
-            raise ValueError(
-                f"Power: `n` is the number of copies, a positive Python integer; got {self.n!r}."
-            )
+            raise ValueError(f"Power: `n` is the number of copies, a positive Python integer; got {self.n!r}.")
 
     def _rows(self, x):
         return x.reshape(self.n, self.group.dim)

@@ -17,9 +17,7 @@ _EYE = np.eye(3)
 _QUATERNION = np.zeros((4, 4, 3, 3))
 _QUATERNION[0, 0] = _EYE
 _QUATERNION[0, 1:] = _QUATERNION[1:, 0] = np.cross(_EYE[None, :, :], _EYE[:, None, :])
-_QUATERNION[1:, 1:] = (
-    _EYE[:, None, :, None] * _EYE[None, :, None, :] + _EYE[:, None, None, :] * _EYE[None, :, :, None]
-)
+_QUATERNION[1:, 1:] = _EYE[:, None, :, None] * _EYE[None, :, None, :] + _EYE[:, None, None, :] * _EYE[None, :, :, None]
 _QUATERNION[1:, 1:] -= _EYE[:, :, None, None] * _EYE[None, None, :, :]
 
 

@@ -97,15 +97,11 @@ class Orthogonality(AbstractClosedFormConstraint):
         e_a, e_b = skew(self.axis_a), skew(self.axis_b)
         coupling = e_a @ (a.orientation.T @ b.orientation) @ e_b
         stiffness = jnp.zeros((12, 12), lam.dtype)
-        stiffness = stiffness.at[ROTATION_A, ROTATION_A].set(
-            e_a @ skew(a.local_axis(b.axis(self.axis_b)))
-        )
+        stiffness = stiffness.at[ROTATION_A, ROTATION_A].set(e_a @ skew(a.local_axis(b.axis(self.axis_b))))
         stiffness = stiffness.at[ROTATION_A, ROTATION_B].set(-coupling)
         # −ẽ_b R_bᵀR_a ẽ_a is the transpose of −ẽ_a R_aᵀR_b ẽ_b
         stiffness = stiffness.at[ROTATION_B, ROTATION_A].set(-coupling.T)
-        stiffness = stiffness.at[ROTATION_B, ROTATION_B].set(
-            e_b @ skew(b.local_axis(a.axis(self.axis_a)))
-        )
+        stiffness = stiffness.at[ROTATION_B, ROTATION_B].set(e_b @ skew(b.local_axis(a.axis(self.axis_a))))
         return stiffness * lam[0]
 
 

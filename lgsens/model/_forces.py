@@ -129,7 +129,7 @@ class TyreSpring(AbstractForce):
             reference height of the wheel centre.
 
     Give `free_radius` or `preload`, not both; with neither the tyre is free in the reference
-    configuration. The spring also pulls: bound its force from below (eq. 48) to keep contact. z is the inertial vertical.
+    configuration. The spring also pulls: bound its force from below (eq. 48) to keep contact. z is vertical.
     Raises `ValueError` for both, or wrong shapes. Source: Sonneville & Brüls (2014), §9.
     """
 

@@ -54,9 +54,7 @@ def separation(a: Frame, b: Frame, point_a, point_b) -> tuple[Float[Array, "3"],
     """
     d = b.point(point_b) - a.point(point_a)
     eye = jnp.eye(3, dtype=d.dtype)
-    gradient = jnp.concatenate(
-        [-eye, a.orientation @ skew(point_a), eye, -b.orientation @ skew(point_b)], axis=1
-    )
+    gradient = jnp.concatenate([-eye, a.orientation @ skew(point_a), eye, -b.orientation @ skew(point_b)], axis=1)
     return d, gradient
 
 

@@ -112,9 +112,7 @@ class SpringDamperLoad(AbstractClosedFormLoad):
         along = n @ gradient
         speed = gradient @ jnp.concatenate([va, vb])
         turning = jnp.zeros((3, 12), n.dtype)
-        turning = turning.at[:, ROTATION_A].set(
-            -a.orientation @ skew(jnp.cross(self.point_a, va[ROTATION]))
-        )
+        turning = turning.at[:, ROTATION_A].set(-a.orientation @ skew(jnp.cross(self.point_a, va[ROTATION])))
         turning = turning.at[:, ROTATION_B].set(b.orientation @ skew(jnp.cross(self.point_b, vb[ROTATION])))
         across = (gradient - jnp.outer(n, along)) / divisor  # P D
         rate_gradient = speed @ across + n @ turning
@@ -140,9 +138,7 @@ class TyreLoad(AbstractClosedFormLoad):
     road: AbstractSignal
 
     def measure(self, a, b, va, vb, t) -> Float[Array, ""]:
-        return self.preload + self.stiffness * (
-            self.road(t) + self.free_radius - b.point(self.point_b)[2]
-        )
+        return self.preload + self.stiffness * (self.road(t) + self.free_radius - b.point(self.point_b)[2])
 
     def _vertical(self, a, b):
         _, gradient = separation(a, b, jnp.zeros_like(self.point_b), self.point_b)

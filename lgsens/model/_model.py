@@ -54,9 +54,7 @@ class Model(eqx.Module):
         ):
             for name, member in members.items():
                 if not isinstance(member, kind):
-                    raise ValueError(
-                        f"{what} {name!r} must be a {kind.__name__}, got {type(member).__name__}."
-                    )
+                    raise ValueError(f"{what} {name!r} must be a {kind.__name__}, got {type(member).__name__}.")
         for name, joint in self.joints.items():
             self._check_connection(f"Joint {name!r}", (joint.a, joint.b))
         for name, force in self.forces.items():
@@ -120,9 +118,7 @@ class Model(eqx.Module):
                 jnp.stack([body.position for body in ordered]),
                 rotations,
             ),
-            velocity=jnp.concatenate(
-                [part for body in ordered for part in (body.velocity, body.angular_velocity)]
-            ),
+            velocity=jnp.concatenate([part for body in ordered for part in (body.velocity, body.angular_velocity)]),
             constraints=stack(constraints),
             loads=stack(loads),
             body_names=names,

@@ -115,9 +115,7 @@ def constraint_stiffness(element: AbstractConstraint, a: Frame, b: Frame, lam):
     if isinstance(element, AbstractClosedFormConstraint):
         return element.geometric_stiffness(a, b, lam)
     zero = jnp.zeros(12, a.position.dtype)
-    return jax.jacfwd(
-        lambda x: lam @ constraint_jacobian(element, _moved(a, x[BODY_A]), _moved(b, x[BODY_B]))
-    )(zero)
+    return jax.jacfwd(lambda x: lam @ constraint_jacobian(element, _moved(a, x[BODY_A]), _moved(b, x[BODY_B])))(zero)
 
 
 def load_tangents(element: AbstractLoad, a: Frame, b: Frame, va, vb, t) -> LoadTangents:
@@ -125,8 +123,6 @@ def load_tangents(element: AbstractLoad, a: Frame, b: Frame, va, vb, t) -> LoadT
     if isinstance(element, AbstractClosedFormLoad):
         return element.tangents(a, b, va, vb, t)
     zero = jnp.zeros(12, a.position.dtype)
-    position = jax.jacfwd(
-        lambda x: element.force(_moved(a, x[BODY_A]), _moved(b, x[BODY_B]), va, vb, t)
-    )(zero)
+    position = jax.jacfwd(lambda x: element.force(_moved(a, x[BODY_A]), _moved(b, x[BODY_B]), va, vb, t))(zero)
     velocity = jax.jacfwd(lambda x: element.force(a, b, va + x[BODY_A], vb + x[BODY_B], t))(zero)
     return LoadTangents(position, velocity)

@@ -12,13 +12,11 @@ from lgsens.model._forces import SpringDamper, TyreSpring
 from lgsens.model._model import Model
 
 
-def static_preload(
-    model: Model, forces: Sequence[str], *, t0=0.0
-) -> tuple[Model, Float[Array, ""]]:
+def static_preload(model: Model, forces: Sequence[str], *, t0=0.0) -> tuple[Model, Float[Array, ""]]:
     """The model with the preloads of the named springs chosen so that it rests in its reference configuration.
 
-    The preloads F and the joint forces λ solve r(q_ref, 0, 0, λ, t0; F) = 0, which is linear in both: A [λ; F] = −r_0, in the
-    sense of least squares through [[I, A], [Aᵀ, 0]].
+    The preloads F and the joint forces λ solve r(q_ref, 0, 0, λ, t0; F) = 0, which is linear in both:
+    A [λ; F] = −r_0, in the sense of least squares through [[I, A], [Aᵀ, 0]].
 
     Arguments:
         model: the scene.

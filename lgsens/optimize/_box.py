@@ -21,9 +21,7 @@ class Box(NamedTuple):
 
     def _ends(self):
         safe = lambda bound: jnp.log(jnp.where(self.log, bound, 1.0))  # noqa: E731
-        return jnp.where(self.log, safe(self.lower), self.lower), jnp.where(
-            self.log, safe(self.upper), self.upper
-        )
+        return jnp.where(self.log, safe(self.lower), self.lower), jnp.where(self.log, safe(self.upper), self.upper)
 
     def scaled(self, x):
         lower, upper = self._ends()
@@ -47,8 +45,7 @@ def checked_box(x0, lower, upper, log_scale) -> tuple[Array, Callable[[Array], P
     def vector(tree, what: str, convert) -> Array:
         if jax.tree.structure(tree) != jax.tree.structure(x0):
             raise ValueError(
-                f"`{what}` must be a pytree like `x0`, {jax.tree.structure(x0)}, "
-                f"got {jax.tree.structure(tree)}."
+                f"`{what}` must be a pytree like `x0`, {jax.tree.structure(x0)}, got {jax.tree.structure(tree)}."
             )
 
         def leaf(path, x, value):
@@ -81,8 +78,7 @@ def checked_box(x0, lower, upper, log_scale) -> tuple[Array, Callable[[Array], P
 def entry_names(tree) -> list[str]:
     """Names for the numbers of a pytree, in the order of `ravel_pytree`: stiffness, points[0, 2], x[1]."""
     return [
-        (jax.tree_util.keystr(path, simple=True, separator=".") or "x")
-        + (str(list(map(int, index))) if index else "")
+        (jax.tree_util.keystr(path, simple=True, separator=".") or "x") + (str(list(map(int, index))) if index else "")
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
         for index in np.ndindex(np.shape(leaf))
     ]

@@ -27,9 +27,7 @@ PENALTY = 30.0  # ρ at first: f and g are both scaled to about 1
 PENALTY_GROWTH = 2.0
 LARGEST_PENALTY = 100.0  # a larger one makes L so stiff that Adam only zigzags; μ does the rest
 PERIOD = 5  # steps of Adam between two updates of the multipliers
-LARGEST_GRADIENT = (
-    1.0  # f is scaled to 1: longer gradients are those of a violation, which Adam would remember
-)
+LARGEST_GRADIENT = 1.0  # f is scaled to 1: longer gradients are those of a violation, which Adam would remember
 DECAY = 0.02  # the last learning rate over the first
 # Shorter memories than Adam's own: these gradients carry no noise, and L changes with μ.
 ADAM_DECAYS = (0.5, 0.99)

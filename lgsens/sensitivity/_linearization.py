@@ -91,9 +91,9 @@ def kinematics(scheme: GeneralizedAlpha, group, x, rates: Rates, h, previous: Va
     dx = h * previous.v + h**2 * ((0.5 - scheme.beta) * previous.a + scheme.beta * u) + rates.x * dh
     w = group.Ad_inv_mv(group.exp(x), previous.w) + group.tangent_mv(x, dx)
     v = previous.v + h * ((1.0 - scheme.gamma) * previous.a + scheme.gamma * u) + rates.v * dh
-    vdot = (
-        (1.0 - scheme.alpha_m) * u + scheme.alpha_m * previous.a - scheme.alpha_f * previous.vdot
-    ) / (1.0 - scheme.alpha_f)
+    vdot = ((1.0 - scheme.alpha_m) * u + scheme.alpha_m * previous.a - scheme.alpha_f * previous.vdot) / (
+        1.0 - scheme.alpha_f
+    )
     return w, v, vdot
 
 

@@ -42,8 +42,8 @@ class DirectDifferentiation(AbstractSensitivity):
     """The hand-derived linearization L of the scheme, in both modes; the default.
 
     Forward mode (`jvp`, `jacfwd`) is the direct differentiation method of §6.2, forward substitution with L; JAX
-    transposes it (`grad`, `jacrev`) to back substitution with Lᵀ, the discrete adjoint variable method. The derivative is
-    that of the numerical solution, to round-off. Supports every JAX transformation, nested too (`hessian`).
+    transposes it (`grad`, `jacrev`) to back substitution with Lᵀ, the discrete adjoint variable method. The derivative
+    is that of the numerical solution, to round-off. Supports every JAX transformation, nested too (`hessian`).
     """
 
     def trajectory(self, scheme, num_steps, state0, parameters):
@@ -73,9 +73,7 @@ def _run(scheme, num_steps, state0, parameters):
 def _decoded(run) -> tuple[State, Stats]:
     states, encoded = run
     stats = lax.stop_gradient(encoded)
-    stats = stats._replace(
-        iterations=stats.iterations.astype(jnp.int32), converged=stats.converged.astype(bool)
-    )
+    stats = stats._replace(iterations=stats.iterations.astype(jnp.int32), converged=stats.converged.astype(bool))
     return states, stats
 
 

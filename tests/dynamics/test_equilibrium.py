@@ -232,9 +232,7 @@ def test_quarter_car_settles_on_a_spring_of_another_rate(car, design):
     z, rate, _ = settled(car, lengths, 0.9 * k)
     assert float(z) < 0.508 - 1e-3  # a softer spring sinks
     step = 1e-4 * k
-    difference = (settled(car, lengths, 0.9 * k + step)[0] - settled(car, lengths, 0.9 * k - step)[0]) / (
-        2 * step
-    )
+    difference = (settled(car, lengths, 0.9 * k + step)[0] - settled(car, lengths, 0.9 * k - step)[0]) / (2 * step)
     # Differences over 1e-4 of k err by 1e-8/6 of k³ d³z/dk³, a few times k dz/dk, and by round-off
     # 1e-14/1e-4 of it.
     assert abs(float(rate / difference) - 1.0) < 1e-7

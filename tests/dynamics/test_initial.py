@@ -16,8 +16,7 @@ def double_pendulum(seed) -> lg.Model:
     """A body on a ball joint, another hinged to it, a damper, and velocities that fit neither joint."""
     rng = np.random.default_rng(seed)
     upper, lower = (
-        random_body(rng, velocity=rng.normal(size=3), angular_velocity=3 * rng.normal(size=3))
-        for _ in range(2)
+        random_body(rng, velocity=rng.normal(size=3), angular_velocity=3 * rng.normal(size=3)) for _ in range(2)
     )
     joints = {
         "ball": lg.SphericalJoint(None, "upper", at=rng.uniform(-1, 1, 3)),
@@ -27,9 +26,7 @@ def double_pendulum(seed) -> lg.Model:
     forces = {
         "gravity": lg.Gravity(GRAVITY),
         "damper": lg.SpringDamper("upper", "lower", **ends, stiffness=20.0, damping=1.0),
-        "push": lg.AppliedForce(
-            "lower", force=rng.normal(size=3), signal=lg.BumpRoad(height=5.0, duration=1.0)
-        ),
+        "push": lg.AppliedForce("lower", force=rng.normal(size=3), signal=lg.BumpRoad(height=5.0, duration=1.0)),
     }
     return lg.Model({"upper": upper, "lower": lower}, joints, forces)
 
@@ -105,10 +102,7 @@ def along(model, state):
 def test_constraints_hold_to_their_second_derivative(pendulum):
     model, initial, _, jacobian, _, condition = pendulum
     for order, derivative in enumerate(along(model, initial.state)):
-        scale = (
-            np.linalg.norm(jacobian)
-            * (1.0, np.abs(initial.state.v).max(), np.abs(initial.state.vdot).max())[order]
-        )
+        scale = np.linalg.norm(jacobian) * (1.0, np.abs(initial.state.v).max(), np.abs(initial.state.vdot).max())[order]
         close(derivative, np.zeros(8), 10 * condition, scale=scale)
 
 
@@ -153,9 +147,7 @@ def test_accelerations_of_the_top_are_eulers():
     body = random_body(rng, angular_velocity=spin)
     pivot = rng.uniform(-1, 1, 3)
     arm = np.asarray(body.orientation).T @ (np.asarray(body.position) - pivot)  # pivot to centre, body frame
-    model = lg.Model(
-        {"top": body}, {"pivot": lg.SphericalJoint(None, "top", at=pivot)}, {"g": lg.Gravity(GRAVITY)}
-    )
+    model = lg.Model({"top": body}, {"pivot": lg.SphericalJoint(None, "top", at=pivot)}, {"g": lg.Gravity(GRAVITY)})
     state = start(model).state
     mass, inertia = float(body.mass), np.asarray(body.inertia)
     about_pivot = inertia + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
@@ -221,9 +213,7 @@ def tripod(lengths) -> lg.Model:
     ends[:, 2] += 1.0
     distances = np.linalg.norm(ends - feet, axis=1)
     joints = {
-        f"rod{i}": lg.DistanceJoint(
-            None, "plate", at_a=feet[i], at_b=ends[i], length=distances[i] + lengths[i]
-        )
+        f"rod{i}": lg.DistanceJoint(None, "plate", at_a=feet[i], at_b=ends[i], length=distances[i] + lengths[i])
         for i in range(3)
     }
     return lg.Model({"plate": body}, joints)

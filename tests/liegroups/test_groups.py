@@ -239,9 +239,7 @@ def test_derivatives_through_exp_and_log_at_zero(name, dtype):
 
     def derivatives(x):
         first = jax.jvp(g, (x,), (y,))[1], jax.vjp(g, x)[1](y)[0], jax.grad(f)(x)
-        if (
-            name != "SO3" or dtype != np.float64
-        ):  # elsewhere only bookkeeping differs: not worth the compilation
+        if name != "SO3" or dtype != np.float64:  # elsewhere only bookkeeping differs: not worth the compilation
             return first
         return *first, jax.jvp(jax.grad(f), (x,), (y,))[1]
 

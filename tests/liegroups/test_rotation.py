@@ -12,9 +12,7 @@ from lgsens.liegroups import SO3, _coefficients, cross, skew, unskew
 
 GROUP = SO3()
 DTYPES = [np.float32, np.float64]
-exp, log, tangent, tangent_inv = (
-    jax.jit(f) for f in (GROUP.exp, GROUP.log, GROUP.tangent, GROUP.tangent_inv)
-)
+exp, log, tangent, tangent_inv = (jax.jit(f) for f in (GROUP.exp, GROUP.log, GROUP.tangent, GROUP.tangent_inv))
 
 
 def _series(k, s, order, weight=lambda j: 1):

@@ -64,9 +64,7 @@ def differentiated(element, a, b, lam):
 
     def jacobian(x):
         first, second = moved(a, x[:6]), moved(b, x[6:])
-        return jax.jacfwd(lambda y: element.value(moved(first, y[:6]), moved(second, y[6:])))(
-            jnp.zeros_like(x)
-        )
+        return jax.jacfwd(lambda y: element.value(moved(first, y[:6]), moved(second, y[6:])))(jnp.zeros_like(x))
 
     zero = jnp.zeros(12, a.position.dtype)
     return jacobian(zero), jax.jacfwd(lambda x: lam @ jacobian(x))(zero)
@@ -142,11 +140,7 @@ class UserJoint(AbstractJoint):
         return True
 
     def constraints(self, a, b):
-        return (
-            UserCoincidence(
-                a.orientation.T @ (self.at - a.position), b.orientation.T @ (self.at - b.position)
-            ),
-        )
+        return (UserCoincidence(a.orientation.T @ (self.at - a.position), b.orientation.T @ (self.at - b.position)),)
 
 
 class UserRod(AbstractJoint):

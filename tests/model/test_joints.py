@@ -34,9 +34,7 @@ class Displacement(NamedTuple):
         return self.at + self.rotation @ (x - self.at) + self.slide
 
     def then(self, second):
-        return Displacement(
-            second.rotation @ self.rotation, self.at, second.point(self.point(self.at)) - self.at
-        )
+        return Displacement(second.rotation @ self.rotation, self.at, second.point(self.point(self.at)) - self.at)
 
     def inverse(self):
         return Displacement(self.rotation.T, self.at + self.slide, -self.slide)
@@ -162,21 +160,13 @@ def configuration(model, side, relative, common=REST) -> Pose:
 def motions(model, name, side) -> np.ndarray:
     """The velocities [ẋ, Ω] that the joint allows at the reference, relative and together, in rows."""
     case = CASES[name]
-    relative = [(axis, at, np.zeros(3)) for axis, at in case.turns] + [
-        (np.zeros(3), AT, u) for u in case.slides
-    ]
+    relative = [(axis, at, np.zeros(3)) for axis, at in case.turns] + [(np.zeros(3), AT, u) for u in case.slides]
     if side == "ground last" and name == "distance":
-        relative = [
-            (axis, AT if at is AT_B else at, u) for axis, at, u in relative
-        ]  # a turns about its own end
+        relative = [(axis, AT if at is AT_B else at, u) for axis, at, u in relative]  # a turns about its own end
     movers = {"two bodies": "b", "ground first": "b", "ground last": "a"}[side]
-    together = (
-        [] if side != "two bodies" else [(e, AT, np.zeros(3)) for e in EYE] + [(0 * e, AT, e) for e in EYE]
-    )
+    together = [] if side != "two bodies" else [(e, AT, np.zeros(3)) for e in EYE] + [(0 * e, AT, e) for e in EYE]
     rows = []
-    for (omega, at, u), moving in [(twist, movers) for twist in relative] + [
-        (twist, "ab") for twist in together
-    ]:
+    for (omega, at, u), moving in [(twist, movers) for twist in relative] + [(twist, "ab") for twist in together]:
         row = []
         for body in sorted(model.bodies):
             pose, moves = model.bodies[body], float(body in moving)
@@ -209,9 +199,7 @@ def test_reference_satisfies_the_joint_and_the_null_space_is_its_motions(name, s
         assert allowed.shape[0] == jacobian.shape[1] - CASES[name].equations
         if allowed.size:
             assert np.linalg.svd(allowed, compute_uv=False).min() > 0.05
-            close(
-                jacobian @ allowed.T, np.zeros((len(value), len(allowed))), ULPS, scale=np.abs(allowed).max()
-            )
+            close(jacobian @ allowed.T, np.zeros((len(value), len(allowed))), ULPS, scale=np.abs(allowed).max())
 
 
 @every_side
@@ -278,9 +266,7 @@ def test_only_the_orthogonal_part_of_the_second_arm_counts():
     rng = np.random.default_rng(6)
     bodies = {end: random_body(rng) for end in ends}
     arms = AXIS_B, 5.0 * (AXIS_B - 3.0 * AXIS)
-    models = [
-        lg.Model(bodies, {"j": lg.UniversalJoint(*ends, at=AT, axis_a=AXIS, axis_b=arm)}) for arm in arms
-    ]
+    models = [lg.Model(bodies, {"j": lg.UniversalJoint(*ends, at=AT, axis_a=AXIS, axis_b=arm)}) for arm in arms]
     q = configuration(models[0], "two bodies", turn(0.3 * ACROSS))
     expected, actual = (evaluate(model, q) for model in models)
     close(actual[0], expected[0], ULPS, scale=1.0)

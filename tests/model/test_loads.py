@@ -92,9 +92,7 @@ def test_position_tangent_equals_central_differences(name):
     actual = np.zeros((12, 12)) if tangents.position is None else tangents.position[0]
 
     def force(x):
-        frames = [
-            moved_without_library(Frame(*(leaf[0] for leaf in f)), w) for f, w in ((a, x[:6]), (b, x[6:]))
-        ]
+        frames = [moved_without_library(Frame(*(leaf[0] for leaf in f)), w) for f, w in ((a, x[:6]), (b, x[6:]))]
         frames = [Frame(*(jnp.asarray(leaf)[None] for leaf in f)) for f in frames]
         return closed_form(load, *frames, va, vb, t)[0][0]
 
@@ -126,9 +124,7 @@ def force_energy(load, a, b, t):
 
 def energy_of(name):
     family = name.partition("-")[0]
-    return {"spring": spring_energy, "tyre": tyre_energy, "weight": weight_energy, "force": force_energy}[
-        family
-    ]
+    return {"spring": spring_energy, "tyre": tyre_energy, "weight": weight_energy, "force": force_energy}[family]
 
 
 def without(load, field):
@@ -179,9 +175,7 @@ def test_moment_of_an_applied_force_is_fixed_in_the_body():
     force, _ = closed_form(load, a, b, va, vb, t)
     factor = np.asarray(jax.vmap(lambda signal, t: signal(t))(load.signal, t))
     arm = np.einsum("nij,nj->ni", b.orientation, load.point_b)
-    moment = (
-        np.einsum("nij,nj->ni", np.swapaxes(b.orientation, 1, 2), np.cross(arm, load.vector)) + load.moment
-    )
+    moment = np.einsum("nij,nj->ni", np.swapaxes(b.orientation, 1, 2), np.cross(arm, load.vector)) + load.moment
     close(force[:, 6:9], factor[:, None] * load.vector, ULPS)
     close(force[:, 9:], factor[:, None] * moment, ULPS)
     np.testing.assert_array_equal(force[:, :6], np.zeros((COUNT, 6)))
@@ -286,9 +280,7 @@ def springs(own: bool):
             "damping": 2.0,
         }
         numbers = {key: jnp.asarray(value, dtype=float) for key, value in numbers.items()}
-        forces[name] = (
-            UserSpringForce(*ends, **numbers) if own else lg.SpringDamper(*ends, **numbers, free_length=1.0)
-        )
+        forces[name] = UserSpringForce(*ends, **numbers) if own else lg.SpringDamper(*ends, **numbers, free_length=1.0)
     return lg.Model(bodies, {}, forces)
 
 
@@ -308,9 +300,7 @@ def test_load_without_tangents_gets_them():
 def test_tangents_of_a_users_drag():
     """C_t of −c|ẋ|ẋ is c (|ẋ| I + ẋẋᵀ/|ẋ|); its moment −c Rᵀ(sin t x) gives K_t = c sin t [Rᵀ, (Rᵀx)~]."""
     rng = np.random.default_rng(6)
-    model = lg.Model(
-        {"kite": random_body(rng)}, {}, {"drag": DragForce("kite", jnp.asarray(0.3, dtype=float))}
-    )
+    model = lg.Model({"kite": random_body(rng)}, {}, {"drag": DragForce("kite", jnp.asarray(0.3, dtype=float))})
     system = model.system()
     point = random_point(system, rng)
     _, (stiffness, damping, _) = evaluate(model, point)

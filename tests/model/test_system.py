@@ -171,14 +171,10 @@ def test_multipliers_of_a_joint(system):
     rows = {name: system.multiplier_rows(name) for name in joints}
     assert {name: len(found) for name, found in rows.items()} == sizes
     assert sorted(np.concatenate(list(rows.values()))) == list(range(28))
-    jacobian = np.asarray(
-        evaluate(system, random_point(system, np.random.default_rng(6)))[2].constraint_jacobian
-    )
+    jacobian = np.asarray(evaluate(system, random_point(system, np.random.default_rng(6)))[2].constraint_jacobian)
     for name, joint in joints.items():
         loaded = np.abs(jacobian[rows[name]]).reshape(len(rows[name]), len(BODIES), 6).max(axis=(0, 2)) > 0
-        assert {body for body, touched in zip(system.body_names, loaded) if touched} == {joint.a, joint.b} - {
-            None
-        }
+        assert {body for body, touched in zip(system.body_names, loaded) if touched} == {joint.a, joint.b} - {None}
 
 
 # Stacking.
@@ -229,11 +225,7 @@ def test_leaves_are_strongly_typed_floats(system):
     assert strongly_typed_floats(model)
     assert strongly_typed_floats(system)
     others = lg.Model(  # ints, lists, NumPy arrays and weakly typed numbers become leaves of the same type
-        {
-            "block": lg.RigidBody(
-                jnp.asarray(2.0), [1, 1, 1], position=np.arange(3), velocity=np.ones(3, np.float32)
-            )
-        },
+        {"block": lg.RigidBody(jnp.asarray(2.0), [1, 1, 1], position=np.arange(3), velocity=np.ones(3, np.float32))},
         {"rod": lg.DistanceJoint(None, "block", at_a=[0, 0, 3], at_b=[0, 1, 2], length=2)},
         {
             "spring": lg.SpringDamper("block", None, at_a=[0, 1, 2], at_b=[1, 1, 1], stiffness=3, preload=1),

@@ -94,9 +94,7 @@ def test_states_of_the_reference(runs):
         np.testing.assert_allclose(spring.length[n], state["spring_length"], atol=2e-5)
         np.testing.assert_allclose(spring.rate[n], state["spring_rate"], atol=5e-4)
         np.testing.assert_allclose(tyre[n], state["tire_normal_force"], atol=2.0)
-        np.testing.assert_allclose(
-            trajectory.body("wheel").position[n], state["wheel_centre"], atol=2e-5
-        )
+        np.testing.assert_allclose(trajectory.body("wheel").position[n], state["wheel_centre"], atol=2e-5)
 
 
 # What cannot matter: the chassis heaves only, so its rotational inertia, its place in the heaving body and its

@@ -19,9 +19,7 @@ DISCRETE = json.loads((Path(__file__).parents[1] / "data" / "spinning_top_discre
 
 
 def criterion(model, num_steps, integrator=lg.GeneralizedAlpha(0.9), sensitivity=lg.DirectDifferentiation()):
-    trajectory = lg.simulate(
-        model, t1=1.0, num_steps=num_steps, integrator=integrator, sensitivity=sensitivity
-    )
+    trajectory = lg.simulate(model, t1=1.0, num_steps=num_steps, integrator=integrator, sensitivity=sensitivity)
     return lg.time_integral(trajectory.t, trajectory.body("top").position[:, 0] ** 2)
 
 
@@ -95,7 +93,11 @@ def test_every_leaf():
     body = eqx.tree_at(
         lambda b: (b.orientation, b.inertia, b.angular_velocity),
         model.bodies["top"],
-        (turn, jnp.array([[0.2, 0.01, 0.02], [0.01, 0.4, 0.03], [0.02, 0.03, 0.25]]), jnp.array([1.0, 6.0, 7.0])),
+        (
+            turn,
+            jnp.array([[0.2, 0.01, 0.02], [0.01, 0.4, 0.03], [0.02, 0.03, 0.25]]),
+            jnp.array([1.0, 6.0, 7.0]),
+        ),
     )
     model = eqx.tree_at(lambda m: m.bodies["top"], model, body)
     value = eqx.filter_jit(lambda m: criterion(m, 200))

@@ -1,0 +1,127 @@
+"""The integrator: coefficients, orders of q, v and λ from the first step, invariants."""
+
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lgsens as lg
+from lgsens.dynamics import State
+from lgsens.integrate import integrate
+
+HEAVY = json.loads((Path(__file__).parents[1] / "data" / "heavy_top_bruls2012.json").read_text())
+
+
+def heavy_top():
+    p = HEAVY["params"]
+    spin = np.array([0.0, p["Om2"], p["Om3"]])
+    arm = np.array([0.0, p["l"], 0.0])
+    body = lg.RigidBody(
+        mass=p["m"],
+        inertia=(p["J11"], p["J22"], p["J33"]),
+        position=arm,
+        velocity=np.cross(spin, arm),
+        angular_velocity=spin,
+    )
+    return lg.Model(
+        bodies={"top": body},
+        joints={"pivot": lg.SphericalJoint(None, "top", at=(0.0, 0.0, 0.0))},
+        forces={"gravity": lg.Gravity((0.0, 0.0, -p["g"]))},
+    )
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5, 0.9, 0.999])
+def test_coefficients(rho):
+    """Second order needs γ = ½ + α_f − α_m; the amplification at infinite frequency is ρ∞ (Chung & Hulbert 1993)."""
+    scheme = lg.GeneralizedAlpha(rho)
+    am, af, beta, gamma = scheme.alpha_m, scheme.alpha_f, scheme.beta, scheme.gamma
+    np.testing.assert_allclose(gamma, 0.5 + af - am, rtol=1e-15)
+    # A constrained direction, or an oscillator with h ω → ∞, has q = 0 in every step. With h = 1 eq. (27) then gives
+    # a' = −v/β − (½ − β) a/β, eq. (28) v'; this map of (v, a) has the double root −ρ∞ for β = (γ + ½)²/4.
+    a_next = np.array([-1.0 / beta, -(0.5 - beta) / beta])
+    v_next = np.array([1.0, 1.0 - gamma]) + gamma * a_next
+    roots = np.linalg.eigvals(np.stack([v_next, a_next]))
+    np.testing.assert_allclose(roots, -rho, atol=1e-6)  # a double root is found to the square root of round-off
+
+
+@pytest.fixture(scope="module")
+def heavy_reference():
+    """100 µs over 0.1 s is 15 mrad per step; the reference is the same scheme 16 times finer."""
+    return lg.simulate(heavy_top(), t1=0.1, num_steps=6400)
+
+
+@pytest.mark.parametrize(("second_order_start", "order_of_first_multipliers"), [(True, 2.0), (False, 1.0)])
+def test_orders_on_the_heavy_top(heavy_reference, second_order_start, order_of_first_multipliers):
+    """q, v second order; λ second order from the first step with the special start, first order without."""
+    integrator = lg.GeneralizedAlpha(0.9, second_order_start=second_order_start)
+    errors = []
+    for num_steps in (100, 200, 400):
+        trajectory = lg.simulate(heavy_top(), t1=0.1, num_steps=num_steps, integrator=integrator)
+        every = 6400 // num_steps
+        lam = trajectory.multiplier("pivot") - heavy_reference.multiplier("pivot")[::every]
+        body, fine = trajectory.body("top"), heavy_reference.body("top")
+        errors.append(
+            [
+                float(jnp.abs(lam).max()),
+                float(jnp.abs(lam[-5:]).max()),
+                float(jnp.abs(body.velocity - fine.velocity[::every]).max()),
+                float(jnp.abs(body.position - fine.position[::every]).max()),
+            ]
+        )
+    rates = np.log2(np.array(errors)[:-1] / np.array(errors)[1:])
+    # the h⁴ term at h Ω = 0.15 is 2 % of the h² term; the first-order case mixes with the reference's own start
+    np.testing.assert_allclose(rates[:, 0], order_of_first_multipliers, atol=0.05 if second_order_start else 0.2)
+    np.testing.assert_allclose(rates[-1, 1:], 2.0, atol=0.05)
+
+
+def test_heavy_top_reaches_the_reference():
+    """Position at 0.1 s by the index-reduced reference; Richardson's extrapolation of two runs."""
+    runs = [lg.simulate(heavy_top(), t1=0.1, num_steps=n).body("top").position[-1] for n in (400, 800)]
+    state = next(s for s in HEAVY["states"] if s["t"] == 0.1)
+    errors = [float(jnp.abs(run - np.array(state["x"])).max()) for run in runs]
+    np.testing.assert_allclose(np.log2(errors[0] / errors[1]), 2.0, atol=0.05)
+    # what is left is h⁴: (0.0375 rad per step)² of the error at 400 steps, 1e-3 × 3e-5
+    np.testing.assert_allclose((4 * runs[1] - runs[0]) / 3, state["x"], atol=1e-7)
+
+
+def test_free_body_keeps_its_momenta():
+    """No force: spatial angular momentum R J Ω and energy drift at second order, orthogonality at round-off."""
+    inertia = np.array([1.0, 2.0, 2.8])
+    model = lg.Model({"body": lg.RigidBody(3.0, inertia, velocity=(1.0, 2.0, 3.0), angular_velocity=(0.1, 5.0, 0.2))})
+    drift = []
+    for num_steps in (500, 1000):
+        body = lg.simulate(model, t1=2.0, num_steps=num_steps).body("body")
+        momentum = jnp.einsum("nij,nj->ni", body.orientation, inertia[None, :] * body.angular_velocity)
+        energy = jnp.sum(inertia[None, :] * body.angular_velocity**2, axis=1) / 2
+        drift.append([float(jnp.abs(momentum - momentum[:1]).max()), float(jnp.abs(energy - energy[0]).max())])
+        orthogonality = jnp.swapaxes(body.orientation, 1, 2) @ body.orientation - jnp.eye(3)[None]
+        # each product of rotations adds a round-off: 1000 × 2e-16
+        assert float(jnp.abs(orthogonality).max()) <= 1e-12
+        np.testing.assert_allclose(body.position[-1], [2.0, 4.0, 6.0], rtol=1e-13)
+    rates = np.log2(np.array(drift[0]) / np.array(drift[1]))
+    assert np.all(rates > 1.9)
+
+
+def test_continuation_is_the_same_run():
+    """Two halves, the second from the last state of the first, give the whole."""
+    whole = lg.simulate(heavy_top(), t1=0.1, num_steps=100)
+    first = lg.simulate(heavy_top(), t1=0.05, num_steps=50)
+    second = lg.simulate(heavy_top(), t0=0.05, t1=0.1, num_steps=50, state0=first.state(-1))
+    # same operations; h differs in its last bit: round-off × 50 steps × condition 5e2
+    for a, b in zip(jax.tree.leaves(second.state(-1)), jax.tree.leaves(whole.state(-1))):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * float(jnp.abs(b).max()))
+
+
+def test_a_failed_step_ends_the_run():
+    """After a failure everything is NaN and no iteration is spent."""
+    model = heavy_top()
+    scheme = lg.GeneralizedAlpha(0.9, max_iterations=1, tolerance=1e-14)
+    state0 = lg.initial_state(model)
+    states, stats = jax.jit(lambda s: integrate(scheme, 5, model.system(), s, jnp.zeros(()), jnp.asarray(0.05)))(state0)
+    assert isinstance(states, State)
+    assert stats.converged.tolist() == [False] * 5
+    assert stats.iterations.tolist() == [1, 0, 0, 0, 0]
+    assert bool(jnp.all(jnp.isfinite(states.v[0]))) and bool(jnp.all(jnp.isnan(states.v[1:])))

@@ -1,0 +1,26 @@
+"""README.md: its example runs and gives what it says; its two commands are there."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+
+
+def test_example():
+    (source,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    names: dict = {}
+    exec(compile(source, "README.md", "exec"), names)
+    jax, psi, top = names["jax"], names["psi"], names["top"]
+    printed = float(re.search(r"adjoint variable method: (-[\d.]+)", source)[1])
+    gradient = float(jax.grad(lambda a: psi(top(a)))(np.pi / 4))
+    assert abs(gradient - printed) < 1e-8  # printed with eight decimals, cut
+    assert names["g"].joints["pivot"].at.shape == (3,)
+    assert float(np.abs(names["g"].bodies["top"].inertia).min()) > 0
+
+
+def test_commands():
+    commands = dict(re.findall(r"<!-- (main job|tests) -->\n```sh\n(.*?)\n```", README, re.DOTALL))
+    assert "lgsens optimize quarter-car" in commands["main job"]
+    assert "pytest" in commands["tests"]
