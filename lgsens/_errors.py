@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 
 from lgsens.dynamics import RESULTS
 
@@ -67,7 +68,7 @@ def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tupl
             raise _exception(int(codes[lane]), message_details, names)
         return np.ones(codes.shape, bool)
 
-    if not isinstance(result, jax.core.Tracer):
+    if not isinstance(result, Tracer):
         # Details may be traced (by grad) where the result is not; their values are all that is needed.
         if int(result) != RESULTS.successful:
             values = {key: np.asarray(_value(value)) for key, value in details.items()}
@@ -84,7 +85,7 @@ def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tupl
 
 
 def _value(array: Any) -> Any:
-    while isinstance(array, jax.core.Tracer) and hasattr(array, "primal"):
+    while isinstance(array, Tracer) and hasattr(array, "primal"):
         array = array.primal
     return array
 

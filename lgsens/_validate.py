@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
 
@@ -31,7 +32,7 @@ def as_float(value: Any, shape: tuple[int, ...] | None, what: str) -> Array:
 def is_concrete(*values: Any) -> bool:
     """Whether every array in `values` has values that Python can look at now."""
     leaves = jax.tree.leaves(values)
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves) and all(
+    return not any(isinstance(leaf, Tracer) for leaf in leaves) and all(
         isinstance(leaf, jax.Array | np.ndarray | float | int) for leaf in leaves
     )
 

@@ -26,7 +26,7 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
     zero = jnp.zeros_like(v_ref)
     scale = lax.stop_gradient(system.coordinate_scale())
     weight = mass_scale(system.mass_matrix())
-    eps = jnp.finfo(dtype).eps
+    eps = float(jnp.finfo(dtype).eps)
 
     def split(z):
         # Multipliers in units of the mass scale × 1 m/s², so that both parts of z are of order one.

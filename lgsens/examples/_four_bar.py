@@ -1,7 +1,6 @@
 """A planar four-bar linkage with a spring-damper at its coupler."""
 
 import jax.numpy as jnp
-import numpy as np
 
 from lgsens.model import (
     Gravity,
@@ -78,7 +77,7 @@ def four_bar(
         spin = jnp.stack([zero, zero, rate + zero])
         return RigidBody(mass, inertia, (start + end) / 2, velocity=middle, angular_velocity=spin)
 
-    e_z = np.array([0.0, 0.0, 1.0])
+    e_z = point(0.0, 0.0).at[2].set(1.0)
     return Model(
         bodies={
             "crank": rod(m2, pin_a, pin_b, point(0.0, 0.0), w0),
@@ -98,9 +97,9 @@ def four_bar(
                 "coupler",
                 at_a=point(px, py),
                 at_b=(pin_b + pin_c) / 2,
-                stiffness=k,
-                damping=cd,
-                free_length=l0,
+                stiffness=k + zero,
+                damping=cd + zero,
+                free_length=l0 + zero,
             ),
         },
     )

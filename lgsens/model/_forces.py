@@ -162,6 +162,10 @@ class TyreSpring(AbstractForce):
         return (Attached(load, None, self.body),)
 
 
+def _one() -> FlatRoad:
+    return FlatRoad(height=jnp.ones(()))
+
+
 class AppliedForce(AbstractForce):
     """A given force on a point of a body and a given moment on it, times a signal: s(t) f and s(t) m.
 
@@ -180,7 +184,7 @@ class AppliedForce(AbstractForce):
     at: Float[Array, "3"] | None = point_field("at", default=None)
     force: Float[Array, "3"] = point_field("force", default=(0.0, 0.0, 0.0))
     moment: Float[Array, "3"] = point_field("moment", default=(0.0, 0.0, 0.0))
-    signal: AbstractSignal = eqx.field(kw_only=True, default_factory=lambda: FlatRoad(height=1.0))
+    signal: AbstractSignal = eqx.field(kw_only=True, default_factory=_one)
 
     @property
     def bodies(self):

@@ -87,8 +87,8 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
         stacks.append(
             Stack(
                 elements=jax.tree.map(lambda *leaves: jnp.stack(leaves), *[m.element for m in members]),
-                a=None if first.a is None else tuple(m.a for m in members),
-                b=None if first.b is None else tuple(m.b for m in members),
+                a=None if first.a is None else tuple(m.a for m in members if m.a is not None),
+                b=None if first.b is None else tuple(m.b for m in members if m.b is not None),
                 owners=tuple(m.owner for m in members),
             )
         )

@@ -39,7 +39,9 @@ def static_preload(model: Model, forces: Sequence[str], *, t0=0.0) -> tuple[Mode
 def _preloaded(model: Model, forces: Sequence[str], values) -> Model:
     members = dict(model.forces)
     for name, value in zip(forces, values):
-        members[name] = _with_preload(members[name], value)
+        spring = members[name]
+        assert isinstance(spring, SpringDamper | TyreSpring)  # checked by the caller
+        members[name] = _with_preload(spring, value)
     return eqx.tree_at(lambda m: m.forces, model, members)
 
 
