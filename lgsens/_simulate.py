@@ -1,6 +1,5 @@
 """`simulate`, `initial_state` and `equilibrium`: the model in, a trajectory or a state out."""
 
-import operator
 import warnings
 
 import equinox as eqx
@@ -9,7 +8,7 @@ import jax.numpy as jnp
 
 from lgsens._errors import throw_if_failed
 from lgsens._trajectory import Trajectory
-from lgsens._validate import as_float, require
+from lgsens._validate import as_count, as_float, require
 from lgsens.dynamics import (
     RESULTS,
     AbstractSystem,
@@ -136,12 +135,7 @@ def simulate(
         raise ValueError(f"`integrator` must be a GeneralizedAlpha, got {integrator!r}.")
     if not isinstance(sensitivity, AbstractSensitivity):
         raise ValueError(f"`sensitivity` must be DirectDifferentiation() or AdjointVariable(), got {sensitivity!r}.")
-    try:
-        num_steps = operator.index(num_steps)
-    except TypeError as error:
-        raise ValueError(f"`num_steps` must be a Python int (it is static), got {num_steps!r}.") from error
-    if num_steps < 1:
-        raise ValueError(f"`num_steps` must be at least 1, got {num_steps}.")
+    num_steps = as_count(num_steps, "num_steps", " (it is static)")
     t0, t1 = as_float(t0, (), "`t0`"), as_float(t1, (), "`t1`")
     require(lambda t0, t1: t1 > t0, f"`t1` must be later than `t0`, got t0 = {t0} s and t1 = {t1} s.", t0, t1)
     trajectory, details = _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0)

@@ -1,5 +1,6 @@
 """Checks of arguments: conversion to float leaves once, at construction, and clear errors."""
 
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -27,6 +28,17 @@ def as_float(value: Any, shape: tuple[int, ...] | None, what: str) -> Array:
     if shape is not None and array.shape != shape:
         raise ValueError(f"{what} must have shape {shape}, got shape {array.shape}.")
     return array
+
+
+def as_count(value: Any, name: str, why: str = "") -> int:
+    """`value` as a Python int of at least 1."""
+    try:
+        count = operator.index(value)
+    except TypeError as error:
+        raise ValueError(f"`{name}` must be a Python int{why}, got {value!r}.") from error
+    if count < 1:
+        raise ValueError(f"`{name}` must be at least 1, got {count}.")
+    return count
 
 
 def is_concrete(*values: Any) -> bool:

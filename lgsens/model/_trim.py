@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from lgsens._validate import as_float, suggestion
 from lgsens.model._forces import SpringDamper, TyreSpring
 from lgsens.model._model import Model
+from lgsens.model._system import MultibodySystem
 
 
 def static_preload(model: Model, forces: Sequence[str], *, t0=0.0) -> tuple[Model, Float[Array, ""]]:
@@ -48,14 +49,20 @@ def _preloaded(model: Model, forces: Sequence[str], values) -> Model:
 @eqx.filter_jit  # outside a jit the many small operations would be compiled one by one: 17 s instead of 2
 def _solve(model: Model, forces: tuple[str, ...], t):
     """The preloads, and the largest force or moment they leave unbalanced."""
-    rest = model.system()
+    rest = _preloaded(model, forces, jnp.zeros(len(forces), t.dtype)).system()
+    where = [_place(rest, name) for name in forces]
     q, v = rest.reference()
     zero = jnp.zeros_like(v)
     jacobian = rest.constraint_jacobian(q)
     lam = jnp.zeros(jacobian.shape[0], v.dtype)
 
     def residual(values):
-        return _preloaded(model, forces, values).system().residual(q, zero, zero, lam, t)
+        # the preloads are set in the assembled system: assembling it anew would be compiled for each of them
+        system = rest
+        for (stack, element), value in zip(where, values):
+            leaf = lambda s, stack=stack: s.loads[stack].elements.preload  # noqa: E731
+            system = eqx.tree_at(leaf, system, leaf(system).at[element].set(value))
+        return system.residual(q, zero, zero, lam, t)
 
     no_preload = jnp.zeros(len(forces), v.dtype)
     unbalanced, by_preload = residual(no_preload), jax.jacfwd(residual)(no_preload)
@@ -64,6 +71,12 @@ def _solve(model: Model, forces: tuple[str, ...], t):
     matrix = jnp.block([[jnp.eye(k, dtype=v.dtype), a], [a.T, jnp.zeros((n, n), v.dtype)]])
     solution = jnp.linalg.solve(matrix, jnp.concatenate([-unbalanced, jnp.zeros(n, v.dtype)]))
     return solution[k + len(lam) :], jnp.max(jnp.abs(solution[:k]))
+
+
+def _place(system: MultibodySystem, force: str) -> tuple[int, int]:
+    """The stack of loads and the element in it that belong to a force element."""
+    found = [(i, stack.owners.index(force)) for i, stack in enumerate(system.loads) if force in stack.owners]
+    return found[0]
 
 
 def _with_preload(force: SpringDamper | TyreSpring, value):

@@ -10,7 +10,6 @@ multipliers follow every few steps, and ρ grows while the violation does not fa
 §17.4).
 """
 
-import operator
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -21,6 +20,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PyTree
 
+from lgsens._validate import as_count
 from lgsens.optimize._box import Box, checked_box
 
 PENALTY = 30.0  # ρ at first: f and g are both scaled to about 1
@@ -121,12 +121,7 @@ def minimize(
     `ValueError` for bounds of another shape than x0, lower ≥ upper, x0 outside them, a logarithmic scale over
     0, `num_steps` < 1, a rate or tolerance that is not positive, and an f or g that is not finite at x0.
     """
-    try:
-        num_steps = operator.index(num_steps)
-    except TypeError as error:
-        raise ValueError(f"`num_steps` must be an int, got {num_steps!r}.") from error
-    if num_steps < 1:
-        raise ValueError(f"`num_steps` must be at least 1, got {num_steps}.")
+    num_steps = as_count(num_steps, "num_steps")
     for name, value in (("learning_rate", learning_rate), ("constraint_tolerance", constraint_tolerance)):
         if not value > 0:
             raise ValueError(f"`{name}` must be positive, got {value}.")

@@ -46,7 +46,7 @@ def test_static_preload_is_the_reference():
 
 @pytest.fixture(scope="module", params=["hinged", "locked"])
 def runs(request):
-    """Trajectories and gradients of Ψ₀ at 500, 1000 and 2000 steps over 2 s, one wheel kind."""
+    """Trajectories and gradients of Ψ₀ at 500 and 1000 steps over 2 s, one wheel kind."""
     wheel = request.param
 
     def value(x, num_steps):
@@ -56,7 +56,7 @@ def runs(request):
 
     x = tuple(jnp.asarray(REFERENCE["params"][name]) for name in ("k", "c", "hb"))
     compute = jax.jit(jax.value_and_grad(value, has_aux=True), static_argnums=1)
-    return wheel, {n: compute(x, n) for n in (500, 1000, 2000)}
+    return wheel, {n: compute(x, n) for n in (500, 1000)}
 
 
 def test_converges_to_the_reference_at_second_order(runs):
@@ -65,13 +65,11 @@ def test_converges_to_the_reference_at_second_order(runs):
     wanted = np.array([REFERENCE["value"][name], *(REFERENCE["gradient"][name][p] for p in ("k", "c", "hb"))])
     found = np.array([[float(value), *map(float, gradient)] for (value, _), gradient in results.values()])
     error = found / wanted - 1.0
-    rates = np.log2(np.abs(error[:-1] / error[1:]))
-    # the h⁴ term at 500 steps: (h ω)² = 0.1 with the wheel hop's 80 rad/s
-    np.testing.assert_allclose(rates[0], 2.0, atol=0.05)
-    np.testing.assert_allclose(rates[1], 2.0, atol=0.02)
+    # the h⁴ term at 500 steps: (h ω)² = 0.1 with the wheel hop's 80 rad/s, times a coefficient below 1
+    np.testing.assert_allclose(np.log2(np.abs(error[0] / error[1])), 2.0, atol=0.05)
     # Richardson's extrapolation removes h²; what is left is h⁴: 1e-4 × (h ω)² at 1000 steps, a few 1e-6
-    extrapolated = (4.0 * found[2] - found[1]) / 3.0
-    np.testing.assert_allclose(extrapolated, wanted, rtol=5e-6)
+    extrapolated = (4.0 * found[1] - found[0]) / 3.0
+    np.testing.assert_allclose(extrapolated, wanted, rtol=1e-5)
 
 
 def test_joints_hold(runs):
@@ -86,15 +84,15 @@ def test_states_of_the_reference(runs):
     wheel, results = runs
     if wheel == "locked":
         pytest.skip("the reference's states are those of the hinged wheel")
-    (_, trajectory), _ = results[2000]
+    (_, trajectory), _ = results[1000]
     spring, tyre = trajectory.force("spring"), trajectory.force("tyre")
     for state in REFERENCE["states"]:
-        n = round(state["t"] / 1e-3)
-        # error at h = 1e-3: (h ω)²/12 = 5e-4 of the motion's amplitudes (0.05 m, 1 m/s, 4 kN)
-        np.testing.assert_allclose(spring.length[n], state["spring_length"], atol=2e-5)
-        np.testing.assert_allclose(spring.rate[n], state["spring_rate"], atol=5e-4)
-        np.testing.assert_allclose(tyre[n], state["tire_normal_force"], atol=2.0)
-        np.testing.assert_allclose(trajectory.body("wheel").position[n], state["wheel_centre"], atol=2e-5)
+        n = round(state["t"] / 2e-3)
+        # error at h = 2e-3: (h ω)²/12 = 2e-3 of the motion's amplitudes (0.05 m, 1 m/s, 4 kN)
+        np.testing.assert_allclose(spring.length[n], state["spring_length"], atol=1e-4)
+        np.testing.assert_allclose(spring.rate[n], state["spring_rate"], atol=2e-3)
+        np.testing.assert_allclose(tyre[n], state["tire_normal_force"], atol=8.0)
+        np.testing.assert_allclose(trajectory.body("wheel").position[n], state["wheel_centre"], atol=1e-4)
 
 
 # What cannot matter: the chassis heaves only, so its rotational inertia, its place in the heaving body and its
@@ -106,7 +104,7 @@ WITHOUT_EFFECT = {
     ".bodies['chassis'].angular_velocity",
     ".joints['heave'].at",
 }
-ROUND_OFF = 1e-13  # of Ψ₀: 100 steps, each 1e-15
+ROUND_OFF = 1e-13  # of Ψ₀: 60 steps, each 1e-15
 
 
 def difference_step(name, leaf):
@@ -143,7 +141,7 @@ def test_gradient_of_every_leaf():
     )
 
     def value(model):
-        return comfort(lg.simulate(model, t1=0.2, num_steps=100))
+        return comfort(lg.simulate(model, t1=0.15, num_steps=60))
 
     compiled = jax.jit(value)
     gradient = jax.jit(jax.grad(value))(model)
