@@ -134,7 +134,7 @@ def test_the_bar_is_optional(missing, monkeypatch, capsys):
         ({"lower": jnp.zeros(3)}, r"`lower` must have shape \(\) or \(\), got shape \(3,\)"),
         ({"upper": {"k": 1.0}}, r"`upper` must be a pytree like `x0`"),
         ({"num_steps": 0}, r"`num_steps` must be at least 1, got 0"),
-        ({"num_steps": 2.5}, r"`num_steps` must be an int, got 2.5"),
+        ({"num_steps": 2.5}, r"`num_steps` must be a Python int, got 2.5"),
         ({"learning_rate": 0.0}, r"`learning_rate` must be positive, got 0.0"),
         ({"constraint_tolerance": -1.0}, r"`constraint_tolerance` must be positive, got -1.0"),
         ({"log_scale": True}, r"A logarithmic scale needs positive bounds, got -1.0 for x"),

@@ -128,7 +128,7 @@ def test_gradient_of_every_leaf():
 
     The scene is in motion from the start, so that everything matters.
     """
-    car = eqx.tree_at(lambda c: (c.bump_height, c.bump_duration), CAR, (jnp.asarray(0.08), jnp.asarray(0.1213)))
+    car = eqx.tree_at(lambda c: (c.bump_height, c.bump_duration), CAR, (jnp.asarray(0.08), jnp.asarray(0.1225)))
     model = car.model(**FREE)
     moving = {"chassis": (0.0, 0.0, 1.0), "knuckle": (0.0, 0.0, -3.0), "wheel": (1.0, 2.0, -3.0)}
     model = eqx.tree_at(
@@ -160,7 +160,7 @@ def test_gradient_of_every_leaf():
 
 
 def test_forward_and_reverse_agree():
-    """jacfwd, grad and AdjointVariable for k, c and the fifteen chassis hardpoints with the preload re-solved."""
+    """jacfwd, and grad through AdjointVariable, for k, c and the fifteen chassis hardpoints, the preload re-solved."""
 
     def value(x, sensitivity):
         k, c, points = x
@@ -173,13 +173,11 @@ def test_forward_and_reverse_agree():
 
     points = jnp.stack([link.chassis for link in CAR.links.values()])
     x = (CAR.spring.rate, CAR.damper.rate, points)
-    default, explicit = lg.DirectDifferentiation(), lg.AdjointVariable()
-    forward = jax.jit(jax.jacfwd(lambda x: value(x, default)))(x)
-    for method in (default, explicit):
-        reverse = jax.jit(jax.grad(lambda x, method=method: value(x, method)))(x)
-        for a, b in zip(jax.tree.leaves(reverse), jax.tree.leaves(forward)):
-            # 100 steps × condition 5e2 × round-off
-            np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * float(jnp.abs(b).max()))
+    forward = jax.jit(jax.jacfwd(lambda x: value(x, lg.DirectDifferentiation())))(x)
+    reverse = jax.jit(jax.grad(lambda x: value(x, lg.AdjointVariable())))(x)
+    for a, b in zip(jax.tree.leaves(reverse), jax.tree.leaves(forward)):
+        # 100 steps × condition 5e2 × round-off
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * float(jnp.abs(b).max()))
 
 
 def test_reverse_mode_keeps_states_only():
