@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float
+from lgsens._validate import as_float, require
 from lgsens.model import (
     BumpRoad,
     FixedJoint,
@@ -55,8 +55,7 @@ class Part(eqx.Module):
 
 
 class QuarterCar(eqx.Module):
-    """A quarter-car with a five-link suspension: its data, all numbers leaves. `QuarterCar.load()` reads
-    them.
+    """A quarter-car with a five-link suspension: its data, all numbers leaves. `QuarterCar.load()` reads them.
 
     Five links, knuckle, wheel and chassis are eight rigid bodies. Each link has a universal joint at the
     chassis and a spherical joint at the knuckle; the wheel turns on a hinge of the knuckle or is locked to
@@ -155,7 +154,17 @@ class QuarterCar(eqx.Module):
             ),
         }
         model = Model(bodies, joints, forces)
-        return model if frozen else static_preload(model, ("spring", "tyre"))[0]
+        if frozen:
+            return model
+        model, unbalanced = static_preload(model, ("spring", "tyre"))
+        require(
+            lambda left, mass: left <= 1e-6 * GRAVITY * mass,  # NaN is not balanced
+            f"The spring and the tyre cannot hold {self.name!r} at its design position ({unbalanced} N remain); does "
+            "the spring change its length as the wheel moves?",
+            unbalanced,
+            self.chassis.mass,
+        )
+        return model
 
 
 def _body(part: Part) -> RigidBody:

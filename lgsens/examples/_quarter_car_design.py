@@ -116,8 +116,7 @@ class SuspensionDesign(eqx.Module):
       - ±30 mm is the room that a subframe usually leaves around a link's bush.
 
     Hardpoints change the motion ratios too, and by them the rates at the wheel: with the paper's constraints
-        alone
-    that is what their optimum uses. Links keep their masses.
+    alone that is what their optimum uses. Links keep their masses.
 
     Raises `ValueError` for unknown parameters. Source: Sonneville & Brüls (2014), §9.
     """
