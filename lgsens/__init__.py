@@ -6,6 +6,8 @@ variable method in reverse mode (Sonneville & Brüls, Sensitivity analysis for m
 group, Multibody System Dynamics, 2014). SI units; `jax.config.update("jax_enable_x64", True)` before use.
 """
 
+import importlib
+
 from lgsens._errors import SimulationError as SimulationError
 from lgsens._simulate import (
     equilibrium as equilibrium,
@@ -39,3 +41,11 @@ from lgsens.sensitivity import (
     AdjointVariable as AdjointVariable,
     DirectDifferentiation as DirectDifferentiation,
 )
+
+_NAMESPACES = ("examples", "optimize", "plotting")  # imported when first used: optax and matplotlib take their time
+
+
+def __getattr__(name: str):
+    if name in _NAMESPACES:
+        return importlib.import_module(f"lgsens.{name}")
+    raise AttributeError(f"module 'lgsens' has no attribute {name!r}")

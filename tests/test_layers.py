@@ -145,3 +145,12 @@ assert all(leaf.dtype == jnp.float64 for leaf in leaves)
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert run.returncode == 0, run.stderr
+
+
+def test_namespaces_are_attributes():
+    """`lgsens.examples`, `.optimize` and `.plotting` without an import of their own; other names raise."""
+    assert callable(lgsens.examples.spinning_top)
+    assert callable(lgsens.optimize.minimize)
+    assert lgsens.plotting.__name__ == "lgsens.plotting"
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = lgsens.nothing
