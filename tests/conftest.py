@@ -1,7 +1,7 @@
 """The tests run in 64 bits, under JAX's strictest promotion rules.
 
 Nearly all their time is compilation, so XLA's costly optimizations are off, as in JAX's own tests: a third less.
-The command line's tests and the benchmarks run the program that users run.
+`pytest --optimized` leaves them on.
 """
 
 import jax
@@ -9,4 +9,11 @@ import jax
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-jax.config.update("jax_disable_most_optimizations", True)
+
+
+def pytest_addoption(parser):
+    parser.addoption("--optimized", action="store_true", help="compile as users do, with all of XLA's optimizations")
+
+
+def pytest_configure(config):
+    jax.config.update("jax_disable_most_optimizations", not config.getoption("--optimized"))
