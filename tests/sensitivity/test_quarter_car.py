@@ -79,11 +79,10 @@ def test_joints_hold(runs):
         assert float(jnp.abs(violation).max()) <= 1e-10  # m; the constraint is solved at position level
 
 
+@pytest.mark.parametrize("runs", ["hinged"], indirect=True)  # the reference has the states of this one
 def test_states_of_the_reference(runs):
     """Spring length, tyre force and wheel centre at the reference's times, second order."""
-    wheel, results = runs
-    if wheel == "locked":
-        pytest.skip("the reference's states are those of the hinged wheel")
+    _, results = runs
     (_, trajectory), _ = results[1000]
     spring, tyre = trajectory.force("spring"), trajectory.force("tyre")
     for state in REFERENCE["states"]:
