@@ -1,5 +1,6 @@
 """What several test modules need: random bodies and poses, differences, a scene with everything."""
 
+import re
 from typing import NamedTuple
 
 import equinox as eqx
@@ -119,8 +120,8 @@ def everything(seed=0, order=BODIES) -> lg.Model:
         points = PointMasses.random(rng)
         motion = {"velocity": rng.normal(size=3), "angular_velocity": rng.normal(size=3)}
         bodies[name] = random_body(rng, points, **motion)
-    at = lambda: rng.uniform(-1, 1, 3)  # noqa: E731
-    axis = lambda: rng.normal(size=3)  # noqa: E731
+    at = lambda: rng.uniform(-1, 1, 3)
+    axis = lambda: rng.normal(size=3)
     joints = {
         "ball": lg.SphericalJoint(None, "a", at=at()),
         "hinge": lg.RevoluteJoint("a", "b", at=at(), axis=axis()),
@@ -167,3 +168,8 @@ def random_point(system, rng, t=0.17) -> Point:
         jnp.asarray(rng.normal(size=m)),
         jnp.asarray(t),
     )
+
+
+def says(*parts):
+    """A pattern for a message with these parts, in this order."""
+    return "(?s)" + ".*".join(re.escape(part) for part in parts)

@@ -194,7 +194,7 @@ class MultibodySystem(AbstractSystem):
         )
 
         def at_time(q, v, t):
-            evaluate = lambda e, *args: getattr(e, "measure", e.force)(*args)  # noqa: E731
+            evaluate = lambda e, *args: getattr(e, "measure", e.force)(*args)
             return single.map(evaluate, q, v.reshape(-1, BODY_DIM), extra=(t,))
 
         return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(at_time)(q, v, t))

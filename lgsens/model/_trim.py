@@ -60,7 +60,7 @@ def _solve(model: Model, forces: tuple[str, ...], t):
         # the preloads are set in the assembled system: assembling it anew would be compiled for each of them
         system = rest
         for (stack, element), value in zip(where, values):
-            leaf = lambda s, stack=stack: s.loads[stack].elements.preload  # noqa: E731
+            leaf = lambda s, stack=stack: s.loads[stack].elements.preload
             system = eqx.tree_at(leaf, system, leaf(system).at[element].set(value))
         return system.residual(q, zero, zero, lam, t)
 

@@ -20,7 +20,7 @@ class Box(NamedTuple):
     log: Bool[Array, " n"]
 
     def _ends(self):
-        safe = lambda bound: jnp.log(jnp.where(self.log, bound, 1.0))  # noqa: E731
+        safe = lambda bound: jnp.log(jnp.where(self.log, bound, 1.0))
         return jnp.where(self.log, safe(self.lower), self.lower), jnp.where(self.log, safe(self.upper), self.upper)
 
     def scaled(self, x):

@@ -67,7 +67,7 @@ def check_gradient(
     if scale is None:
         scale = jax.tree.map(lambda leaf: jnp.max(jnp.abs(leaf)), x)
         scale = jax.tree.map(lambda size: jnp.where(size > 0, size, 1.0), scale)
-    spread = lambda leaf, size: jnp.broadcast_to(as_float(size, None, "`scale`"), leaf.shape)  # noqa: E731
+    spread = lambda leaf, size: jnp.broadcast_to(as_float(size, None, "`scale`"), leaf.shape)
     size = np.asarray(ravel_pytree(jax.tree.map(spread, x, scale))[0])
     if value_and_grad is None:
         value_and_grad = jax.jit(jax.value_and_grad(fun))

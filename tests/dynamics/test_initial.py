@@ -73,7 +73,7 @@ def test_velocity_is_the_closest_that_the_joints_allow(pendulum):
     assert tangents.shape[1] == 4
     close(tangents.T @ mass @ (v - wanted), np.zeros(4), 1, scale=allowed)
     # And so by the definition: every other allowed velocity is farther.
-    distance = lambda v: (v - wanted) @ mass @ (v - wanted)  # noqa: E731
+    distance = lambda v: (v - wanted) @ mass @ (v - wanted)
     rng = np.random.default_rng(0)
     assert all(distance(v + 1e-3 * tangents @ rng.normal(size=4)) > distance(v) for _ in range(20))
 
@@ -95,7 +95,7 @@ def along(model, state):
     def value(s):
         return system.constraint(system.group.retract(state.q, s * state.v + s**2 / 2 * state.vdot))
 
-    rate = lambda s: jax.jvp(value, (s,), (jnp.ones_like(s),))[1]  # noqa: E731
+    rate = lambda s: jax.jvp(value, (s,), (jnp.ones_like(s),))[1]
     return value(0.0 * TIME), *jax.jvp(rate, (0.0 * TIME,), (jnp.ones_like(TIME),))
 
 
@@ -116,7 +116,7 @@ def slope(model, q0, x, v, t):
 def fly(model, q0, v, h, count):
     """v̇ after each of `count` Runge-Kutta steps of size h: nothing in it is the integrator's."""
     y, t, seen = np.stack([np.zeros_like(v), v]), float(TIME), []
-    rate = lambda y, t: np.stack(slope(model, q0, *y, jnp.asarray(t)))  # noqa: E731
+    rate = lambda y, t: np.stack(slope(model, q0, *y, jnp.asarray(t)))
     for _ in range(count):
         k1 = rate(y, t)
         k2 = rate(y + h / 2 * k1, t + h / 2)

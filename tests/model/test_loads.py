@@ -218,7 +218,7 @@ def test_every_number_of_a_road_has_a_derivative(name):
     signal, t = SIGNALS[name](), jnp.asarray(0.41)
     flat, rebuild = jax.flatten_util.ravel_pytree(signal)
     gradient, _ = jax.flatten_util.ravel_pytree(jax.grad(lambda s: s(t))(signal))
-    shifted = lambda x: rebuild(flat + jnp.asarray(x))(t)  # noqa: E731
+    shifted = lambda x: rebuild(flat + jnp.asarray(x))(t)
     np.testing.assert_allclose(gradient, central_difference(shifted, flat.size), rtol=0, atol=4e-9)
     assert np.abs(gradient).max() > 0.1
 

@@ -129,7 +129,7 @@ def test_gyroscopic_force_is_lagranges():
         return jnp.sum(points.masses * jnp.sum(velocities**2, axis=1)) / 2
 
     def lagrange(x, xdot, xddot):
-        momentum = lambda x, xdot: jax.grad(energy, argnums=1)(x, xdot)  # noqa: E731
+        momentum = lambda x, xdot: jax.grad(energy, argnums=1)(x, xdot)
         _, rate = jax.jvp(momentum, (x, xdot), (xdot, xddot))
         return rate - jax.grad(energy)(x, xdot)
 

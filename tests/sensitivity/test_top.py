@@ -82,11 +82,11 @@ PARAMETERS = {"mass": 15.0, "length": 1.0, "spin": 10.0, "gravity": 9.81}
 def test_scalar_parameters():
     """m, l, ω₀ and g in both modes against differences of the discrete scheme."""
     values = {name: jnp.asarray(value) for name, value in PARAMETERS.items()}
-    function = lambda p: criterion(spinning_top(ALPHA, **p), 200)  # noqa: E731
+    function = lambda p: criterion(spinning_top(ALPHA, **p), 200)
     compiled = jax.jit(function)
     forward, reverse = jax.jit(jax.jacfwd(function))(values), jax.jit(jax.grad(function))(values)
     for name, value in PARAMETERS.items():
-        moved = lambda s, name=name: compiled(values | {name: values[name] + s})  # noqa: E731
+        moved = lambda s, name=name: compiled(values | {name: values[name] + s})
         estimate = central(moved, 1e-3 * value)
         # δ⁴ = 1e-12 of truncation, 1e-15/1e-3 of round-off, relative to derivatives of order Ψ/p
         scale = abs(float(compiled(values))) / value
@@ -157,7 +157,7 @@ def test_taylor_remainder_falls_at_second_order():
     model = spinning_top(0.7)
     value = eqx.filter_jit(lambda m: criterion(m, 100))
     gradient = jax.grad(lambda m: criterion(m, 100))(model)
-    where = lambda m: (m.bodies["top"].mass, m.bodies["top"].inertia, m.bodies["top"].angular_velocity)  # noqa: E731
+    where = lambda m: (m.bodies["top"].mass, m.bodies["top"].inertia, m.bodies["top"].angular_velocity)
     direction = (jnp.array(2.0), jnp.array([0.02, -0.03, 0.01]), jnp.array([0.3, -0.5, 0.4]))
     slope = sum(jnp.sum(g * d) for g, d in zip(where(gradient), direction))
     base = value(model)

@@ -112,7 +112,7 @@ def test_vmap(scene):
 
     @jax.jit
     def both(designs):
-        criterion = lambda x: scene.function(x)[1]  # noqa: E731
+        criterion = lambda x: scene.function(x)[1]
         lanes = jax.vmap(jax.grad(criterion))(designs)
         total = jax.grad(lambda xs: jnp.sum(jax.vmap(criterion)(xs)))(designs)
         return lanes, total
@@ -125,7 +125,7 @@ def test_vmap(scene):
 
 def test_hessian(scene):
     """Forward over reverse: symmetric, and the differences of the gradient."""
-    criterion = lambda x: scene.function(x)[1]  # noqa: E731
+    criterion = lambda x: scene.function(x)[1]
     hessian = np.asarray(jax.jit(jax.hessian(criterion))(scene.x))
     expected = scene.differences(lambda x: scene.jacobian(x)[1], 1e-3)
     scale = np.abs(expected).max()
@@ -136,7 +136,7 @@ def test_hessian(scene):
 @pytest.mark.slow
 def test_all_orders_of_second_derivatives():
     """Forward and reverse nested in every order, on the top."""
-    criterion = lambda a: top(jnp.stack([a, jnp.ones_like(a)]))[1]  # noqa: E731
+    criterion = lambda a: top(jnp.stack([a, jnp.ones_like(a)]))[1]
     modes = (jax.grad, jax.jacfwd)
     values = [float(jax.jit(outer(inner(criterion)))(0.7)) for outer in modes for inner in modes]
     np.testing.assert_allclose(values, values[0], rtol=1e-10)  # condition of the second derivative, a few digits more

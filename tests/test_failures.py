@@ -1,0 +1,304 @@
+"""Bad arguments of functions, and failures: mechanisms, equilibrium, Newton, precision."""
+
+import re
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import says
+
+import lgsens as lg
+from lgsens.dynamics import AbstractSystem, Tangents
+from lgsens.examples import spinning_top
+from lgsens.liegroups import Rn
+
+BODY = lg.RigidBody(1.0, (1.0, 1.0, 1.0))
+TWO = {"chassis": BODY, "wheel": lg.RigidBody(1.0, (1.0, 1.0, 1.0), position=(1.0, 0.0, 0.0))}
+ORIGIN, X, Z = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+NAN, INF = float("nan"), float("inf")
+
+
+def ball(a, b, at=ORIGIN):
+    return lg.SphericalJoint(a, b, at=at)
+
+
+# Arguments of the functions. The scene is the one that the failures below use, so that it compiles once.
+
+
+def pendulum(push=0.0, length=None, extra=()):
+    """A body at rest under a ball joint; after 0.5 s a force of up to `push` N."""
+    signal = lg.SampledRoad([0.0, 0.5, 0.6, 1.0], [0.0, 0.0, 1.0, 1.0])
+    bob = lg.RigidBody(2.0, (0.1, 0.2, 0.3), position=(0.0, 0.0, -1.0))
+    joints = {"pivot": ball(None, "bob")}
+    if length is not None:
+        ends = {"at_a": (1.0, 0.0, -1.0), "at_b": (0.0, 0.0, -1.0)}
+        joints["rod"] = lg.DistanceJoint(None, "bob", **ends, length=length)
+    force = jnp.stack([push + jnp.zeros(()), jnp.zeros(()), jnp.zeros(())])
+    forces = {
+        "gravity": lg.Gravity((0.0, 0.0, -9.81)),
+        "push": lg.AppliedForce("bob", force=force, signal=signal),
+    }
+    return lg.Model({"bob": bob}, joints | dict(extra), forces)
+
+
+ARGUMENTS = {
+    "model": (dict(model=3.0), ("`model` must be a Model or an AbstractSystem", "float")),
+    "num_steps zero": (dict(num_steps=0), ("`num_steps` must be at least 1", "got 0")),
+    "num_steps negative": (dict(num_steps=-5), ("`num_steps` must be at least 1", "got -5")),
+    "num_steps a float": (dict(num_steps=10.0), ("`num_steps` must be a Python int", "static", "10.0")),
+    "num_steps text": (dict(num_steps="ten"), ("`num_steps` must be a Python int", "'ten'")),
+    "t1 before t0": (dict(t0=2.0, t1=1.0), ("`t1` must be later than `t0`", "t0 = 2.0 s", "t1 = 1.0 s")),
+    "t1 at t0": (dict(t0=1.0, t1=1.0), ("`t1` must be later than `t0`", "t0 = 1.0 s", "t1 = 1.0 s")),
+    "t1 nan": (dict(t1=NAN), ("`t1` must be later than `t0`", "nan")),
+    "t1 of shape (2,)": (dict(t1=[1.0, 2.0]), ("`t1` must have shape ()", "got shape (2,)")),
+    "integrator": (dict(integrator="RK4"), ("`integrator` must be a GeneralizedAlpha", "'RK4'")),
+    "sensitivity": (
+        dict(sensitivity="adjoint"),
+        ("`sensitivity` must be DirectDifferentiation() or", "'adjoint'"),
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", ARGUMENTS)
+def test_argument_of_simulate(mistake):
+    changes, parts = ARGUMENTS[mistake]
+    arguments = {"model": pendulum(), "t1": 1.0, "num_steps": 10} | changes
+    with pytest.raises(ValueError, match=says(*parts)):
+        lg.simulate(arguments.pop("model"), **arguments)
+
+
+def test_number_of_steps_is_static():
+    with pytest.raises(ValueError, match=says("`num_steps` must be a Python int (it is static)")):
+        jax.jit(lambda n: lg.simulate(pendulum(), t1=1.0, num_steps=n).t)(10)
+
+
+@pytest.mark.parametrize("function", [lg.initial_state, lg.equilibrium])
+def test_arguments_of_the_other_functions(function):
+    with pytest.raises(ValueError, match=says("`model` must be a Model or an AbstractSystem", "dict")):
+        function({"bob": BODY})
+    with pytest.raises(ValueError, match=says("`t0` must have shape ()", "got shape (2,)")):
+        function(pendulum(), t0=[0.0, 1.0])
+
+
+# Mechanisms.
+
+UNREACHABLE = says("cannot be assembled", "lengths, hardpoints and axes", "|Φ| =", "largest in joint 'rod'")
+
+
+def test_mechanism_that_cannot_be_assembled():
+    """The bob is 1 m from the pivot and the rod's foot √2 m: a rod of 5 m reaches nowhere."""
+    with pytest.raises(ValueError, match=UNREACHABLE):
+        lg.initial_state(pendulum(length=5.0))
+    state = lg.initial_state(pendulum(length=1.2))  # the same scene can be assembled with a rod of 1.2 m
+    assert np.all(np.isfinite(state.q.position))
+
+
+DOOR = {
+    f"{name} hinge": lg.RevoluteJoint(None, "bob", at=(0.0, 0.0, z), axis=Z)
+    for name, z in (("upper", 2.0), ("lower", 1.0))
+}
+REDUNDANT = {
+    "door on two hinges": (DOOR, ["lower hinge", "upper hinge"]),
+    "weld and hinge": (
+        {"weld": lg.FixedJoint(None, "bob", at=ORIGIN), "hinge": lg.RevoluteJoint(None, "bob", at=X, axis=Z)},
+        ["hinge", "weld"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REDUNDANT)
+def test_redundant_constraints(case):
+    joints, names = REDUNDANT[case]
+    model = lg.Model({"bob": BODY}, joints)
+    parts = (
+        "constrain the same motion twice",
+        "Replace one of the joints",
+        "spherical",
+        f"Joints involved: {names}",
+    )
+    with pytest.raises(ValueError, match=says(*parts)):
+        lg.initial_state(model)
+
+
+def test_an_innocent_joint_is_not_named_among_the_redundant():
+    """A door on two hinges and a stone on a rod from it: 11 equations for 12 coordinates, of rank 6."""
+    bodies = {"door": BODY, "stone": TWO["wheel"]}
+    joints = {name: lg.RevoluteJoint(None, "door", at=hinge.at, axis=Z) for name, hinge in DOOR.items()}
+    model = lg.Model(bodies, joints | {"rod": lg.DistanceJoint("door", "stone", at_a=Z, at_b=X)})
+    with pytest.raises(ValueError, match=says("Joints involved: ['lower hinge', 'upper hinge'].")):
+        lg.initial_state(model)
+
+
+def test_body_that_nothing_holds_has_no_equilibrium():
+    model = lg.Model({"stone": BODY}, {}, {"gravity": lg.Gravity((0.0, 0.0, -9.81))})
+    with pytest.raises(
+        lg.SimulationError, match=says("No static equilibrium was found", "a body that nothing holds falls")
+    ):
+        lg.equilibrium(model)
+
+
+# Newton failures. One iteration is enough while the pendulum hangs (its predictor is the answer), and not
+# enough once it is pushed: step 6 of 10, t = 0.6 s.
+
+IMPATIENT = lg.GeneralizedAlpha(max_iterations=1)
+FAILURE = says(
+    "Newton's iteration did not converge",
+    "smaller step (more `num_steps`)",
+    "`max_iterations`",
+    "step 6 of 10, t = 0.6 s, after 1 iterations",
+    "increment",
+    "tolerance 1e-10",
+    "residual",
+    "`throw=False`",
+)
+
+
+def fail(push, throw=True):
+    return lg.simulate(pendulum(push), t1=1.0, num_steps=10, integrator=IMPATIENT, throw=throw)
+
+
+def test_newton_failure_raises():
+    with pytest.raises(lg.SimulationError, match=FAILURE) as caught:
+        fail(30.0)
+    numbers = re.search(r"increment (\S+) \(.*residual (\S+)\. ", str(caught.value)).groups()
+    assert all(0 < float(number) < INF for number in numbers)
+    assert fail(0.0).result == lg.RESULTS.successful
+
+
+def test_newton_failure_as_data():
+    """`throw=False`: the code, finite data up to the step before the failure, NaN from there on."""
+    trajectory = fail(30.0, throw=False)
+    assert trajectory.result == lg.RESULTS.newton_failed
+    assert lg.RESULTS(int(trajectory.result)).message.startswith("Newton's iteration did not converge")
+    np.testing.assert_array_equal(trajectory.stats.converged, [True] * 5 + [False] * 5)
+    for leaf in jax.tree.leaves((trajectory.states, trajectory.body("bob"), trajectory.multiplier("pivot"))):
+        finite = np.isfinite(leaf).reshape(11, -1)
+        assert np.all(finite[:6]) and not np.any(finite[6:])
+    assert np.all(np.isfinite(trajectory.t))
+
+
+def test_newton_failure_inside_jit():
+    """JAX's runtime error, with the same text; the run that works is untouched."""
+    path = jax.jit(lambda push: fail(push).body("bob").position[:, 0])
+    with pytest.raises(jax.errors.JaxRuntimeError, match=FAILURE):
+        jax.block_until_ready(path(30.0))
+    np.testing.assert_array_equal(path(0.0), fail(0.0).body("bob").position[:, 0])
+
+
+def test_newton_failure_under_vmap():
+    paths = jax.jit(jax.vmap(lambda push: fail(push).body("bob").position[:, 0]))
+    with pytest.raises(jax.errors.JaxRuntimeError, match=FAILURE):
+        jax.block_until_ready(paths(jnp.asarray([0.0, 30.0])))
+    assert np.all(np.isfinite(paths(jnp.zeros(2))))
+
+
+def test_newton_failure_under_differentiation():
+    """Where the model is traced but its values are known the error is the library's own."""
+    with pytest.raises(lg.SimulationError, match=FAILURE):
+        jax.jvp(lambda push: fail(push).body("bob").position, (30.0,), (1.0,))
+
+
+def test_mechanism_that_cannot_be_assembled_inside_jit():
+    with pytest.raises(jax.errors.JaxRuntimeError, match=UNREACHABLE):
+        jax.block_until_ready(jax.jit(lambda length: lg.initial_state(pendulum(length=length)).q)(5.0))
+
+
+# What a trajectory is asked for.
+
+
+def test_names_of_a_trajectory():
+    trajectory = fail(0.0)
+    with pytest.raises(ValueError, match=says("`body`: 'bop' is not one of ['bob']")):
+        trajectory.body("bop")
+    with pytest.raises(ValueError, match=says("`multiplier`: 'pivott' is not one of ['pivot']")):
+        trajectory.multiplier("pivott")
+    with pytest.raises(ValueError, match=says("`force`: 'pull' is not one of ['gravity', 'push']")):
+        trajectory.force("pull")
+
+
+def test_force_that_acts_on_several_bodies():
+    system = lg.Model(TWO, {}, {"gravity": lg.Gravity(Z)}).system()
+    with pytest.raises(ValueError, match=says("`force`: 'gravity' acts on 2 bodies and has no single value")):
+        system.measure("gravity", system.pose, system.velocity, jnp.zeros(1))
+
+
+class Oscillator(AbstractSystem):
+    """ẍ = −ω² x: a system of a user's own, which has no bodies."""
+
+    square: jax.Array
+    assembled: bool = eqx.field(static=True, default=True)
+    group = Rn(1)
+    constraint_names = ()
+
+    def reference(self):
+        return jnp.ones_like(self.square)[None], jnp.zeros_like(self.square)[None]
+
+    def coordinate_scale(self):
+        return jnp.ones_like(self.square)[None]
+
+    def mass_matrix(self):
+        return jnp.ones_like(self.square)[None, None]
+
+    def residual(self, q, v, vdot, lam, t):
+        return vdot + self.square * q
+
+    def constraint(self, q):
+        return q[:0]
+
+    def constraint_jacobian(self, q):
+        return q[:0, None]
+
+    def tangents(self, q, v, vdot, lam, t):
+        return Tangents(self.square[None, None], jnp.zeros_like(self.square)[None, None], self.constraint_jacobian(q))
+
+
+def test_trajectory_without_bodies():
+    trajectory = lg.simulate(Oscillator(jnp.asarray(4.0)), t1=1.0, num_steps=4)
+    for ask in (trajectory.body, trajectory.multiplier, trajectory.force):
+        with pytest.raises(
+            ValueError, match=says("trajectory is one of a Oscillator", "no named bodies", "use `states`")
+        ):
+            ask("x")
+
+
+@pytest.mark.parametrize("f", [np.zeros(4), np.zeros((4, 5)), 3.0])
+def test_time_integral_of_another_length(f):
+    with pytest.raises(
+        ValueError, match=says("`time_integral`: `t` must have shape (n,) and `f` shape (n, …)", "(5,)")
+    ):
+        lg.time_integral(np.arange(5.0), f)
+
+
+# Single precision.
+
+
+def test_single_precision_warns_and_works():
+    """A `UserWarning` says what to do; the top in float32 is near the one in float64."""
+
+    def path():
+        trajectory = lg.simulate(spinning_top(jnp.asarray(np.pi / 4, dtype=float)), t1=0.2, num_steps=20)
+        return trajectory.body("top").position
+
+    expected = path()
+    assert expected.dtype == jnp.float64
+    with jax.enable_x64(False):
+        with pytest.warns(
+            UserWarning, match=says("single precision", 'jax.config.update("jax_enable_x64", True)', "before")
+        ):
+            actual = path()
+        assert actual.dtype == jnp.float32
+    # A step is solved to 64 round-offs of 1 m or 1 rad (4e-6 for 6e-8), more than any other error, and 20
+    # steps of 10 ms add up to no more than each other's: 20 × 64 × EPS32 bounds it, and the motion is a
+    # thousand times larger.
+    difference = np.abs(np.asarray(actual, np.float64) - expected).max()
+    assert np.ptp(expected, axis=0).max() > 0.05
+    assert 0 < difference < 20 * 64 * np.finfo(np.float32).eps
+
+
+def test_double_precision_does_not_warn():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fail(0.0)
