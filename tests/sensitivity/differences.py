@@ -8,13 +8,13 @@ import numpy as np
 
 from lgsens.liegroups import SO3
 
-# Central differences of fourth order: f' = (8 (f₁ − f₋₁) − (f₂ − f₋₂))/(12 δ) + O(δ⁴ f⁗)
-STENCIL = ((1, 8.0), (-1, -8.0), (2, -1.0), (-2, 1.0))
+# Central differences of sixth order: f' = (45 (f₁ − f₋₁) − 9 (f₂ − f₋₂) + (f₃ − f₋₃))/(60 δ) + O(δ⁶)
+STENCIL = ((1, 45.0), (-1, -45.0), (2, -9.0), (-2, 9.0), (3, 1.0), (-3, -1.0))
 
 
 def central(f, step):
-    """f'(0) of a function of a number, fourth order."""
-    return sum(weight * f(k * step) for k, weight in STENCIL) / (12 * step)
+    """f'(0) of a function of a number, sixth order."""
+    return sum(weight * f(k * step) for k, weight in STENCIL) / (60 * step)
 
 
 class Direction(NamedTuple):

@@ -107,7 +107,7 @@ ROUND_OFF = 1e-13  # of Ψ₀: 60 steps, each 1e-15
 
 
 def difference_step(name, leaf):
-    """The distance of differences: δ⁴ below 1e-7 on the leaf's own length, and round-off 1e-13/δ small."""
+    """The distance of differences: δ⁶ below 1e-7 on the leaf's own length, and round-off 1e-13/δ small."""
     largest = float(jnp.abs(leaf).max())
     if name.endswith(("mass", "stiffness", "damping", "preload")):
         return 1e-3 * largest if largest > 0 else 100.0
@@ -115,10 +115,12 @@ def difference_step(name, leaf):
         return 3e-2 * largest
     if name.endswith(("velocity", "acceleration")):
         return 3e-2
-    if name.endswith(("orientation", "axis", "axis_a", "axis_b")):
+    if name.endswith(("orientation", "axis")):
         return 5e-3
+    if name.endswith(("axis_a", "axis_b")):
+        return 1.5e-2  # the weakest leaves: round-off shows first
     if name.endswith(("duration", "start")):
-        return 1e-4  # the bump's ends are half a step from the grid
+        return 5e-5  # the bump's ends are half a step from the grid
     return 3e-4  # points and lengths [m]
 
 
@@ -154,7 +156,9 @@ def test_gradient_of_every_leaf():
         scale = np.abs(estimate).max()
         if scale <= 10 * noise:
             silent.add(name)
-        np.testing.assert_allclose(exact, estimate, rtol=0, atol=1e-6 * scale + noise, err_msg=name)
+        np.testing.assert_allclose(
+            exact, estimate, rtol=0, atol=1e-6 * scale if scale > 10 * noise else noise, err_msg=name
+        )
     assert silent == WITHOUT_EFFECT
 
 
