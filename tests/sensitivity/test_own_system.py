@@ -83,7 +83,7 @@ def test_sensitivities():
     expected = np.array([central(lambda s, e=e: compiled(p + s * e), 1e-3) for e in jnp.eye(4)])
     assert np.abs(expected).min() > 1e-3
     forward = jax.jit(jax.jacfwd(lambda p: value(p, lg.DirectDifferentiation())))(p)
-    # differences: δ⁴ = 1e-12 × fifth derivative, round-off 1e-15/1e-3
+    # differences: δ⁶ = 1e-18 × seventh derivative, round-off 1e-15/1e-3
     np.testing.assert_allclose(forward, expected, rtol=1e-8)
     for method in (lg.DirectDifferentiation(), lg.AdjointVariable()):
         reverse = jax.jit(jax.grad(lambda p, method=method: value(p, method)))(p)

@@ -88,7 +88,7 @@ def test_scalar_parameters():
     for name, value in PARAMETERS.items():
         moved = lambda s, name=name: compiled(values | {name: values[name] + s})
         estimate = central(moved, 1e-3 * value)
-        # δ⁴ = 1e-12 of truncation, 1e-15/1e-3 of round-off, relative to derivatives of order Ψ/p
+        # δ⁶ = 1e-18 of truncation, 1e-15/1e-3 of round-off, relative to derivatives of order Ψ/p
         scale = abs(float(compiled(values))) / value
         np.testing.assert_allclose(forward[name], estimate, rtol=1e-8, atol=1e-8 * scale)
         np.testing.assert_allclose(reverse[name], estimate, rtol=1e-8, atol=1e-8 * scale)
