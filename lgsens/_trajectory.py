@@ -1,5 +1,7 @@
-"""The result of a simulation."""
+"""The result of a simulation, and one instant of it: the same questions, asked of all times or of one."""
 
+import abc
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,7 +16,7 @@ from lgsens.model import MultibodySystem
 
 
 class BodyMotion(NamedTuple):
-    """The motion of one body; every array has a leading axis over the n + 1 times.
+    """The motion of one body; every array has a leading axis over the n + 1 times, at an `Instant` none.
 
     Attributes:
         position: centre of mass [m], inertial frame, shape (n+1, 3).
@@ -25,20 +27,82 @@ class BodyMotion(NamedTuple):
         angular_acceleration: Ω̇ [rad/s²], body frame, shape (n+1, 3).
     """
 
-    position: Float[Array, "n 3"]
-    orientation: Float[Array, "n 3 3"]
-    velocity: Float[Array, "n 3"]
-    angular_velocity: Float[Array, "n 3"]
-    acceleration: Float[Array, "n 3"]
-    angular_acceleration: Float[Array, "n 3"]
+    position: Float[Array, "*n 3"]
+    orientation: Float[Array, "*n 3 3"]
+    velocity: Float[Array, "*n 3"]
+    angular_velocity: Float[Array, "*n 3"]
+    acceleration: Float[Array, "*n 3"]
+    angular_acceleration: Float[Array, "*n 3"]
 
     def point(self, at) -> Float[Array, "n 3"]:
-        """The path [m], inertial frame, of the body's point that is at `at` (inertial frame, shape (3,)) at first."""
+        """The path [m], inertial frame, of the body's point that is at `at` (inertial frame, shape (3,)) at first.
+
+        Needs a motion with times: that of a `Trajectory`.
+        """
         local = self.orientation[0].T @ (jnp.asarray(at, self.position.dtype) - self.position[0])
         return self.position + self.orientation @ local
 
 
-class Trajectory(eqx.Module):
+class AbstractMotion(eqx.Module):
+    """What `Trajectory` and `Instant` answer alike; arrays of a trajectory have a leading axis n + 1."""
+
+    system: eqx.AbstractVar[AbstractSystem]
+
+    @abc.abstractmethod
+    def _kinematics(self) -> tuple[State, Any]:
+        """The states and their times."""
+
+    def _multibody(self) -> MultibodySystem:
+        if not isinstance(self.system, MultibodySystem):
+            raise ValueError(
+                f"This motion is one of a {type(self.system).__name__}, which has no named bodies, joints or "
+                "forces; use the states themselves."
+            )
+        return self.system
+
+    def body(self, name: str) -> BodyMotion:
+        """The motion of the body `name`. Raises `ValueError` for an unknown name."""
+        system, (states, _) = self._multibody(), self._kinematics()
+        if name not in system.body_names:
+            raise ValueError(f"`body`: {suggestion(name, system.body_names)}.")
+        index = system.body_names.index(name)
+        count = len(system.body_names)
+        v, vdot = (x.reshape(*x.shape[:-1], count, 2, 3)[..., index, :, :] for x in (states.v, states.vdot))
+        return BodyMotion(
+            states.q.position[..., index, :],
+            states.q.orientation[..., index, :, :],
+            v[..., 0, :],
+            v[..., 1, :],
+            vdot[..., 0, :],
+            vdot[..., 1, :],
+        )
+
+    def multiplier(self, joint: str) -> Float[Array, "*n rows"]:
+        """The Lagrange multipliers of a joint, shape (n+1, its equations); the joint says what they mean.
+
+        Raises `ValueError` for an unknown name.
+        """
+        system, (states, _) = self._multibody(), self._kinematics()
+        if joint not in system.constraint_names:
+            raise ValueError(f"`multiplier`: {suggestion(joint, set(system.constraint_names))}.")
+        return states.lam[..., system.multiplier_rows(joint)]
+
+    def force(self, name: str) -> Any:
+        """What a force element measures, every array with a leading axis n + 1 if this is a trajectory.
+
+        A `SpringDamper` gives its `LineForce` (length [m], rate [m/s], tension [N]), a `TyreSpring` its normal
+        force [N], shape (n+1,); other elements the generalized force [F_a, M_a, F_b, M_b] that they apply.
+        Raises `ValueError` for an unknown name, or one of several loads (gravity).
+        """
+        states, t = self._kinematics()
+        measure = partial(self._multibody().measure, name)
+        if jnp.ndim(t) == 0:
+            stacked = measure(*jax.tree.map(lambda leaf: leaf[None], (states.q, states.v, t)))
+            return jax.tree.map(lambda leaf: leaf[0], stacked)
+        return measure(states.q, states.v, t)
+
+
+class Trajectory(AbstractMotion):
     """A simulated motion, a pytree like every other: criteria of it are differentiated as usual.
 
     Attributes:
@@ -55,51 +119,26 @@ class Trajectory(eqx.Module):
     stats: Stats
     system: AbstractSystem
 
-    def _multibody(self) -> MultibodySystem:
-        if not isinstance(self.system, MultibodySystem):
-            raise ValueError(
-                f"This trajectory is one of a {type(self.system).__name__}, which has no named bodies, joints or "
-                "forces; use `states`."
-            )
-        return self.system
-
-    def body(self, name: str) -> BodyMotion:
-        """The motion of the body `name`. Raises `ValueError` for an unknown name."""
-        system = self._multibody()
-        if name not in system.body_names:
-            raise ValueError(f"`body`: {suggestion(name, system.body_names)}.")
-        index = system.body_names.index(name)
-        count = len(system.body_names)
-        states = self.states
-        v, vdot = (x.reshape(x.shape[0], count, 2, 3)[:, index] for x in (states.v, states.vdot))
-        return BodyMotion(
-            states.q.position[:, index],
-            states.q.orientation[:, index],
-            v[:, 0],
-            v[:, 1],
-            vdot[:, 0],
-            vdot[:, 1],
-        )
-
-    def multiplier(self, joint: str) -> Float[Array, "n+1 rows"]:
-        """The Lagrange multipliers of a joint, shape (n+1, its equations); the joint says what they mean.
-
-        Raises `ValueError` for an unknown name.
-        """
-        system = self._multibody()
-        if joint not in system.constraint_names:
-            raise ValueError(f"`multiplier`: {suggestion(joint, set(system.constraint_names))}.")
-        return self.states.lam[:, system.multiplier_rows(joint)]
-
-    def force(self, name: str) -> Any:
-        """What a force element measures over the trajectory, every array with a leading axis n + 1.
-
-        A `SpringDamper` gives its `LineForce` (length [m], rate [m/s], tension [N]), a `TyreSpring` its normal
-        force [N], shape (n+1,); other elements the generalized force [F_a, M_a, F_b, M_b] that they apply.
-        Raises `ValueError` for an unknown name, or one of several loads (gravity).
-        """
-        return self._multibody().measure(name, self.states.q, self.states.v, self.t)
+    def _kinematics(self):
+        return self.states, self.t
 
     def state(self, index: int) -> State:
         """The state at step `index` (negative: from the end), from which a simulation can be continued."""
         return jax.tree.map(lambda leaf: leaf[index], self.states)
+
+
+class Instant(AbstractMotion):
+    """One instant of a motion: what the integrand of a `Criterion` sees.
+
+    Attributes:
+        t: the time [s], shape ().
+        state: q, v, v̇, λ (and a).
+        system: the equations of motion.
+    """
+
+    t: Float[Array, ""]
+    state: State
+    system: AbstractSystem
+
+    def _kinematics(self):
+        return self.state, self.t
