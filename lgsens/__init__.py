@@ -8,7 +8,10 @@ group, Multibody System Dynamics, 2014). SI units; `jax.config.update("jax_enabl
 
 import importlib
 
+from lgsens._advice import Advice as Advice, Costs as Costs, direct_or_adjoint as direct_or_adjoint
+from lgsens._differentiate import Sensitivities as Sensitivities, differentiate as differentiate
 from lgsens._errors import SimulationError as SimulationError
+from lgsens._reference_methods import FiniteDifferences as FiniteDifferences, IndexReduced as IndexReduced
 from lgsens._simulate import (
     equilibrium as equilibrium,
     initial_state as initial_state,
@@ -39,6 +42,9 @@ from lgsens.model import (
 )
 from lgsens.sensitivity import (
     AdjointVariable as AdjointVariable,
+    Autodiff as Autodiff,
+    ContinuousAdjoint as ContinuousAdjoint,
+    ContinuousDirect as ContinuousDirect,
     DirectDifferentiation as DirectDifferentiation,
 )
 

@@ -46,14 +46,18 @@ def describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> st
     return code.message
 
 
-def _exception(result: int, details: dict[str, Any], names: tuple[str, ...]) -> Exception:
+def _exception(result: int, details: dict[str, Any], names: tuple[str, ...], note: str) -> Exception:
     bad_input = (RESULTS.assembly_failed, RESULTS.redundant_constraints)
     kind = ValueError if result in bad_input else SimulationError
-    return kind(describe(result, details, names))
+    if result != RESULTS.redundant_constraints:
+        note = ""
+    return kind(f"{note} {describe(result, details, names)}".strip())
 
 
-def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tuple[str, ...]) -> Any:
+def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tuple[str, ...], note: str = "") -> Any:
     """`tree` unchanged, unless `result` is a failure: then raise, now or, inside a trace, when it runs.
+
+    `note` is what else to say where the constraints are redundant.
 
     Inside a trace the exception is JAX's runtime error with the same message. The callback runs only in the
     failing branch (under `vmap`, always, and names the first lane that failed).
@@ -65,14 +69,14 @@ def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tupl
         if len(failed):  # not its size: a scalar that has failed has an index of no entries
             lane = tuple(failed[0])
             message_details = {key: np.asarray(value)[lane] for key, value in details.items()}
-            raise _exception(int(codes[lane]), message_details, names)
+            raise _exception(int(codes[lane]), message_details, names, note)
         return np.ones(codes.shape, bool)
 
     if not isinstance(result, Tracer):
         # Details may be traced (by grad) where the result is not; their values are all that is needed.
         if int(result) != RESULTS.successful:
             values = {key: np.asarray(_value(value)) for key, value in details.items()}
-            raise _exception(int(result), values, names)
+            raise _exception(int(result), values, names, note)
         return tree
 
     def fail(operands):

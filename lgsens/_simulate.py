@@ -1,10 +1,12 @@
 """`simulate`, `initial_state` and `equilibrium`: the model in, a trajectory or a state out."""
 
 import warnings
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from lgsens._errors import throw_if_failed
 from lgsens._trajectory import Trajectory
@@ -18,12 +20,12 @@ from lgsens.dynamics import (
     initial_state as _initial,
     split_velocity,
 )
-from lgsens.integrate import GeneralizedAlpha
+from lgsens.integrate import GeneralizedAlpha, Stats
 from lgsens.model import Model
 from lgsens.sensitivity import AbstractSensitivity, DirectDifferentiation, Parameters
 
 
-def _as_system(model: Model | AbstractSystem) -> AbstractSystem:
+def as_system(model: Model | AbstractSystem) -> AbstractSystem:
     if isinstance(model, Model):
         return model.system()
     if isinstance(model, AbstractSystem):
@@ -31,7 +33,7 @@ def _as_system(model: Model | AbstractSystem) -> AbstractSystem:
     raise ValueError(f"`model` must be a Model or an AbstractSystem, got {type(model).__name__}.")
 
 
-def _warn_of_single_precision(system: AbstractSystem) -> None:
+def warn_of_single_precision(system: AbstractSystem) -> None:
     if jax.tree.leaves(system)[0].dtype == jnp.float32:
         warnings.warn(
             "lgsens runs in single precision: positions carry seven digits, accelerations lose them as 1/h². Call "
@@ -56,7 +58,7 @@ def initial_state(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) 
     Differentiable, by the implicit function theorem. Raises `ValueError` as said under `throw`; inside
     `jit`, JAX's runtime error with the same message.
     """
-    system = _as_system(model)
+    system = as_system(model)
     t0 = as_float(t0, (), "`t0`")
     initial = _initial_jit(system, t0)
     return _checked(system, initial, throw)
@@ -75,7 +77,7 @@ def equilibrium(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) ->
     those closest to the reference. Raises `SimulationError` if none is found; inside `jit`, JAX's runtime
     error with the same message.
     """
-    system = _as_system(model)
+    system = as_system(model)
     t0 = as_float(t0, (), "`t0`")
     return _checked(system, _equilibrium_jit(system, t0), throw)
 
@@ -129,49 +131,88 @@ def simulate(
     and `SimulationError` for a step that does not converge; inside `jit`, JAX's runtime error with the
     same message. Source: Sonneville & Brüls (2014), §4 and §6.2.
     """
-    system = _as_system(model)
-    _warn_of_single_precision(system)
-    if not isinstance(integrator, GeneralizedAlpha):
-        raise ValueError(f"`integrator` must be a GeneralizedAlpha, got {integrator!r}.")
+    system = as_system(model)
+    warn_of_single_precision(system)
+    check_integrator(integrator)
     if not isinstance(sensitivity, AbstractSensitivity):
-        raise ValueError(f"`sensitivity` must be DirectDifferentiation() or AdjointVariable(), got {sensitivity!r}.")
+        raise ValueError(
+            f"`sensitivity` must be one of DirectDifferentiation(), AdjointVariable(), ContinuousDirect() and Autodiff(), "
+            f"got {sensitivity!r}; ContinuousAdjoint() needs a Criterion, see `differentiate`."
+        )
     num_steps = as_count(num_steps, "num_steps", " (it is static)")
-    t0, t1 = as_float(t0, (), "`t0`"), as_float(t1, (), "`t1`")
-    require(lambda t0, t1: t1 > t0, f"`t1` must be later than `t0`, got t0 = {t0} s and t1 = {t1} s.", t0, t1)
+    t0, t1 = interval(t0, t1)
     trajectory, details = _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0)
     if throw:
         trajectory = throw_if_failed(trajectory, trajectory.result, details, system.constraint_names)
     return trajectory
 
 
+def check_integrator(integrator: GeneralizedAlpha) -> None:
+    if not isinstance(integrator, GeneralizedAlpha):
+        raise ValueError(f"`integrator` must be a GeneralizedAlpha, got {integrator!r}.")
+
+
+def interval(t0, t1):
+    """The initial and the final time as arrays."""
+    t0, t1 = as_float(t0, (), "`t0`"), as_float(t1, (), "`t1`")
+    require(lambda t0, t1: t1 > t0, f"`t1` must be later than `t0`, got t0 = {t0} s and t1 = {t1} s.", t0, t1)
+    return t0, t1
+
+
 @eqx.filter_jit
 def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0):
-    h = (t1 - t0) / num_steps
-    if state0 is None:
-        initial = _initial(system, t0)
-        usable = initial.result == RESULTS.successful
-        state0 = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), _started(integrator, system, initial, h))
-        result, violation = initial.result, initial.violation
-    else:
-        result, violation = jnp.zeros((), jnp.int32), system.constraint(state0.q)
-    states, stats = sensitivity.trajectory(integrator, num_steps, state0, Parameters(system, t0, h))
+    start = begin(integrator, system, t0, (t1 - t0) / num_steps, state0)
+    return run(system, start, t0, t1, num_steps, integrator, sensitivity)
+
+
+class Begin(NamedTuple):
+    """The initial state as the scheme starts from it, and how its computation ended."""
+
+    state: State
+    consistent_v: Float[Array, " k"]  # v_0 without the scheme's O(h²)
+    result: Int[Array, ""]
+    violation: Float[Array, " m"]
+    jacobian: Float[Array, "m k"]
+
+
+def begin(integrator: GeneralizedAlpha, system: AbstractSystem, t0, h, state0: State | None) -> Begin:
+    """The state at t0: `state0` as it is, or the consistent one of the reference configuration."""
+    if state0 is not None:
+        jacobian = system.constraint_jacobian(state0.q)
+        return Begin(state0, state0.v, jnp.zeros((), jnp.int32), system.constraint(state0.q), jacobian)
+    initial = _initial(system, t0)
+    usable = initial.result == RESULTS.successful
+    state = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), _started(integrator, system, initial, h))
+    jacobian = system.constraint_jacobian(initial.state.q)
+    return Begin(state, initial.state.v, initial.result, initial.violation, jacobian)
+
+
+def outcome(integrator: GeneralizedAlpha, start: Begin, stats: Stats, t0, h):
+    """The result code of a simulation, and what its message needs."""
     failed = jnp.argmin(stats.converged)  # the first step that did not converge, 0 if all did
     newton = jnp.where(jnp.all(stats.converged), RESULTS.successful, RESULTS.newton_failed)
-    result = jnp.where(result == RESULTS.successful, newton, result).astype(jnp.int32)
-    count = jnp.arange(num_steps + 1, dtype=h.dtype)
-    trajectory = Trajectory(t=t0 + count * h, states=states, result=result, stats=stats, system=system)
+    result = jnp.where(start.result == RESULTS.successful, newton, start.result).astype(jnp.int32)
     details = {
-        "violation": violation,
-        "jacobian": system.constraint_jacobian(state0.q),
+        "violation": start.violation,
+        "jacobian": start.jacobian,
         "step": failed + 1,
-        "num_steps": jnp.asarray(num_steps),
-        "time": trajectory.t[failed + 1],
+        "num_steps": jnp.asarray(stats.converged.shape[0]),
+        "time": t0 + (failed + 1).astype(h.dtype) * h,
         "iterations": stats.iterations[failed],
         "increment": stats.increment[failed],
         "residual": stats.residual[failed],
         "tolerance": jnp.asarray(integrator.tolerance),
     }
-    return trajectory, jax.lax.stop_gradient(details)
+    return result, jax.lax.stop_gradient(details)
+
+
+def run(system: AbstractSystem, start: Begin, t0, t1, num_steps: int, integrator, sensitivity: AbstractSensitivity):
+    """`simulate` without its checks: the trajectory, and what the message of a failure needs."""
+    h = (t1 - t0) / num_steps
+    states, stats = sensitivity.trajectory(integrator, num_steps, start.state, Parameters(system, t0, h))
+    result, details = outcome(integrator, start, stats, t0, h)
+    count = jnp.arange(num_steps + 1, dtype=h.dtype)
+    return Trajectory(t=t0 + count * h, states=states, result=result, stats=stats, system=system), details
 
 
 def _started(integrator: GeneralizedAlpha, system: AbstractSystem, initial: Initial, h) -> State:

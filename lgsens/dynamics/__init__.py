@@ -3,8 +3,11 @@
 from lgsens.dynamics._equilibrium import equilibrium as equilibrium
 from lgsens.dynamics._initial import (
     Initial as Initial,
+    acceleration_and_jerk as acceleration_and_jerk,
     accelerations as accelerations,
+    independence as independence,
     initial_state as initial_state,
+    kkt_solve as kkt_solve,
     mass_scale as mass_scale,
     split_velocity as split_velocity,
 )

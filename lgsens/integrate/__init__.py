@@ -1,6 +1,11 @@
 """The Lie-group generalized-α integrator (paper, §4)."""
 
-from lgsens.integrate._integrate import Stats as Stats, integrate as integrate
+from lgsens.integrate._integrate import (
+    Constants as Constants,
+    Stats as Stats,
+    integrate as integrate,
+    take_step as take_step,
+)
 from lgsens.integrate._linear import Factors as Factors
 from lgsens.integrate._scheme import (
     GeneralizedAlpha as GeneralizedAlpha,

@@ -8,11 +8,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.dynamics import AbstractSystem, State
-from lgsens.integrate._scheme import GeneralizedAlpha, Motion, advance, factorize_iteration_matrix
+from lgsens.integrate._scheme import GeneralizedAlpha, advance, factorize_iteration_matrix
 
 
 class Stats(NamedTuple):
-    """What Newton did in each step.
+    """What Newton did in each step (in `take_step`: in one).
 
     Attributes:
         iterations: Newton iterations of each step, shape (n,), int32; 0 after a failure.
@@ -35,6 +35,50 @@ class _Iterate(NamedTuple):
     iterations: Int[Array, ""]
 
 
+class Constants(NamedTuple):
+    """What all steps share."""
+
+    mass: Float[Array, "k k"]
+    scale: Float[Array, " k"]
+
+    @classmethod
+    def of(cls, system: AbstractSystem) -> "Constants":
+        return cls(system.mass_matrix(), system.coordinate_scale())
+
+
+def take_step(
+    scheme: GeneralizedAlpha, system: AbstractSystem, constants: Constants, previous: State, running, t, h
+) -> tuple[State, Stats]:
+    """The state at t = t_n + h and what Newton did; NaN unless `running` and converged."""
+    mass, scale = constants
+    tolerance = max(scheme.tolerance, 64 * float(jnp.finfo(mass.dtype).eps))
+
+    def body(iterate: _Iterate) -> _Iterate:
+        motion = advance(scheme, system, previous, iterate.u, h)
+        point = (motion.q, motion.v, motion.vdot, iterate.lam, t)
+        residual = system.residual(*point)
+        violation = system.constraint(motion.q) / (scheme.beta * h**2)
+        factors = factorize_iteration_matrix(scheme, system, system.tangents(*point), mass, motion.x, h)
+        du, dlam = factors.solve(residual, violation)
+        size = jnp.max(jnp.abs(du) * (scheme.beta * h**2) / scale)
+        largest = jnp.max(jnp.abs(residual))
+        return _Iterate(iterate.u - du, iterate.lam - dlam, size, largest, iterate.iterations + 1)
+
+    def unfinished(iterate: _Iterate):
+        # NaN compares false, and ends the iteration
+        return running & (iterate.increment > tolerance) & (iterate.iterations < scheme.max_iterations)
+
+    infinite = jnp.full((), jnp.inf, mass.dtype)
+    start = _Iterate(previous.a, previous.lam, infinite, infinite, jnp.zeros((), jnp.int32))
+    iterate = lax.while_loop(unfinished, body, start)
+    motion = advance(scheme, system, previous, iterate.u, h)
+    state = State(q=motion.q, v=motion.v, vdot=motion.vdot, lam=iterate.lam, a=iterate.u)
+    finite = jnp.all(jnp.isfinite(iterate.u)) & jnp.all(jnp.isfinite(iterate.lam))
+    converged = running & (iterate.increment <= tolerance) & finite
+    state = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), state)
+    return state, Stats(iterate.iterations, iterate.increment, iterate.residual, converged)
+
+
 def integrate(
     scheme: GeneralizedAlpha, num_steps: int, system: AbstractSystem, state0: State, t0, h
 ) -> tuple[State, Stats]:
@@ -42,42 +86,14 @@ def integrate(
 
     A step that does not converge ends the simulation: it and the steps after it are NaN, and `Stats` says so.
     """
-    mass = system.mass_matrix()
-    scale = system.coordinate_scale()
-    tolerance = max(scheme.tolerance, 64 * float(jnp.finfo(mass.dtype).eps))
-
-    def newton(previous: State, t, attempt) -> tuple[Motion, _Iterate]:
-        def body(iterate: _Iterate) -> _Iterate:
-            motion = advance(scheme, system, previous, iterate.u, h)
-            point = (motion.q, motion.v, motion.vdot, iterate.lam, t)
-            residual = system.residual(*point)
-            violation = system.constraint(motion.q) / (scheme.beta * h**2)
-            factors = factorize_iteration_matrix(scheme, system, system.tangents(*point), mass, motion.x, h)
-            du, dlam = factors.solve(residual, violation)
-            size = jnp.max(jnp.abs(du) * (scheme.beta * h**2) / scale)
-            largest = jnp.max(jnp.abs(residual))
-            return _Iterate(iterate.u - du, iterate.lam - dlam, size, largest, iterate.iterations + 1)
-
-        def unfinished(iterate: _Iterate):
-            # NaN compares false, and ends the iteration
-            return attempt & (iterate.increment > tolerance) & (iterate.iterations < scheme.max_iterations)
-
-        infinite = jnp.full((), jnp.inf, mass.dtype)
-        start = _Iterate(previous.a, previous.lam, infinite, infinite, jnp.zeros((), jnp.int32))
-        iterate = lax.while_loop(unfinished, body, start)
-        return advance(scheme, system, previous, iterate.u, h), iterate
+    constants = Constants.of(system)
 
     def step(carry, n):
         previous, running = carry
-        motion, iterate = newton(previous, t0 + (n + 1) * h, running)
-        state = State(q=motion.q, v=motion.v, vdot=motion.vdot, lam=iterate.lam, a=iterate.u)
-        finite = jnp.all(jnp.isfinite(iterate.u)) & jnp.all(jnp.isfinite(iterate.lam))
-        converged = running & (iterate.increment <= tolerance) & finite
-        state = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), state)
-        stats = Stats(iterate.iterations, iterate.increment, iterate.residual, converged)
-        return (state, converged), (state, stats)
+        state, stats = take_step(scheme, system, constants, previous, running, t0 + (n + 1) * h, h)
+        return (state, stats.converged), (state, stats)
 
     start = (state0, jnp.ones((), bool))
-    _, (states, stats) = lax.scan(step, start, jnp.arange(num_steps, dtype=mass.dtype))
+    _, (states, stats) = lax.scan(step, start, jnp.arange(num_steps, dtype=constants.mass.dtype))
     states = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), state0, states)
     return states, stats

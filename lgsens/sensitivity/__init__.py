@@ -1,8 +1,16 @@
 """Derivatives of the trajectory, derived by hand (paper, §6–7)."""
 
-from lgsens.sensitivity._linearization import Parameters as Parameters
+from lgsens.sensitivity._continuous_method import ContinuousAdjoint as ContinuousAdjoint
+from lgsens.sensitivity._criterion_terms import Functional as Functional
+from lgsens.sensitivity._linearization import (
+    Parameters as Parameters,
+    configuration_cotangent as configuration_cotangent,
+)
 from lgsens.sensitivity._methods import (
     AbstractSensitivity as AbstractSensitivity,
     AdjointVariable as AdjointVariable,
+    Autodiff as Autodiff,
+    ContinuousDirect as ContinuousDirect,
     DirectDifferentiation as DirectDifferentiation,
 )
+from lgsens.sensitivity._on_the_fly import direct_on_the_fly as direct_on_the_fly

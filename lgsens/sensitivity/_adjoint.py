@@ -68,7 +68,7 @@ def adjoint_sweep(scheme: GeneralizedAlpha, states: State, parameters: Parameter
         mu_vdot = c.vdot - mu_a @ mass
         mu_x = group.tangent_rmv(x, mu_w)
 
-        _, pull_back = jax.vjp(pseudo_load_function(step), system, step.t)
+        _, pull_back = jax.vjp(pseudo_load_function(step.state), system, step.t)
         bar_system, bar_t = pull_back((-mu_a, -of_constraint))
         n = (step.t - parameters.t0) / h
         bar = Parameters(

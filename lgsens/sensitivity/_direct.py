@@ -19,6 +19,7 @@ from lgsens.dynamics import State
 from lgsens.integrate import GeneralizedAlpha, factorize_iteration_matrix
 from lgsens.sensitivity._linearization import (
     Parameters,
+    Step,
     Variation,
     kinematics,
     pseudo_loads,
@@ -28,32 +29,46 @@ from lgsens.sensitivity._linearization import (
 )
 
 
+def direct_step(
+    scheme: GeneralizedAlpha,
+    parameters: Parameters,
+    mass,
+    step: Step,
+    previous: Variation,
+    row: Variation,
+    d: Parameters,
+) -> Variation:
+    """δ_{n+1} from δ_n, the right-hand side of its equations and p'. What does not depend on these three is shared
+    by all of them under `vmap`: the tangents and one factorization."""
+    system, h = parameters.system, parameters.h
+    group = system.group
+    x, rates = step_increment(scheme, step, h)
+    tangents = step_tangents(system, step)
+    factors = factorize_iteration_matrix(scheme, system, tangents, mass, x, h)
+    r_p, phi_p = pseudo_loads(step, parameters, d)
+    k_t, c_t, jacobian = tangents
+
+    w, v, vdot = kinematics(scheme, group, x, rates, h, previous, jnp.zeros_like(previous.a), d.h)
+    w, v, vdot = w + row.w, v + row.v, vdot + row.vdot
+    u, lam = factors.solve(
+        row.a - r_p - (mass @ vdot + c_t @ v + k_t @ w),
+        row.lam - (phi_p + jacobian @ w) / (scheme.beta * h**2),
+    )
+    return Variation(
+        w=w + group.tangent_mv(x, (scheme.beta * h**2) * u),
+        v=v + (scheme.gamma * h) * u,
+        vdot=vdot + scheme.inertia_factor * u,
+        lam=lam,
+        a=u,
+    )
+
+
 def direct_sweep(scheme: GeneralizedAlpha, states: State, parameters: Parameters, b: Variation, d: Parameters):
     """Solve L (δ, p') = (b, d) forwards in time; returns δ stacked, and p' = d."""
-    system, h = parameters.system, parameters.h
-    group, mass = system.group, parameters.system.mass_matrix()
+    mass = parameters.system.mass_matrix()
 
     def sweep(previous: Variation, inputs):
-        step, row = inputs
-        x, rates = step_increment(scheme, step, h)
-        tangents = step_tangents(system, step)
-        factors = factorize_iteration_matrix(scheme, system, tangents, mass, x, h)
-        r_p, phi_p = pseudo_loads(step, parameters, d)
-        k_t, c_t, jacobian = tangents
-
-        w, v, vdot = kinematics(scheme, group, x, rates, h, previous, jnp.zeros_like(previous.a), d.h)
-        w, v, vdot = w + row.w, v + row.v, vdot + row.vdot
-        u, lam = factors.solve(
-            row.a - r_p - (mass @ vdot + c_t @ v + k_t @ w),
-            row.lam - (phi_p + jacobian @ w) / (scheme.beta * h**2),
-        )
-        current = Variation(
-            w=w + group.tangent_mv(x, (scheme.beta * h**2) * u),
-            v=v + (scheme.gamma * h) * u,
-            vdot=vdot + scheme.inertia_factor * u,
-            lam=lam,
-            a=u,
-        )
+        current = direct_step(scheme, parameters, mass, inputs[0], previous, inputs[1], d)
         return current, current
 
     first = jax.tree.map(lambda leaf: leaf[0], b)

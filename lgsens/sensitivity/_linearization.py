@@ -97,9 +97,8 @@ def kinematics(scheme: GeneralizedAlpha, group, x, rates: Rates, h, previous: Va
     return w, v, vdot
 
 
-def pseudo_load_function(step: Step):
+def pseudo_load_function(state: State):
     """p ↦ (r, Φ) at the fixed converged state: its JVP is (r_p p', Φ_p p'), its VJP their transposes."""
-    state = step.state
 
     def loads(system: AbstractSystem, t):
         return system.residual(state.q, state.v, state.vdot, state.lam, t), system.constraint(state.q)
@@ -110,7 +109,7 @@ def pseudo_load_function(step: Step):
 def pseudo_loads(step: Step, parameters: Parameters, d: Parameters):
     """r_p p' + r_t t' and Φ_p p', with t' = t0' + (n+1) h'."""
     n = (step.t - parameters.t0) / parameters.h
-    loads = pseudo_load_function(step)
+    loads = pseudo_load_function(step.state)
     return jax.jvp(loads, (parameters.system, step.t), (d.system, d.t0 + n * d.h))[1]
 
 
@@ -159,8 +158,13 @@ def cotangent_to_algebra(group, state: State, cotangent: State) -> Variation:
 
 def cotangent_to_ambient(group, state: State, delta: Variation) -> State:
     """The transpose of `to_algebra`."""
-    (q,) = jax.linear_transpose(lambda dq: group.from_ambient(state.q, dq), state.q)(delta.w)
+    q = configuration_cotangent(group, state.q, delta.w)
     return State(q, delta.v, delta.vdot, delta.lam, delta.a)
+
+
+def configuration_cotangent(group, q, w):
+    """The cotangent of the arrays of q that acts as w acts on Lie-algebra coordinates."""
+    return jax.linear_transpose(lambda dq: group.from_ambient(q, dq), q)(w)[0]
 
 
 def zeros_like_trajectory(states: State) -> Any:

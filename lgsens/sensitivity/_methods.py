@@ -15,6 +15,7 @@ from jax.flatten_util import ravel_pytree
 from lgsens.dynamics import State
 from lgsens.integrate import GeneralizedAlpha, Stats, integrate
 from lgsens.sensitivity._adjoint import adjoint_sweep
+from lgsens.sensitivity._continuous_direct import continuous_direct_sweep
 from lgsens.sensitivity._direct import direct_sweep
 from lgsens.sensitivity._linearization import (
     Parameters,
@@ -61,6 +62,31 @@ class AdjointVariable(AbstractSensitivity):
         return _decoded(_adjoint_trajectory(scheme, num_steps, state0, parameters))
 
 
+class ContinuousDirect(AbstractSensitivity):
+    """The differentiated equations of motion, integrated (§6.1): forward mode, first derivatives.
+
+    Its derivative is second-order accurate, but not that of the numerical trajectory: for comparison with the
+    paper, and for equations whose scheme cannot be linearized. It has an iteration matrix of its own. `grad` through
+    it is the transpose of the forward sweep. At least 2 steps.
+    """
+
+    def trajectory(self, scheme, num_steps, state0, parameters):
+        if num_steps < 2:
+            raise ValueError("ContinuousDirect: `num_steps` must be at least 2, got 1; its start needs two nodes.")
+        return _decoded(_continuous_trajectory(scheme, num_steps, state0, parameters))
+
+
+class Autodiff(AbstractSensitivity):
+    """What JAX makes of the scheme's own loops: forward mode only, for comparison.
+
+    Newton's iteration is differentiated as it runs, so the derivative is exact up to the last increment of each step:
+    ask the integrator for a tolerance of 1e-14 or so.
+    """
+
+    def trajectory(self, scheme, num_steps, state0, parameters):
+        return _decoded(_run(scheme, num_steps, state0, parameters))
+
+
 # The custom rules see statistics as floats: an integer output of a `custom_vjp` reaches operations that have no
 # derivative (`jnp.all`) with a tangent, and JAX refuses.
 
@@ -105,6 +131,26 @@ def _direct_rule(scheme, num_steps, primals, tangents):
         transpose_solve=lambda _, rhs: ravel_pytree(adjoint_sweep(scheme, states, parameters, *unravel(rhs)))[0],
     )
     delta, _ = unravel(solution)
+    d_states = jax.vmap(partial(to_ambient, group))(states, delta)
+    return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
+
+
+# Direct differentiation of the equations of motion: a rule whose tangent is linear in the input tangents, as it is.
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _continuous_trajectory(scheme, num_steps, state0, parameters):
+    return _run(scheme, num_steps, state0, parameters)
+
+
+@_continuous_trajectory.defjvp
+def _continuous_rule(scheme, num_steps, primals, tangents):
+    state0, parameters = primals
+    d_state0, d_parameters = tangents
+    states, stats = _continuous_trajectory(scheme, num_steps, state0, parameters)
+    group = parameters.system.group
+    first = to_algebra(group, state0, d_state0)
+    delta = continuous_direct_sweep(scheme, states, parameters, first, d_parameters)
     d_states = jax.vmap(partial(to_ambient, group))(states, delta)
     return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
 

@@ -1,0 +1,266 @@
+"""`differentiate`: the value and the gradient of criteria, by any method through one call."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int, PyTree
+
+from lgsens._advice import direct_or_adjoint
+from lgsens._criterion_use import Use, checked_for
+from lgsens._errors import throw_if_failed
+from lgsens._reference_methods import STENCIL, FiniteDifferences, IndexReduced
+from lgsens._simulate import as_system, begin, check_integrator, interval, outcome, run
+from lgsens._validate import as_count, as_float
+from lgsens.criteria import Criterion
+from lgsens.dynamics import RESULTS, AbstractSystem, State, independence
+from lgsens.integrate import GeneralizedAlpha
+from lgsens.model import Model
+from lgsens.sensitivity import (
+    AbstractSensitivity,
+    AdjointVariable,
+    ContinuousAdjoint,
+    DirectDifferentiation,
+    Functional,
+    Parameters,
+    configuration_cotangent,
+    direct_on_the_fly,
+)
+
+Method = AbstractSensitivity | ContinuousAdjoint | FiniteDifferences | IndexReduced
+
+
+class Sensitivities(NamedTuple):
+    """Values and gradients of criteria.
+
+    Attributes:
+        value: Ψ, a pytree as the criteria, leaves of shape ().
+        gradient: dΨ/dp, a pytree as the criteria, each leaf a pytree as p.
+        method: the method that was used.
+        result: a value of `RESULTS`, shape (), int32; 0 is success.
+    """
+
+    value: PyTree
+    gradient: PyTree
+    method: Method
+    result: Int[Array, ""]
+
+
+def differentiate(
+    criteria: PyTree,
+    build: Callable[[Any], Model | AbstractSystem],
+    p: PyTree,
+    *,
+    t0=0.0,
+    t1,
+    num_steps: int,
+    integrator: GeneralizedAlpha = GeneralizedAlpha(),
+    method: Method | None = None,
+    state0: Callable[[Any], State] | None = None,
+    throw: bool = True,
+) -> Sensitivities:
+    """Ψ and dΨ/dp of one or several criteria with respect to one or several parameters, by any method.
+
+    Arguments:
+        criteria: a `Criterion`, or a pytree of them (a dict, say): all are differentiated at once, with one
+            factorization per step.
+        build: p ↦ the scene, a `Model` or an `AbstractSystem`; `lambda model: model` for every number of a model.
+        p: the design parameters, a pytree of floats.
+        t0, t1, num_steps, integrator: as in `simulate`.
+        method: `DirectDifferentiation()`: on the fly, no trajectory is stored. `AdjointVariable()`: one forward
+            and one backward sweep. `ContinuousDirect()`, `ContinuousAdjoint()`: the equations of motion
+            differentiated, then integrated. For comparison: `Autodiff()`, `FiniteDifferences()`, `IndexReduced()`. None:
+            direct or adjoint, as `direct_or_adjoint` advises for these numbers of parameters and criteria.
+        state0: p ↦ the state at t0 (one of `equilibrium`, say). None: the consistent initial state.
+        throw: raise if the simulation fails. With False `result` says so, and values and gradients are NaN.
+
+    The first two methods give the derivative of the numerical solution, to round-off; the continuous ones and
+    `IndexReduced` that of the motion, to their own accuracy. Compiled once for the same functions: define
+    `criteria` and `build` outside the loop that calls this.
+
+    Raises `ValueError` for criteria that are not scalar, parameters that are not numbers, a criterion that the method
+    cannot treat (with the alternatives), and multipliers that redundant constraints make non-unique; otherwise as
+    `simulate`. Source: Sonneville & Brüls (2014), §5–7.
+    """
+    is_criterion = lambda leaf: isinstance(leaf, Criterion)
+    paths, structure = jax.tree_util.tree_flatten_with_path(criteria, is_leaf=is_criterion)
+    leaves = tuple(leaf for _, leaf in paths)
+    if not leaves or not all(map(is_criterion, leaves)):
+        raise ValueError(f"`criteria` must be a Criterion or a pytree of them, got {criteria!r}.")
+    if not callable(build):
+        raise ValueError(f"`build` must be a function of the parameters that returns a Model, got {build!r}.")
+    check_integrator(integrator)
+    if method is not None and not isinstance(method, Method):
+        raise ValueError(f"`method` must be a method such as AdjointVariable() or ContinuousAdjoint(), got {method!r}.")
+    num_steps = as_count(num_steps, "num_steps", " (it is static)")
+    t0, t1 = interval(t0, t1)
+    p = jax.tree_util.tree_map_with_path(lambda path, leaf: as_float(leaf, None, f"`p`{jax.tree_util.keystr(path)}"), p)
+    size = sum(leaf.size for leaf in jax.tree.leaves(p))
+    if size == 0:
+        raise ValueError(f"`p` must hold at least one number, got {p!r}.")
+    if method is None:
+        method = direct_or_adjoint(size, len(leaves)).method
+    names = tuple(f"Criterion {jax.tree_util.keystr(path)}".strip() for path, _ in paths)
+    value, gradient, result, details, labels, note = _differentiate_jit(
+        leaves, names, build, state0, p, t0, t1, num_steps, integrator, method
+    )
+    found = Sensitivities(
+        value=jax.tree.unflatten(structure, value),
+        gradient=jax.tree.unflatten(structure, gradient),
+        method=method,
+        result=result,
+    )
+    if not throw or details is None:
+        return found
+    value, gradient = throw_if_failed(found[:2], result, details, labels, note)
+    return found._replace(value=value, gradient=gradient)
+
+
+class _Task(NamedTuple):
+    """What the methods share: criteria and scene as functions of the flat vector of parameters."""
+
+    criteria: tuple[Criterion, ...]
+    build: Callable[[Any], Any]
+    start: Callable[[Any], State] | None
+    unravel: Callable[[Array], Any]
+    integrator: GeneralizedAlpha
+    num_steps: int
+    t0: Float[Array, ""]
+    t1: Float[Array, ""]
+
+    @property
+    def h(self):
+        return (self.t1 - self.t0) / self.num_steps
+
+    def system(self, p) -> AbstractSystem:
+        return as_system(self.build(self.unravel(p)))
+
+    def begin(self, p):
+        """The system and how its motion begins."""
+        system = self.system(p)
+        state0 = None if self.start is None else self.start(self.unravel(p))
+        return system, begin(self.integrator, system, self.t0, self.h, state0)
+
+    @property
+    def functional(self) -> Functional:
+        def stacked(which):
+            def function(p, system, state, t):
+                return jnp.stack([getattr(c, which)(system, state, t, self.unravel(p)) for c in self.criteria])
+
+            return function
+
+        return Functional(rate=stacked("rate"), final=stacked("final"))
+
+    def simulate(self, p, sensitivity: AbstractSensitivity):
+        """Ψ of all criteria, and the run."""
+        system, start = self.begin(p)
+        trajectory, details = run(system, start, self.t0, self.t1, self.num_steps, self.integrator, sensitivity)
+        values = jnp.stack([criterion(trajectory, self.unravel(p)) for criterion in self.criteria])
+        return values, (trajectory, details)
+
+
+class _Found(NamedTuple):
+    """What a method returns: Ψ (c,), dΨ/dp (c, p), and how the simulation went."""
+
+    value: Float[Array, " c"]
+    gradient: Float[Array, "c p"]
+    result: Int[Array, ""]
+    details: dict[str, Any] | None
+
+
+@eqx.filter_jit
+def _differentiate_jit(criteria, names, build, start, p, t0, t1, num_steps, integrator, method):
+    flat, unravel = ravel_pytree(p)
+    task = _Task(criteria, build, start, unravel, integrator, num_steps, t0, t1)
+    system = task.system(flat)
+    uses = [Use.of(criterion, system, t0, p) for criterion in criteria]
+    checked_for(method, dict(zip(names, uses)))
+    if isinstance(method, IndexReduced):
+        found = _index_reduced(task, flat, method)
+    elif isinstance(method, FiniteDifferences):
+        found = _differences(task, flat, method)
+    elif isinstance(method, ContinuousAdjoint):
+        found = _continuous_adjoint(task, flat, method, uses)
+    elif isinstance(method, DirectDifferentiation):
+        found = _on_the_fly(task, flat)
+    else:
+        found = _through_the_trajectory(task, flat, method)
+    result, note = found.result, ""
+    of_multipliers = [name for name, use in zip(names, uses) if use.multipliers]
+    if of_multipliers and found.details is not None:
+        note = f"{' and '.join(of_multipliers)}: multipliers are used."
+        eps = jnp.finfo(flat.dtype).eps
+        redundant = independence(found.details["jacobian"]) < eps**0.6  # as for an initial state of our own
+        result = jnp.where(redundant, RESULTS.redundant_constraints, result).astype(jnp.int32)
+    gradient = tuple(unravel(row) for row in found.gradient)
+    return tuple(found.value), gradient, result, found.details, system.constraint_names, note
+
+
+def _on_the_fly(task: _Task, p) -> _Found:
+    def start(p):
+        system, started = task.begin(p)
+        return (started.state, Parameters(system, task.t0, task.h)), started
+
+    run = direct_on_the_fly(task.integrator, task.num_steps, start, task.functional, p)
+    return _Found(run.value, run.gradient, *outcome(task.integrator, run.begun, run.stats, task.t0, task.h))
+
+
+def _through_the_trajectory(task: _Task, p, method: AbstractSensitivity) -> _Found:
+    """The derivative of the trajectory, contracted by the criteria: all criteria or all parameters in one sweep."""
+    mode = jax.jacrev if isinstance(method, AdjointVariable) else jax.jacfwd
+
+    def function(p):
+        values, (trajectory, details) = task.simulate(p, method)
+        return values, (values, trajectory.result, details)
+
+    gradient, (value, result, details) = mode(function, has_aux=True)(p)
+    return _Found(value, gradient, result, details)
+
+
+def _continuous_adjoint(task: _Task, p, method: ContinuousAdjoint, uses: list[Use]) -> _Found:
+    value, (trajectory, details) = task.simulate(p, DirectDifferentiation())
+
+    def initial(p):
+        """Everything that the motion depends on; v_0 as it is, without the scheme's own O(h²)."""
+        system, started = task.begin(p)
+        return system, started.state.q, started.consistent_v
+
+    (system, q0, _), pull_back = jax.vjp(initial, p)
+    cotangents = method.cotangents(
+        task.integrator,
+        trajectory.states,
+        Parameters(system, task.t0, task.h),
+        task.functional,
+        p,
+        uses=(any(use.in_integrand for use in uses), any(use.in_terminal for use in uses)),
+    )
+    of_q = jax.vmap(lambda w: configuration_cotangent(system.group, q0, w))(cotangents.w0)
+    (of_initial,) = jax.vmap(pull_back)((cotangents.system, of_q, cotangents.v0))
+    return _Found(value, cotangents.p + of_initial, trajectory.result, details)
+
+
+def _differences(task: _Task, p, method: FiniteDifferences) -> _Found:
+    value, (trajectory, details) = task.simulate(p, DirectDifferentiation())
+    distance = method.step * jnp.where(p == 0.0, 1.0, jnp.abs(p))
+
+    def slope(direction):
+        moved = lambda k: task.simulate(p + k * distance * direction, DirectDifferentiation())[0]
+        ahead = jax.lax.map(moved, jnp.asarray([k for k, _ in STENCIL], p.dtype))
+        return jnp.asarray([weight for _, weight in STENCIL], p.dtype) @ ahead / jnp.dot(distance, direction)
+
+    gradient = jax.lax.map(slope, jnp.eye(p.shape[0], dtype=p.dtype))
+    return _Found(value, gradient.T, trajectory.result, details)
+
+
+def _index_reduced(task: _Task, p, method: IndexReduced) -> _Found:
+    from lgsens._index_reduced import integrate_index_reduced  # diffrax takes its time to import
+
+    if task.start is not None:
+        raise ValueError("IndexReduced starts from the consistent initial state of the model; leave `state0` out.")
+    found = integrate_index_reduced(
+        *task.functional, task.system, p, task.t0, task.t1, rtol=method.rtol, atol=method.atol, breaks=method.breaks
+    )
+    return _Found(found.value, found.gradient, jnp.zeros((), jnp.int32), None)

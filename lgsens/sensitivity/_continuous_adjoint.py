@@ -1,0 +1,156 @@
+"""The adjoint variable method of the equations of motion (§7).
+
+The adjoint variables μ, ν solve, backwards in time from t_f, the linear index-3 equations (39)–(40)
+
+    M μ̈ − r_Cᵀ μ̇ + (K_t + C_t ad(v) − Ċ_t)ᵀ μ + Bᵀν = (−F̈_M + Ḟ_C − F_K)ᵀ,        B μ = −F_λᵀ
+
+with r_C = C_t + M ad(v). In τ = t_f − t the sign of the damping turns, and generalized-α for linear spaces solves them
+with a matrix that is neither the iteration matrix of eq. (30) nor its transpose.
+
+Final conditions. The boundary terms at t_f are b₁ δq̇ + b₂ δq with b₁ = F_M + G_C + μᵀM and
+b₂ = F_C + G_K + μᵀr_C − Ḟ_M − μ̇ᵀM, and δq, δq̇ are not free: B δq = −Φ_p δp and B δq̇ = −Ḃ δq − (Φ̇)_p δp. So b₁ = −η₁ᵀB
+and b₂ + η₁ᵀḂ = −η₂ᵀB is all that can be asked for, together with eq. (40) and its derivative:
+
+    M μ + Bᵀη₁ = −(F_M + G_C)ᵀ                                 B μ = −F_λᵀ                       (42)
+    M μ̇ − Bᵀη₂ = (F_C + G_K + μᵀr_C − Ḟ_M + η₁ᵀḂ)ᵀ              B μ̇ = −Ḃ μ − Ḟ_λᵀ                (43)
+
+solved with the pseudo-inverse, and what is left is η₁ᵀ(Φ̇)_p δp + η₂ᵀΦ_p δp. The paper has neither Ḃᵀη₁ in (43) nor
+these two terms. They vanish where μ_f = μ̇_f = 0 (a criterion of positions, as on the top), not for a criterion of
+velocities and a parameter in the constraints: an error that no step size removes.
+
+Initial conditions. With ζ = q_0(p)⁻¹ q and χ = v − v_0(p), at t_0
+
+    ρ = F_M + M μ,        π = F_C + r_Cᵀμ − Ḟ_M − M μ̇ − ad(v)ᵀρ
+
+    dΨ/dp = G_p − πᵀw_0 − ρᵀv'_0 + η₁ᵀ(Φ̇)_p + η₂ᵀΦ_p + ∫ (F_p + μᵀr_p + νᵀΦ_p) dt.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from lgsens.dynamics import AbstractSystem, State
+from lgsens.integrate import GeneralizedAlpha
+from lgsens.sensitivity._criterion_terms import Functional, Point, gradients
+from lgsens.sensitivity._linear_alpha import Node, advance, start
+from lgsens.sensitivity._linearization import Parameters, pseudo_load_function
+
+
+class Cotangents(NamedTuple):
+    """dΨ as it acts on what the motion depends on; a leading axis over the criteria."""
+
+    w0: Float[Array, "c k"]  # of q_0, Lie-algebra coordinates: −π
+    v0: Float[Array, "c k"]  # −ρ
+    system: AbstractSystem
+    p: Any
+
+
+class Final(NamedTuple):
+    """μ, μ̇ at t_f, and the multipliers of the constrained variations there, one column for each criterion."""
+
+    mu: Float[Array, "k c"]
+    mu_rate: Float[Array, "k c"]
+    eta1: Float[Array, "m c"]
+    eta2: Float[Array, "m c"]
+
+
+def constrained_solve(mass, jacobian, force, level):
+    """x and η with M x + Bᵀη = force and B x = level, by [(I − B⁺B) M; B]⁺ of eqs. (42)–(43)."""
+    scale = jnp.trace(mass) / mass.shape[0]
+    inverse = jnp.linalg.pinv(jacobian)
+    free = jnp.eye(mass.shape[0], dtype=mass.dtype) - inverse @ jacobian
+    stacked = jnp.concatenate([free @ mass, scale * jacobian])
+    x = jnp.linalg.lstsq(stacked, jnp.concatenate([free @ force, scale * level]))[0]
+    return x, inverse.T @ (force - mass @ x)
+
+
+def along(function, system: AbstractSystem, state: State):
+    """The derivative of function(q) along the motion."""
+    return jax.jvp(function, (state.q,), (system.group.to_ambient(state.q, state.v),))[1]
+
+
+def continuous_adjoint_sweep(
+    scheme: GeneralizedAlpha, path: Point, parameters: Parameters, functional: Functional, p, terms
+) -> Cotangents:
+    """The cotangents of c criteria, by the second-order adjoint equations; `terms` is one of `_criterion_terms`."""
+    system, h = parameters.system, parameters.h
+    group, mass = system.group, system.mass_matrix()
+
+    def node(point: Point) -> tuple[Node, Any]:
+        state, t = point.state, point.t
+        k_t, c_t, jacobian = system.tangents(state.q, state.v, state.vdot, state.lam, t)
+        motion = (group.to_ambient(state.q, state.v), state.vdot, jnp.ones_like(t))
+        damping = lambda q, v, t: system.tangents(q, v, state.vdot, state.lam, t).damping
+        _, c_t_rate = jax.jvp(damping, (state.q, state.v, t), motion)
+        bracket, of = group.ad(state.v), terms(functional, p, system, point)
+        return Node(
+            damping=(c_t + mass @ bracket).T,
+            stiffness=(k_t + c_t @ bracket - c_t_rate).T,
+            constraint_jacobian=jacobian,
+            load=of.load.T,
+            level=of.level.T,
+        ), of
+
+    at = lambda n: jax.tree.map(lambda leaf: leaf[n], path)
+    ends = [node(at(-1 - i)) for i in range(3)]
+    final = _final_conditions(functional, p, system, at(-1), *ends[0])
+    motion = start(scheme, mass, tuple(end for end, _ in ends), final.mu, -final.mu_rate, h)
+    bar = final_cotangents(functional, p, system, at(-1), final.eta1, final.eta2)
+    bar = accumulated(bar, functional, p, system, at(-1), motion.x, motion.lam, h / 2)
+
+    def sweep(carry, point: Point):
+        motion, bar = carry
+        here, _ = node(point)
+        motion = advance(scheme, mass, motion, here, h)
+        return (motion, accumulated(bar, functional, p, system, point, motion.x, motion.lam, h)), None
+
+    interior = jax.tree.map(lambda leaf: leaf[1:-1], path)
+    (motion, bar), _ = lax.scan(sweep, (motion, bar), interior, reverse=True)
+    first, of = node(at(0))
+    motion = advance(scheme, mass, motion, first, h)
+    bar = accumulated(bar, functional, p, system, at(0), motion.x, motion.lam, h / 2)
+
+    rho = of.f_m.T + mass @ motion.x
+    pi = of.f_c.T + first.damping @ motion.x - of.df_m.T + mass @ motion.rate  # μ̇ = −dμ/dτ
+    pi = pi - group.ad(at(0).state.v).T @ rho
+    return Cotangents(-pi.T, -rho.T, *bar)
+
+
+def _final_conditions(functional: Functional, p, system: AbstractSystem, point: Point, node: Node, of) -> Final:
+    state, mass = point.state, system.mass_matrix()
+    g = gradients(lambda state: functional.final(p, system, state, point.t), system.group, state)
+    jacobian_rate = along(system.constraint_jacobian, system, state)
+    jacobian = node.constraint_jacobian
+    mu, eta1 = constrained_solve(mass, jacobian, -(of.f_m + g.v).T, of.level.T)
+    g_k = g.w + g.v @ system.group.ad(state.v)
+    force = (of.f_c + g_k - of.df_m).T + node.damping @ mu + jacobian_rate.T @ eta1
+    mu_rate, minus_eta2 = constrained_solve(mass, jacobian, force, -jacobian_rate @ mu - of.df_lam.T)
+    return Final(mu, mu_rate, eta1, -minus_eta2)
+
+
+def final_cotangents(functional: Functional, p, system: AbstractSystem, point: Point, eta1, eta2):
+    """G_p + η₁ᵀ(Φ̇)_p + η₂ᵀΦ_p, on the numbers of the system and on p."""
+    state = point.state
+
+    def ends(system, p):
+        rate = system.constraint_jacobian(state.q) @ state.v
+        return functional.final(p, system, state, point.t), rate, system.constraint(state.q)
+
+    values, pull_back = jax.vjp(ends, system, p)
+    return jax.vmap(pull_back)((jnp.eye(values[0].shape[0], dtype=state.v.dtype), eta1.T, eta2.T))
+
+
+def accumulated(bar, functional: Functional, p, system: AbstractSystem, point: Point, mu, nu, weight):
+    """bar + weight (F_p + μᵀr_p + νᵀΦ_p), for every criterion."""
+    state = point.state
+
+    def integrand(system, p):
+        rate = functional.rate(p, system, state, point.t)
+        return rate, *pseudo_load_function(state)(system, point.t)
+
+    values, pull_back = jax.vjp(integrand, system, p)
+    one = weight * jnp.eye(values[0].shape[0], dtype=mu.dtype)
+    return jax.tree.map(jnp.add, bar, jax.vmap(pull_back)((one, weight * mu.T, weight * nu.T)))

@@ -1,0 +1,86 @@
+"""The direct differentiation method of the equations of motion (§6.1).
+
+Before any discretization, with ẇ = v' − ad(v) w and v̇' = ẅ + ad(v) ẇ + ad(v̇) w,
+
+    M ẅ + (C_t + M ad(v)) ẇ + (K_t + C_t ad(v) + M ad(v̇)) w + Bᵀλ' = −r_p p'
+    B w = −Φ_p p'
+
+linear equations on a linear space, integrated by generalized-α with the numbers of the nominal scheme. The brackets
+ad(v), ad(v̇) are what the Lie group adds. The solution is not the derivative of the numerical trajectory (that is §6.2,
+`_direct.py`) but converges to the same limit, at second order.
+
+Of the derivative of the initial state only w_0 and v'_0 are data here; what §6.2 inherits from the nominal start
+through v̇'_0 and a'_0 is found by `start`. v_0 has been moved off B v = 0 by O(h²) for the nominal scheme
+(`GeneralizedAlpha.second_order_start`); ẇ_0 must solve its own hidden constraint to better than that, so that it is
+projected on d/dt (B w + Φ_p p') = 0 along the motion.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from lgsens.dynamics import State, kkt_solve, split_velocity
+from lgsens.integrate import GeneralizedAlpha
+from lgsens.sensitivity._linear_alpha import Motion, Node, advance, start
+from lgsens.sensitivity._linearization import Parameters, Variation, pseudo_load_function
+
+
+def continuous_direct_sweep(
+    scheme: GeneralizedAlpha, states: State, parameters: Parameters, first: Variation, d: Parameters
+) -> Variation:
+    """The sensitivities (w, v', v̇', λ', a' = v̇') of all states, stacked, given those of the first."""
+    system, h = parameters.system, parameters.h
+    group, mass = system.group, system.mass_matrix()
+    num_steps = states.v.shape[0] - 1
+    count = jnp.arange(num_steps + 1, dtype=states.v.dtype)
+
+    def node(state: State, n) -> Node:
+        t = parameters.t0 + n * h
+        k_t, c_t, jacobian = system.tangents(state.q, state.v, state.vdot, state.lam, t)
+        bracket = group.ad(state.v)
+        loads = pseudo_load_function(state)
+        r_p, phi_p = jax.jvp(loads, (system, t), (d.system, d.t0 + n * d.h))[1]
+        return Node(
+            damping=c_t + mass @ bracket,
+            stiffness=k_t + c_t @ bracket + mass @ group.ad(state.vdot),
+            constraint_jacobian=jacobian,
+            load=-r_p[:, None],
+            level=-phi_p[:, None],
+        )
+
+    state0 = jax.tree.map(lambda leaf: leaf[0], states)
+    nodes = tuple(node(jax.tree.map(lambda leaf, i=i: leaf[i], states), count[i]) for i in range(3))
+    w, rate = first.w, first.v - group.ad(state0.v) @ first.w
+    rate = rate - _hidden_violation(system, state0, w, rate, d)
+    motion = start(scheme, mass, nodes, w[:, None], rate[:, None], h)
+
+    def sweep(previous: Motion, inputs):
+        current = advance(scheme, mass, previous, node(*inputs), h)
+        return current, current
+
+    later = (jax.tree.map(lambda leaf: leaf[1:], states), count[1:])
+    _, rest = lax.scan(sweep, motion, later)
+    motion = jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest])[..., 0], motion, rest)
+    return jax.vmap(partial(_variation, group))(states, motion)
+
+
+def _variation(group, state: State, motion: Motion) -> Variation:
+    bracket = group.ad(state.v)
+    v = motion.rate + bracket @ motion.x
+    vdot = motion.acceleration + bracket @ motion.rate + group.ad(state.vdot) @ motion.x
+    return Variation(motion.x, v, vdot, motion.lam, vdot)
+
+
+def _hidden_violation(system, state: State, w, rate, d: Parameters):
+    """What d/dt (B w + Φ_p p') = 0 forbids of ẇ, as its M-orthogonal part."""
+    q, group = state.q, system.group
+    v, _ = split_velocity(system, q, state.v)
+
+    def varied(q, w):
+        return jax.jvp(lambda system, q: system.constraint(q), (system, q), (d.system, group.to_ambient(q, w)))[1]
+
+    violation = jax.jvp(varied, (q, w), (group.to_ambient(q, v), rate))[1]
+    mass, jacobian = system.mass_matrix(), system.constraint_jacobian(q)
+    return kkt_solve(mass, jacobian, jnp.zeros_like(rate), violation)[0]

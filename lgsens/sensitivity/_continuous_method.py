@@ -1,0 +1,66 @@
+"""The continuous adjoint variable method as a value."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from lgsens.dynamics import State
+from lgsens.integrate import GeneralizedAlpha
+from lgsens.sensitivity._continuous_adjoint import Cotangents, continuous_adjoint_sweep
+from lgsens.sensitivity._criterion_terms import (
+    Functional,
+    derivative_terms,
+    of_state,
+    plain_terms,
+    points,
+)
+from lgsens.sensitivity._first_order_adjoint import first_order_adjoint_sweep
+from lgsens.sensitivity._linearization import Parameters
+
+TREATMENTS = ("state", "derivatives", "first_order", None)
+
+
+class ContinuousAdjoint(eqx.Module):
+    """The adjoint equations of motion, integrated backwards (§7); a method of `differentiate`.
+
+    Second order, but not the derivative of the numerical trajectory, whose own adjoint is `AdjointVariable`. It needs
+    F and G apart, and where F depends on accelerations, one of the treatments that §7.2 lists:
+
+    Arguments:
+        accelerations: "state" expresses v̇ and λ through q and v (eq. 41; F and G may use both); "derivatives"
+            computes v̈ and v⃛ by additional differential equations; "first_order" solves the first-order adjoint
+            equations of Bestle & Seybold (1992), extended to the Lie group, by BDF2; None leaves eqs. (39)–(43) as
+            they are, for criteria without accelerations. Criteria that use neither v̇ nor λ are the same in "state",
+            "derivatives" and None, and cost the same.
+
+    At least 4 steps. Raises `ValueError` for another treatment. Source: Sonneville & Brüls (2014), §7.
+    """
+
+    accelerations: str | None = eqx.field(static=True, default="state")
+
+    def __check_init__(self):
+        if self.accelerations not in TREATMENTS:
+            raise ValueError(
+                f"ContinuousAdjoint: `accelerations` must be one of {TREATMENTS}, got {self.accelerations!r}."
+            )
+
+    def cotangents(
+        self,
+        scheme: GeneralizedAlpha,
+        states: State,
+        parameters: Parameters,
+        functional: Functional,
+        p,
+        *,
+        uses: tuple[bool, bool],
+    ) -> Cotangents:
+        """dΨ as it acts on the initial state, the system and p; `uses`: whether F and G use v̇ or λ."""
+        count = jnp.arange(states.v.shape[0], dtype=states.v.dtype)
+        t, h = parameters.t0 + count * parameters.h, parameters.h
+        derivatives = uses[0] and self.accelerations in ("derivatives", None)
+        path = points(scheme, states, t, h, derivatives=derivatives)
+        if self.accelerations == "first_order":
+            return first_order_adjoint_sweep(path, parameters, functional, p)
+        if self.accelerations == "state":
+            functional = Functional(*(of_state(f) if used else f for f, used in zip(functional, uses)))
+        terms = derivative_terms if derivatives else plain_terms
+        return continuous_adjoint_sweep(scheme, path, parameters, functional, p, terms)

@@ -1,0 +1,108 @@
+"""Generalized-α on a linear space, for the linear equations of the continuous methods (§6.1 and §7).
+
+    M ẍ + D(t) ẋ + K(t) x + B(t)ᵀλ = l(t),     B(t) x = g(t)
+
+The sensitivities of §6.1 satisfy equations of this kind, and so do the adjoint variables of §7 in the time that runs
+backwards. With u = a_{n+1}, and x*, ẋ*, ẍ* the values at u = 0 of eqs. (27)–(29) written for a linear space,
+
+    [[c M + γh D + βh² K,  Bᵀ],   [u; λ] = [l − M ẍ* − D ẋ* − K x*;  (g − B x*)/(βh²)]
+     [B,                   0 ]]
+
+This matrix is not the iteration matrix of eq. (30): the continuous methods need factors of their own. The columns of
+x are right-hand sides (parameters or criteria), and share them.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens.dynamics import kkt_solve, mass_scale
+from lgsens.integrate import Factors, GeneralizedAlpha
+
+
+class Node(NamedTuple):
+    """The equations at one time."""
+
+    damping: Float[Array, "k k"]  # D
+    stiffness: Float[Array, "k k"]  # K
+    constraint_jacobian: Float[Array, "m k"]  # B
+    load: Float[Array, "k c"]  # l
+    level: Float[Array, "m c"]  # g
+
+
+class Motion(NamedTuple):
+    """The solution at one time: x, ẋ, ẍ, λ, and the algorithmic acceleration a."""
+
+    x: Float[Array, "k c"]
+    rate: Float[Array, "k c"]
+    acceleration: Float[Array, "k c"]
+    lam: Float[Array, "m c"]
+    a: Float[Array, "k c"]
+
+
+def start(scheme: GeneralizedAlpha, mass, nodes: tuple[Node, Node, Node], x, rate, h) -> Motion:
+    """The starting values that follow from x and ẋ at the first of three nodes, a distance h apart.
+
+    The second derivative of the constraint would give ẍ; it asks for B̈ and g̈. Here x is instead a cubic through x_0
+    and ẋ_0, with s = ẍ_0 and j = h x⃛_0 such that it solves the equations at the two later nodes (i = 1, 2):
+
+        M (s + i j) + D_i (ẋ_0 + ih s + ½i²h j) + K_i x_i + B_iᵀλ_i = l_i
+        B_i x_i = g_i,        x_i = x_0 + ih ẋ_0 + h² (½i² s + i³/6 j)
+
+    s is then accurate to O(h²) and x⃛ to O(h): what a second-order start needs (the correction of ẋ_0 and of a_0 is that
+    of `simulate`, there derived for the nonlinear scheme; here T = I).
+    """
+    k, m = nodes[0].load.shape[0], nodes[0].level.shape[0]
+    scale = mass_scale(mass)
+    rows, loads, levels = [], [], []
+    for i, node in ((1, nodes[1]), (2, nodes[2])):
+        d, stiffness, jacobian = node.damping, node.stiffness, scale * node.constraint_jacobian
+        of_s = mass + (i * h) * d + (i**2 * h**2 / 2) * stiffness
+        of_j = i * mass + (i**2 * h / 2) * d + (i**3 * h**2 / 6) * stiffness
+        none = jnp.zeros((k, m), mass.dtype)
+        multipliers = [jacobian.T if n == i else none for n in (1, 2)]
+        rows.append([jnp.concatenate([of_s, of_j, *multipliers], axis=1)])
+        border = [(i**2 / 2) * jacobian, (i**3 / 6) * jacobian, jnp.zeros((m, 2 * m), mass.dtype)]
+        levels.append(jnp.concatenate(border, axis=1))
+        free = x + (i * h) * rate
+        loads.append(
+            (
+                node.load - node.damping @ rate - node.stiffness @ free,
+                scale * (node.level - node.constraint_jacobian @ free) / h**2,
+            )
+        )
+    matrix = jnp.concatenate([rows[0][0], rows[1][0], *levels])
+    rhs = jnp.concatenate([loads[0][0], loads[1][0], loads[0][1], loads[1][1]])
+    solution = jnp.linalg.solve(matrix, rhs)
+    s, j = solution[:k], solution[k : 2 * k]
+    first = nodes[0]
+    left = first.load - mass @ s - first.damping @ rate - first.stiffness @ x
+    _, lam = kkt_solve(mass, first.constraint_jacobian, left, jnp.zeros_like(first.level))
+    if not scheme.second_order_start:
+        return Motion(x, rate, s, lam, s)
+    delta = scheme.alpha_m - scheme.alpha_f
+    missed = (1.0 / 6.0 - scheme.beta - delta / 2.0) * j
+    tangential, _ = kkt_solve(mass, first.constraint_jacobian, mass @ missed, jnp.zeros_like(first.level))
+    return Motion(x, rate + h * (missed - tangential), s, lam, s + delta * j)
+
+
+def advance(scheme: GeneralizedAlpha, mass, previous: Motion, node: Node, h) -> Motion:
+    """One step: one factorization, one solve for all columns."""
+    x = previous.x + h * previous.rate + (h**2 * (0.5 - scheme.beta)) * previous.a
+    rate = previous.rate + (h * (1.0 - scheme.gamma)) * previous.a
+    acceleration = (scheme.alpha_m * previous.a - scheme.alpha_f * previous.acceleration) / (1.0 - scheme.alpha_f)
+    jacobian = node.constraint_jacobian
+    dynamic = scheme.inertia_factor * mass + (scheme.gamma * h) * node.damping + (scheme.beta * h**2) * node.stiffness
+    factors = Factors.of(dynamic, jacobian.T, jacobian, mass_scale(mass))
+    u, lam = factors.solve(
+        node.load - mass @ acceleration - node.damping @ rate - node.stiffness @ x,
+        (node.level - jacobian @ x) / (scheme.beta * h**2),
+    )
+    return Motion(
+        x=x + (scheme.beta * h**2) * u,
+        rate=rate + (scheme.gamma * h) * u,
+        acceleration=acceleration + scheme.inertia_factor * u,
+        lam=lam,
+        a=u,
+    )
