@@ -9,6 +9,7 @@ group, Multibody System Dynamics, 2014). SI units; `jax.config.update("jax_enabl
 import importlib
 
 from lgsens._advice import Advice as Advice, Costs as Costs, direct_or_adjoint as direct_or_adjoint
+from lgsens._cost import measure_costs as measure_costs
 from lgsens._differentiate import Sensitivities as Sensitivities, differentiate as differentiate
 from lgsens._errors import SimulationError as SimulationError
 from lgsens._reference_methods import FiniteDifferences as FiniteDifferences, IndexReduced as IndexReduced

@@ -43,9 +43,9 @@ def direct_or_adjoint(
 ) -> Advice:
     """Which of the two methods is cheaper (paper, §9).
 
-    The direct method solves one more linear system per step for each parameter, the adjoint variable method one for each
-    criterion. After time discretization a path constraint is as many criteria as there are time steps at which it is
-    active: with some active, the direct method is the one for few parameters.
+    The direct method solves one more linear system per step for each parameter, the adjoint variable method one for
+    each criterion. After time discretization a path constraint is as many criteria as there are time steps at which it
+    is active: with some active, the direct method is the one for few parameters.
 
     Arguments:
         num_parameters: number of scalar design parameters.

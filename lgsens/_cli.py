@@ -10,7 +10,7 @@ from typing import NoReturn
 
 import jax
 
-from lgsens import _cli_optimize, _cli_top
+from lgsens import _cli_optimize, _cli_paper, _cli_top
 from lgsens._cli_report import version
 from lgsens._errors import SimulationError
 from lgsens.examples import PARAMETERS
@@ -92,6 +92,26 @@ def _parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--h", type=_positive, default=1e-3, help="step size [s] (default: %(default)s)")
     top.set_defaults(run=_cli_top.run)
+
+    paper = commands.add_parser(
+        "paper",
+        help="reproduce the paper's convergence figures",
+        description="Errors of sensitivities against the step size by all four methods, beside references from an "
+        "independent integrator: the spinning top (Sonneville & Brüls 2014, Fig. 2) and the quarter-car (Fig. 4). "
+        "Most of the ten minutes is compilation.",
+    )
+    paper.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/paper"),
+        metavar="DIR",
+        help="new folder for paper.json and the figures (default: %(default)s)",
+    )
+    paper.add_argument("--overwrite", action="store_true", help="write into --out even if it exists")
+    paper.add_argument("--only", choices=list(_cli_paper.STUDIES), help="one of the figures (default: all)")
+    paper.add_argument("--coarse", action="store_true", help="two large steps instead of four or five: a quick look")
+    paper.add_argument("--quiet", action="store_true", help="no progress bar and no tables")
+    paper.set_defaults(run=_cli_paper.run)
     return parser
 
 

@@ -1,11 +1,13 @@
 """`differentiate`: the value and the gradient of criteria, by any method through one call."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
@@ -72,8 +74,8 @@ def differentiate(
         t0, t1, num_steps, integrator: as in `simulate`.
         method: `DirectDifferentiation()`: on the fly, no trajectory is stored. `AdjointVariable()`: one forward
             and one backward sweep. `ContinuousDirect()`, `ContinuousAdjoint()`: the equations of motion
-            differentiated, then integrated. For comparison: `Autodiff()`, `FiniteDifferences()`, `IndexReduced()`. None:
-            direct or adjoint, as `direct_or_adjoint` advises for these numbers of parameters and criteria.
+            differentiated, then integrated. For comparison: `Autodiff()`, `FiniteDifferences()`, `IndexReduced()`.
+            None: direct or adjoint, as `direct_or_adjoint` advises for these numbers of parameters and criteria.
         state0: p ↦ the state at t0 (one of `equilibrium`, say). None: the consistent initial state.
         throw: raise if the simulation fails. With False `result` says so, and values and gradients are NaN.
 
@@ -103,10 +105,19 @@ def differentiate(
         raise ValueError(f"`p` must hold at least one number, got {p!r}.")
     if method is None:
         method = direct_or_adjoint(size, len(leaves)).method
+    if isinstance(method, ContinuousAdjoint) and num_steps < ContinuousAdjoint.LEAST_STEPS:
+        raise ValueError(
+            f"ContinuousAdjoint: `num_steps` must be at least {ContinuousAdjoint.LEAST_STEPS}, got {num_steps}; its "
+            "start needs three points. AdjointVariable() has no such limit."
+        )
     names = tuple(f"Criterion {jax.tree_util.keystr(path)}".strip() for path, _ in paths)
-    value, gradient, result, details, labels, note = _differentiate_jit(
-        leaves, names, build, state0, p, t0, t1, num_steps, integrator, method
-    )
+    if isinstance(method, IndexReduced):
+        value, gradient = _index_reduced(leaves, build, state0, p, t0, t1, method)
+        result, details, labels, note = jnp.zeros((), jnp.int32), None, (), ""
+    else:
+        value, gradient, result, details, labels, note = _differentiate_jit(
+            leaves, names, build, state0, p, t0, t1, num_steps, integrator, method
+        )
     found = Sensitivities(
         value=jax.tree.unflatten(structure, value),
         gradient=jax.tree.unflatten(structure, gradient),
@@ -117,6 +128,37 @@ def differentiate(
         return found
     value, gradient = throw_if_failed(found[:2], result, details, labels, note)
     return found._replace(value=value, gradient=gradient)
+
+
+def _index_reduced(criteria, build, start, p, t0, t1, method: IndexReduced):
+    from lgsens._index_reduced import integrate_index_reduced  # diffrax takes its time to import
+
+    if start is not None:
+        raise ValueError("IndexReduced starts from the consistent initial state of the model; leave `state0` out.")
+    flat, unravel = ravel_pytree(p)
+    functions = _functions(criteria, build, jax.tree.structure(p), tuple(leaf.shape for leaf in jax.tree.leaves(p)))
+    found = integrate_index_reduced(*functions, flat, t0, t1, rtol=method.rtol, atol=method.atol, breaks=method.breaks)
+    return tuple(found.value), tuple(unravel(row) for row in found.gradient)
+
+
+@functools.lru_cache(maxsize=64)
+def _functions(criteria, build, structure, shapes):
+    """F, G and the system as functions of the flat vector; the same ones for the same scene, so compiled once."""
+    _, unravel = ravel_pytree(jax.tree.unflatten(structure, [np.zeros(shape) for shape in shapes]))
+    stacked = _stacked(criteria, unravel)
+    return *stacked, lambda p: as_system(build(unravel(p)))
+
+
+def _stacked(criteria, unravel) -> Functional:
+    """All criteria as one function of the flat vector of parameters."""
+
+    def of(which):
+        def function(p, system, state, t):
+            return jnp.stack([getattr(c, which)(system, state, t, unravel(p)) for c in criteria])
+
+        return function
+
+    return Functional(rate=of("rate"), final=of("final"))
 
 
 class _Task(NamedTuple):
@@ -144,16 +186,6 @@ class _Task(NamedTuple):
         state0 = None if self.start is None else self.start(self.unravel(p))
         return system, begin(self.integrator, system, self.t0, self.h, state0)
 
-    @property
-    def functional(self) -> Functional:
-        def stacked(which):
-            def function(p, system, state, t):
-                return jnp.stack([getattr(c, which)(system, state, t, self.unravel(p)) for c in self.criteria])
-
-            return function
-
-        return Functional(rate=stacked("rate"), final=stacked("final"))
-
     def simulate(self, p, sensitivity: AbstractSensitivity):
         """Ψ of all criteria, and the run."""
         system, start = self.begin(p)
@@ -178,9 +210,7 @@ def _differentiate_jit(criteria, names, build, start, p, t0, t1, num_steps, inte
     system = task.system(flat)
     uses = [Use.of(criterion, system, t0, p) for criterion in criteria]
     checked_for(method, dict(zip(names, uses)))
-    if isinstance(method, IndexReduced):
-        found = _index_reduced(task, flat, method)
-    elif isinstance(method, FiniteDifferences):
+    if isinstance(method, FiniteDifferences):
         found = _differences(task, flat, method)
     elif isinstance(method, ContinuousAdjoint):
         found = _continuous_adjoint(task, flat, method, uses)
@@ -204,7 +234,7 @@ def _on_the_fly(task: _Task, p) -> _Found:
         system, started = task.begin(p)
         return (started.state, Parameters(system, task.t0, task.h)), started
 
-    run = direct_on_the_fly(task.integrator, task.num_steps, start, task.functional, p)
+    run = direct_on_the_fly(task.integrator, task.num_steps, start, _stacked(task.criteria, task.unravel), p)
     return _Found(run.value, run.gradient, *outcome(task.integrator, run.begun, run.stats, task.t0, task.h))
 
 
@@ -233,7 +263,7 @@ def _continuous_adjoint(task: _Task, p, method: ContinuousAdjoint, uses: list[Us
         task.integrator,
         trajectory.states,
         Parameters(system, task.t0, task.h),
-        task.functional,
+        _stacked(task.criteria, task.unravel),
         p,
         uses=(any(use.in_integrand for use in uses), any(use.in_terminal for use in uses)),
     )
@@ -253,14 +283,3 @@ def _differences(task: _Task, p, method: FiniteDifferences) -> _Found:
 
     gradient = jax.lax.map(slope, jnp.eye(p.shape[0], dtype=p.dtype))
     return _Found(value, gradient.T, trajectory.result, details)
-
-
-def _index_reduced(task: _Task, p, method: IndexReduced) -> _Found:
-    from lgsens._index_reduced import integrate_index_reduced  # diffrax takes its time to import
-
-    if task.start is not None:
-        raise ValueError("IndexReduced starts from the consistent initial state of the model; leave `state0` out.")
-    found = integrate_index_reduced(
-        *task.functional, task.system, p, task.t0, task.t1, rtol=method.rtol, atol=method.atol, breaks=method.breaks
-    )
-    return _Found(found.value, found.gradient, jnp.zeros((), jnp.int32), None)

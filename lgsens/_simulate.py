@@ -136,8 +136,8 @@ def simulate(
     check_integrator(integrator)
     if not isinstance(sensitivity, AbstractSensitivity):
         raise ValueError(
-            f"`sensitivity` must be one of DirectDifferentiation(), AdjointVariable(), ContinuousDirect() and Autodiff(), "
-            f"got {sensitivity!r}; ContinuousAdjoint() needs a Criterion, see `differentiate`."
+            "`sensitivity` must be DirectDifferentiation(), AdjointVariable(), ContinuousDirect() or Autodiff(), got "
+            f"{sensitivity!r}; ContinuousAdjoint() needs a Criterion, see `differentiate`."
         )
     num_steps = as_count(num_steps, "num_steps", " (it is static)")
     t0, t1 = interval(t0, t1)

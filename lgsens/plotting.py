@@ -1,4 +1,4 @@
-"""Figures: time histories with their limits, convergence, the mechanism in space; matplotlib comes late.
+"""Figures: time histories, convergence, errors, the mechanism in space; matplotlib comes late.
 
 Figures are made without pyplot, so they need no display and leave no global state; in a notebook they show
 themselves, and `save` writes them.
@@ -18,6 +18,15 @@ if TYPE_CHECKING:
 
 COLOURS = ("#8c8c8c", "#1b62a5", "#d9822b", "#3a8a4d")  # before in grey, after in blue, then others
 LIMIT = "#b3262e"
+# For curves that may lie on each other and be printed without colours: each has a marker of its own.
+CURVES: tuple[dict[str, Any], ...] = (
+    {"color": "#1b62a5", "marker": "o", "markersize": 11, "fillstyle": "none", "linestyle": "-", "linewidth": 2.4},
+    {"color": "#d9822b", "marker": "s", "markersize": 4.5, "fillstyle": "full", "linestyle": "--", "linewidth": 1.2},
+    {"color": "#3a8a4d", "marker": "D", "markersize": 8, "fillstyle": "none", "linestyle": "-", "linewidth": 1.6},
+    {"color": "#7a4b9a", "marker": "^", "markersize": 5.5, "fillstyle": "full", "linestyle": "--", "linewidth": 1.2},
+    {"color": "#3c3c3c", "marker": "v", "markersize": 5, "fillstyle": "none", "linestyle": ":", "linewidth": 0.8},
+    {"color": "#b3262e", "marker": "x", "markersize": 5, "fillstyle": "full", "linestyle": ":", "linewidth": 0.8},
+)
 ROLES = {"link": "#1b62a5", "body": "#3a8a4d", "wheel": "#3c3c3c", "spring": "#d9822b", "damper": "#7a4b9a"}
 
 
@@ -33,6 +42,24 @@ class Panel(NamedTuple):
     label: str
     series: Mapping[str, Any]
     limits: Mapping[str, float] = {}
+
+
+class ErrorPanel(NamedTuple):
+    """Errors of several methods.
+
+    Attributes:
+        title: what the errors are of.
+        label: what the vertical axis shows, with its unit: "relative error [–]".
+        series: step sizes [s] and errors by the name of the method, each of shape (n,).
+        order: slope of the reference line; None: no line, and the horizontal axis is linear.
+        horizontal: label of the horizontal axis.
+    """
+
+    title: str
+    label: str
+    series: Mapping[str, tuple[Any, Any]]
+    order: int | None = 2
+    horizontal: str = "step size h [s]"
 
 
 def figure(width: float = 7.0, height: float = 4.5) -> "Figure":
@@ -137,6 +164,50 @@ def convergence(history: Any, *, tolerance: float, best: int | None = None, obje
     bottom.set_xlabel("step")
     fig.align_ylabels()
     return fig
+
+
+def errors(panels: Sequence[ErrorPanel], title: str = "") -> "Figure":
+    """Errors on a logarithmic axis, panels side by side, with a line of the slope that the order predicts.
+
+    A name looks the same in every panel, and is in one legend below them.
+
+    Arguments:
+        panels: what to draw, from left to right.
+        title: over the figure.
+
+    Raises `ImportError` without matplotlib.
+    """
+    fig = figure(1.6 + 4.6 * len(panels), 5.2)
+    names = list(dict.fromkeys(name for panel in panels for name in panel.series))
+    handles: dict[str, Any] = {}
+    for axes, panel in zip(fig.subplots(1, len(panels), squeeze=False)[0], panels):
+        for name, (x, error) in panel.series.items():
+            style = CURVES[names.index(name) % len(CURVES)]
+            (handles[name],) = axes.plot(np.asarray(x), np.asarray(error), label=name, **style)
+        axes.set_yscale("log")
+        _plain(axes)
+        axes.set(title=panel.title, xlabel=panel.horizontal, ylabel=panel.label)
+        if panel.order is not None:
+            _slope(axes, panel, panel.order)
+    columns = min(len(names), 2 * len(panels))
+    fig.legend(
+        handles=list(handles.values()), loc="outside lower center", ncols=columns, frameon=False, handlelength=3.5
+    )
+    if title:
+        fig.suptitle(title)
+    return fig
+
+
+def _slope(axes: "Axes", panel: ErrorPanel, order: int) -> None:
+    """A line of this slope, below all curves where h is least, and the step sizes themselves along the axis."""
+    x = np.unique(np.concatenate([np.asarray(h) for h, _ in panel.series.values()]))
+    least = min(np.asarray(error)[np.argmin(h)] for h, error in panel.series.values())
+    ends, middle = x[[0, -1]], np.sqrt(x[0] * x[-1])
+    axes.plot(ends, 0.5 * least * (ends / x[0]) ** order, color=COLOURS[0], linewidth=1.2)
+    axes.text(middle, 0.4 * least * (middle / x[0]) ** order, f"slope {order}", va="top", color=COLOURS[0])
+    axes.set_xscale("log")
+    axes.set_xticks(x, [f"{h:.3g}" for h in x])
+    axes.minorticks_off()
 
 
 def mechanism(models: Mapping[str, Model], title: str = "", view: tuple[float, float] = (18.0, -38.0)) -> "Figure":

@@ -9,10 +9,9 @@ linear equations on a linear space, integrated by generalized-α with the number
 ad(v), ad(v̇) are what the Lie group adds. The solution is not the derivative of the numerical trajectory (that is §6.2,
 `_direct.py`) but converges to the same limit, at second order.
 
-Of the derivative of the initial state only w_0 and v'_0 are data here; what §6.2 inherits from the nominal start
-through v̇'_0 and a'_0 is found by `start`. v_0 has been moved off B v = 0 by O(h²) for the nominal scheme
-(`GeneralizedAlpha.second_order_start`); ẇ_0 must solve its own hidden constraint to better than that, so that it is
-projected on d/dt (B w + Φ_p p') = 0 along the motion.
+The derivative of the initial state gives w_0, v'_0, v̇'_0, λ'_0 and, through a'_0, ẅ at t0 + (α_m − α_f) h. v_0 has been
+moved off B v = 0 by O(h²) for the nominal scheme (`GeneralizedAlpha.second_order_start`); ẇ_0 must solve its own hidden
+constraint to better than that, so it is projected on d/dt (B w + Φ_p p') = 0 along the motion.
 """
 
 from functools import partial
@@ -23,7 +22,7 @@ from jax import lax
 
 from lgsens.dynamics import State, kkt_solve, split_velocity
 from lgsens.integrate import GeneralizedAlpha
-from lgsens.sensitivity._linear_alpha import Motion, Node, advance, start
+from lgsens.sensitivity._linear_alpha import Motion, Node, advance, started
 from lgsens.sensitivity._linearization import Parameters, Variation, pseudo_load_function
 
 
@@ -50,11 +49,7 @@ def continuous_direct_sweep(
             level=-phi_p[:, None],
         )
 
-    state0 = jax.tree.map(lambda leaf: leaf[0], states)
-    nodes = tuple(node(jax.tree.map(lambda leaf, i=i: leaf[i], states), count[i]) for i in range(3))
-    w, rate = first.w, first.v - group.ad(state0.v) @ first.w
-    rate = rate - _hidden_violation(system, state0, w, rate, d)
-    motion = start(scheme, mass, nodes, w[:, None], rate[:, None], h)
+    motion = _begin(scheme, system, jax.tree.map(lambda leaf: leaf[0], states), first, d, h)
 
     def sweep(previous: Motion, inputs):
         current = advance(scheme, mass, previous, node(*inputs), h)
@@ -71,6 +66,21 @@ def _variation(group, state: State, motion: Motion) -> Variation:
     v = motion.rate + bracket @ motion.x
     vdot = motion.acceleration + bracket @ motion.rate + group.ad(state.vdot) @ motion.x
     return Variation(motion.x, v, vdot, motion.lam, vdot)
+
+
+def _begin(scheme: GeneralizedAlpha, system, state: State, first: Variation, d: Parameters, h) -> Motion:
+    """w, ẇ, ẅ, λ' and the algorithmic acceleration of the linear scheme at t0."""
+    ad, delta = system.group.ad, scheme.alpha_m - scheme.alpha_f
+    bracket, of_vdot = ad(state.v), ad(state.vdot)
+    w = first.w
+    rate = first.v - bracket @ w
+    rate = rate - _hidden_violation(system, state, w, rate, d)
+    acceleration = first.vdot - bracket @ rate - of_vdot @ w
+    # a' stands for v̇' = ẅ + ad(v) ẇ + ad(v̇) w at t0 + Δ h, and a_0 for v̇ there
+    change = (delta * h) * (bracket @ acceleration + 2.0 * of_vdot @ rate) + ad(state.a - state.vdot) @ w
+    a = first.a - bracket @ rate - of_vdot @ w - change
+    exact = Motion(*(column[:, None] for column in (w, rate, acceleration, first.lam, a)))
+    return started(scheme, system.mass_matrix(), system.constraint_jacobian(state.q), exact, h)
 
 
 def _hidden_violation(system, state: State, w, rate, d: Parameters):

@@ -1,5 +1,7 @@
 """The continuous adjoint variable method as a value."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 
@@ -34,6 +36,8 @@ class ContinuousAdjoint(eqx.Module):
 
     At least 4 steps. Raises `ValueError` for another treatment. Source: Sonneville & Brüls (2014), §7.
     """
+
+    LEAST_STEPS: ClassVar[int] = 4
 
     accelerations: str | None = eqx.field(static=True, default="state")
 

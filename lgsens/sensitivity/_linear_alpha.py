@@ -50,8 +50,7 @@ def start(scheme: GeneralizedAlpha, mass, nodes: tuple[Node, Node, Node], x, rat
         M (s + i j) + D_i (ẋ_0 + ih s + ½i²h j) + K_i x_i + B_iᵀλ_i = l_i
         B_i x_i = g_i,        x_i = x_0 + ih ẋ_0 + h² (½i² s + i³/6 j)
 
-    s is then accurate to O(h²) and x⃛ to O(h): what a second-order start needs (the correction of ẋ_0 and of a_0 is that
-    of `simulate`, there derived for the nonlinear scheme; here T = I).
+    s is then accurate to O(h²) and x⃛ to O(h): what a second-order start needs.
     """
     k, m = nodes[0].load.shape[0], nodes[0].level.shape[0]
     scale = mass_scale(mass)
@@ -79,12 +78,22 @@ def start(scheme: GeneralizedAlpha, mass, nodes: tuple[Node, Node, Node], x, rat
     first = nodes[0]
     left = first.load - mass @ s - first.damping @ rate - first.stiffness @ x
     _, lam = kkt_solve(mass, first.constraint_jacobian, left, jnp.zeros_like(first.level))
+    return started(
+        scheme, mass, first.constraint_jacobian, Motion(x, rate, s, lam, s + (scheme.alpha_m - scheme.alpha_f) * j), h
+    )
+
+
+def started(scheme: GeneralizedAlpha, mass, jacobian, exact: Motion, h) -> Motion:
+    """What the scheme starts from, given exact values and a = ẍ_0 + (α_m − α_f) h x⃛_0.
+
+    ẋ_0 receives h² P c, c = (1/6 − β − Δ/2) x⃛_0, Δ = α_m − α_f: as in `simulate` for the nonlinear scheme; here T = I.
+    """
     if not scheme.second_order_start:
-        return Motion(x, rate, s, lam, s)
+        return exact._replace(a=exact.acceleration)
     delta = scheme.alpha_m - scheme.alpha_f
-    missed = (1.0 / 6.0 - scheme.beta - delta / 2.0) * j
-    tangential, _ = kkt_solve(mass, first.constraint_jacobian, mass @ missed, jnp.zeros_like(first.level))
-    return Motion(x, rate + h * (missed - tangential), s, lam, s + delta * j)
+    missed = ((1.0 / 6.0 - scheme.beta - delta / 2.0) / delta) * (exact.a - exact.acceleration)
+    tangential, _ = kkt_solve(mass, jacobian, mass @ missed, jnp.zeros_like(exact.lam))
+    return exact._replace(rate=exact.rate + h * (missed - tangential))
 
 
 def advance(scheme: GeneralizedAlpha, mass, previous: Motion, node: Node, h) -> Motion:

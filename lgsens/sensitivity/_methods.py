@@ -67,12 +67,10 @@ class ContinuousDirect(AbstractSensitivity):
 
     Its derivative is second-order accurate, but not that of the numerical trajectory: for comparison with the
     paper, and for equations whose scheme cannot be linearized. It has an iteration matrix of its own. `grad` through
-    it is the transpose of the forward sweep. At least 2 steps.
+    it is the transpose of the forward sweep.
     """
 
     def trajectory(self, scheme, num_steps, state0, parameters):
-        if num_steps < 2:
-            raise ValueError("ContinuousDirect: `num_steps` must be at least 2, got 1; its start needs two nodes.")
         return _decoded(_continuous_trajectory(scheme, num_steps, state0, parameters))
 
 

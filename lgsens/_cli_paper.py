@@ -1,0 +1,296 @@
+"""`lgsens paper`: figures 2 and 4 of the paper, errors of sensitivities against the step size by all its methods."""
+
+import argparse
+import contextlib
+import itertools
+import json
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from lgsens import plotting
+from lgsens._cli_report import version
+from lgsens._cli_top import REFERENCE
+from lgsens._differentiate import Method, differentiate
+from lgsens._reference_methods import IndexReduced
+from lgsens.criteria import Criterion
+from lgsens.examples import PROBLEMS
+from lgsens.integrate import GeneralizedAlpha
+from lgsens.model import Model
+from lgsens.sensitivity import AdjointVariable, ContinuousAdjoint, ContinuousDirect, DirectDifferentiation
+
+METHODS: dict[str, Method] = {
+    "DDM of the scheme": DirectDifferentiation(),
+    "AVM of the scheme": AdjointVariable(),
+    "DDM of the equations of motion": ContinuousDirect(),
+    "AVM of the equations of motion": ContinuousAdjoint(),
+}
+# What else §7.2 does with accelerations in a criterion; the paper's Fig. 4b is made with the first of them.
+TREATMENTS: dict[str, Method] = {
+    "the same, v̇ differentiated": ContinuousAdjoint("derivatives"),
+    "the same, first-order equations": ContinuousAdjoint("first_order"),
+}
+RHO_INF = 0.9
+RTOL = 1e-12  # of the reference
+CALLS = 3  # of which the median time is taken, after the one that compiles
+SLOPE_STEPS = 3  # the finest ones, through which the slope is fitted
+COLUMNS = ("h", "gradient", "relative_error", "seconds", "seconds_of_first_call")
+
+
+class Curves(NamedTuple):
+    """One panel: the derivative of a criterion with respect to a parameter; `published`: its value from `source`."""
+
+    label: str
+    title: str
+    unit: str
+    criterion: str
+    parameter: str
+    t1: float
+    published: float
+    source: str
+    methods: Mapping[str, Method] = METHODS
+
+
+class Study(NamedTuple):
+    """One figure: panels whose numbers come from the same calls of `differentiate`."""
+
+    scene: str
+    build: Callable[[Mapping[str, Any]], Model]
+    parameters: dict[str, float]
+    criteria: dict[str, Criterion]
+    panels: dict[str, Curves]
+    num_steps: tuple[int, ...]
+    coarse: tuple[int, ...]
+    breaks: tuple[float, ...] = ()
+
+
+def _top() -> Study:
+    problem = PROBLEMS["spinning_top_brulls.l_1.0_reproduces_published_number"]
+    panel = Curves(
+        label="dPsi/dalpha_0",
+        title=r"spinning top, $d\Psi/d\alpha_0$",
+        unit="m^2 s/rad",
+        criterion="Psi",
+        parameter="alpha0",
+        t1=problem.t1,
+        published=REFERENCE,
+        source="lgsens.examples.spinning_top: Runge-Kutta and generalized-alpha, both converged",
+    )
+    return Study(
+        scene="spinning top, l = 1 m, alpha_0 = pi/4",
+        build=lambda p: problem.build({**problem.parameters, **p}),
+        parameters={"alpha0": problem.parameters["alpha0"]},
+        criteria=problem.criteria,
+        panels={"fig2": panel},
+        num_steps=(100, 200, 500, 1000, 2000),
+        coarse=(100, 200),
+    )
+
+
+def _quarter_car() -> Study:
+    problem = PROBLEMS["five_link_quarter_car"]
+    at_instant = PROBLEMS["five_link_quarter_car.at_0.3s"]
+    source = "tests/data/five_link_quarter_car.json: Bulirsch-Stoer of order 14 on quaternions in 80 bits"
+    # In eq. (50) l_max is subtracted, a number that no derivative sees.
+    spring = Curves(
+        label="dPsi_3/dc, Psi_3 = l_spring(0.3 s) - l_max",
+        title=r"(a) $d\Psi_3/dc$, spring length at 0.3 s",
+        unit="m/(N s/m)",
+        criterion="Psi_3",
+        parameter="c",
+        t1=at_instant.t1,
+        published=-5.145103818505668e-07,
+        source=source,
+    )
+    comfort = Curves(
+        label="dPsi_0/dk, Psi_0 = integral of the squared acceleration of the chassis",
+        title=r"(b) $d\Psi_0/dk$, $\int \dot v_z^2\,dt$ of the chassis over 2 s",
+        unit="m^2/s^3/(N/m)",
+        criterion="Psi_0",
+        parameter="k",
+        t1=problem.t1,
+        published=0.00010220048752247168,
+        source=source,
+        methods=METHODS | TREATMENTS,
+    )
+    return Study(
+        scene="five-link quarter-car",
+        build=lambda p: problem.build({**problem.parameters, **p}),
+        parameters={name: problem.parameters[name] for name in ("k", "c")},
+        criteria={"Psi_0": problem.criteria["Psi0"], "Psi_3": at_instant.criteria["spring_length(0.3)"]},
+        panels={"fig4a": spring, "fig4b": comfort},
+        # Multiples of 24: the end of the bump, 0.25 s, is a node of both horizons, and they share their programs.
+        num_steps=(240, 480, 960, 1920),
+        coarse=(120, 240),
+        breaks=(0.25,),
+    )
+
+
+STUDIES: dict[str, Callable[[], Study]] = {"fig2": _top, "fig4": _quarter_car}
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compute the chosen figures, write `paper.json` and the PNGs, print the tables."""
+    plotting.figure()  # asks for matplotlib now, not after minutes
+    names = [arguments.only] if arguments.only else list(STUDIES)
+    with _folder(arguments.out, arguments.overwrite) as out:
+        panels: dict[str, Any] = {}
+        for name in names:
+            study = STUDIES[name]()
+            found = measure(study, arguments.coarse, progress=not arguments.quiet)
+            if not arguments.quiet:
+                print("\n\n".join(table(panel) for panel in found.values()), end="\n\n")
+            plotting.save(
+                plotting.errors([_drawn(study, key, panel) for key, panel in found.items()]), out / f"{name}.png"
+            )
+            panels |= found
+        text = json.dumps(_document(panels, arguments), indent=2, allow_nan=False)
+        (out / "paper.json").write_text(text + "\n", encoding="utf-8")
+    if not arguments.quiet:
+        print(f"written to {out}: paper.json, {', '.join(f'{name}.png' for name in names)}")
+    return 0
+
+
+@contextlib.contextmanager
+def _folder(out: Path, overwrite: bool) -> Iterator[Path]:
+    """A new folder, or with `overwrite` one that may exist, and gone again after a failure."""
+    if out.exists() and not (overwrite and out.is_dir()):
+        remedy = "choose another --out DIR, or give --overwrite to replace the files in it"
+        raise ValueError(f"output directory {str(out)!r} exists already: {remedy}")
+    created = not out.exists()
+    out.mkdir(parents=True, exist_ok=True)  # asks for the right to write now, too
+    try:
+        yield out
+    except BaseException:
+        if created:
+            with contextlib.suppress(OSError):
+                out.rmdir()
+        raise
+
+
+def measure(study: Study, coarse: bool, progress: bool) -> dict[str, dict[str, Any]]:
+    """Everything about the panels of a study by their names, as for JSON."""
+    found = {}
+    for key, panel in study.panels.items():
+        method = IndexReduced(rtol=RTOL, breaks=study.breaks)
+        value = _gradient(study, panel, method, 1)  # the tolerances decide, not the number of steps
+        found[key] = {
+            "scene": study.scene,
+            "derivative": panel.label,
+            "unit": panel.unit,
+            "parameters": study.parameters,
+            "t1": panel.t1,
+            "rho_inf": RHO_INF,
+            "reference": {
+                "value": value,
+                "route": f"IndexReduced(rtol={RTOL:g}): diffrax on the index-reduced equations",
+                "published": panel.published,
+                "source": panel.source,
+                "relative_difference": abs(value / panel.published - 1),
+            },
+            "methods": {name: {key: [] for key in COLUMNS} for name in panel.methods},
+        }
+    methods = {name: method for panel in study.panels.values() for name, method in panel.methods.items()}
+    num_steps = study.coarse if coarse else study.num_steps
+    for name, count in _with_bar(list(itertools.product(methods, num_steps)), progress):
+        for key, panel in study.panels.items():
+            if name in panel.methods:
+                row = _timed(study, panel, methods[name], count, found[key]["reference"]["value"])
+                for column, number in zip(COLUMNS, row):
+                    found[key]["methods"][name][column].append(number)
+    for curve in (curve for panel in found.values() for curve in panel["methods"].values()):
+        h, error = np.log(curve["h"]), np.log(curve["relative_error"])
+        curve["slopes_between"] = (np.diff(error) / np.diff(h)).tolist()
+        curve["slope"] = float(np.polyfit(h[-SLOPE_STEPS:], error[-SLOPE_STEPS:], 1)[0])
+    return found
+
+
+def _gradient(study: Study, panel: Curves, method: Method, num_steps: int) -> float:
+    found = differentiate(
+        study.criteria,
+        study.build,
+        study.parameters,
+        t1=panel.t1,
+        num_steps=num_steps,
+        integrator=GeneralizedAlpha(RHO_INF),
+        method=method,
+    )
+    return float(found.gradient[panel.criterion][panel.parameter])
+
+
+def _timed(study: Study, panel: Curves, method: Method, num_steps: int, reference: float) -> tuple[float, ...]:
+    """One entry for each of `COLUMNS`."""
+    seconds, value = [], 0.0
+    for _ in range(1 + CALLS):
+        started = time.perf_counter()
+        value = _gradient(study, panel, method, num_steps)
+        seconds.append(time.perf_counter() - started)
+    error = abs(value / reference - 1)
+    return panel.t1 / num_steps, value, error, statistics.median(seconds[1:]), seconds[0]
+
+
+def _with_bar(runs: list[tuple[str, int]], progress: bool) -> Iterable[tuple[str, int]]:
+    """The runs, behind a bar if tqdm is installed."""
+    if progress:
+        with contextlib.suppress(ImportError):
+            from tqdm import tqdm
+
+            return tqdm(runs, unit="run", dynamic_ncols=True)
+    return runs
+
+
+def table(panel: Mapping[str, Any]) -> str:
+    """Reference, errors, slopes and times of one panel."""
+    reference, methods = panel["reference"], panel["methods"]
+    steps = next(iter(methods.values()))["h"]
+    lines = [
+        f"{panel['derivative']} [{panel['unit']}]",
+        f"{panel['scene']}, t = 0..{panel['t1']:g} s, rho_inf = {panel['rho_inf']}",
+        f"{'reference, ' + reference['route']:<75}{reference['value']:>24.15e}",
+        f"{'published, ' + reference['source']:<75}{reference['published']:>24.15e}",
+        f"{'relative difference':<75}{reference['relative_difference']:>24.1e}",
+    ]
+
+    def block(head: str, columns: Sequence[str], row: Callable[[Any], Sequence[str]]):
+        lines.extend(["", f"{head:<34}" + "".join(f"{column:>11}" for column in columns)])
+        lines.extend(f"{name:<34}" + "".join(f"{cell:>11}" for cell in row(curve)) for name, curve in methods.items())
+
+    sizes = [f"{h:.4g}" for h in steps]
+    block(
+        "relative error, h [s] =",
+        [*sizes, "slope"],
+        lambda c: [*(f"{error:.3e}" for error in c["relative_error"]), f"{c['slope']:.3f}"],
+    )
+    block(
+        "slope between this h and the last",
+        ["", *sizes[1:]],
+        lambda c: ["", *(f"{s:.3f}" for s in c["slopes_between"])],
+    )
+    block("time of one gradient [ms]", sizes, lambda c: [f"{1e3 * seconds:.1f}" for seconds in c["seconds"]])
+    return "\n".join(lines)
+
+
+def _drawn(study: Study, key: str, panel: Mapping[str, Any]) -> plotting.ErrorPanel:
+    series = {name: (curve["h"], curve["relative_error"]) for name, curve in panel["methods"].items()}
+    return plotting.ErrorPanel(study.panels[key].title, "relative error [–]", series)
+
+
+def _document(panels: Mapping[str, Any], arguments: argparse.Namespace) -> dict[str, Any]:
+    return {
+        "source": "Sonneville & Bruls (2014), Fig. 2 and Fig. 4",
+        "settings": {"only": arguments.only, "coarse": arguments.coarse},
+        "panels": panels,
+        "timing": f"median of {CALLS} calls after the first, which compiles; a program of fig4a serves fig4b, too",
+        "slope": f"least squares through the {SLOPE_STEPS} smallest steps",
+        "cores": os.cpu_count(),
+        "device": jax.devices()[0].platform,
+        "versions": {"python": platform.python_version()}
+        | {name: version(name) for name in ("lgsens", "jax", "jaxlib", "diffrax", "equinox", "numpy")},
+    }

@@ -1,0 +1,113 @@
+"""Every method against every other, through `differentiate`: four scenes, five kinds of criteria on each.
+
+The whole table, with costs, is printed by `benchmarks/methods.py`.
+"""
+
+import numpy as np
+import pytest
+
+import lgsens as lg
+from lgsens.examples import COMPARISON
+
+# The quarter-car compiles for minutes, and the chain shares all of its code with the four-bar.
+SCENES = ["top", "four_bar", *(pytest.param(name, marks=pytest.mark.slow) for name in ("chain", "quarter_car"))]
+REFERENCE = -0.0021318254254500  # dΨ/dα₀ of the paper's top, l = 1 m, converged by three routes
+
+
+def gradients(name, method, factor=1.0, **settings):
+    """p dΨ/dp of the five criteria, one row each; the problem's own number of steps times `factor`."""
+    problem = COMPARISON[name]
+    settings = {"num_steps": round(problem.num_steps * factor), "t1": problem.t1} | settings
+    found = lg.differentiate(problem.criteria, problem.build, problem.parameters, method=method, **settings)
+    assert found.method == method
+    size = {p: abs(value) or 0.01 for p, value in problem.parameters.items()}  # a hardpoint at 0: 10 mm
+    return np.array([[found.gradient[c][p] * size[p] for p in problem.parameters] for c in problem.criteria])
+
+
+def error(found, wanted):
+    """Of each criterion, relative to its largest effect."""
+    return np.abs(found - wanted).max(axis=1) / np.abs(wanted).max(axis=1)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_discrete_methods_are_the_derivative_of_the_scheme(name):
+    """DDM on the fly, AVM, autodiff of the loops, and sixth-order differences: one derivative."""
+    direct = gradients(name, lg.DirectDifferentiation(), 0.2)
+    # Round-off 2e-16 × 100 steps × condition 5e2 of the iteration matrix is 1e-11.
+    assert np.all(error(gradients(name, lg.AdjointVariable(), 0.2), direct) <= 1e-10)
+    # Newton's derivative is exact up to its last increment, and multipliers carry round-off / h².
+    exact = lg.GeneralizedAlpha(tolerance=1e-13)
+    assert np.all(error(gradients(name, lg.Autodiff(), 0.2, integrator=exact), direct) <= 1e-9)
+    # δ⁶ = 1e-18 of truncation, and 1e-14/δ of round-off in Ψ: 1e-11 of Ψ, which is up to 100 × its derivative
+    assert np.all(error(gradients(name, lg.FiniteDifferences(), 0.2), direct) <= 1e-9)
+
+
+@pytest.fixture(scope="module")
+def limits():
+    """The derivatives of the motion itself, by the index-reduced equations."""
+    found = {}
+
+    def of(name):
+        if name not in found:
+            breaks = (0.25,) if name == "quarter_car" else ()
+            found[name] = gradients(name, lg.IndexReduced(rtol=1e-11, breaks=breaks))
+        return found[name]
+
+    return of
+
+
+@pytest.mark.parametrize("name", ["four_bar", *SCENES[2:], pytest.param("top", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", [lg.ContinuousDirect(), lg.ContinuousAdjoint()], ids=["direct", "adjoint"])
+def test_continuous_methods_converge_to_the_motions_derivative(name, method, limits):
+    """Slope 2 ± 0.1 for all five kinds of criteria, with respect to hardpoints and lengths, too.
+
+    A criterion of velocities, the terminal term and a length: without the multipliers η₁, η₂ of the final conditions,
+    which the paper's (42)–(43) do not have, these would not converge.
+    """
+    errors = [error(gradients(name, method, factor), limits(name)) for factor in (1.0, 2.0)]
+    # (ω h)² of the fastest motion: the car's wheel hop, 80 rad/s × 1e-3 s; derivatives cancel by another digit at most
+    assert np.all(errors[1] <= 6e-3)
+    np.testing.assert_allclose(np.log2(errors[0] / errors[1]), 2.0, atol=0.1)
+
+
+def top_gradient(method, num_steps, **settings):
+    criterion = COMPARISON["top"].criteria["q"]
+    return lg.differentiate(
+        criterion, lg.examples.spinning_top, np.pi / 4, t1=1.0, num_steps=num_steps, method=method, **settings
+    ).gradient
+
+
+def test_continuous_adjoint_on_the_papers_top():
+    """Fig. 2: 1.2e-4, 2.9e-5, 7.3e-6 at h = 2e-3, 1e-3, 5e-4; all of it through π and ρ and the constraint's ν."""
+    method = lg.ContinuousAdjoint(None)
+    found = [abs(float(top_gradient(method, n)) / REFERENCE - 1.0) for n in (500, 1000, 2000)]
+    np.testing.assert_allclose(found, [1.2e-4, 2.9e-5, 7.3e-6], rtol=0.05)
+
+
+@pytest.mark.parametrize("treatment", ["derivatives", "first_order"])
+def test_other_treatments_of_accelerations(treatment, limits):
+    """The extra differential equations and the first-order formulation reach the same limit, at second order.
+
+    ρ∞ = 0.2: both differentiate v̇_n and λ_n twice, and with ρ∞ = 0.9 the start's transient, O(h²) (−ρ)^n n³, is O(1)
+    then for 30 steps (`benchmarks/methods.py` has the loss of order).
+    """
+    integrator = lg.GeneralizedAlpha(0.2)
+    problem = COMPARISON["four_bar"]
+    criteria = {name: problem.criteria[name] for name in ("vdot", "lam")}
+    rows = [list(problem.criteria).index(name) for name in criteria]
+    wanted = limits("four_bar")[rows]
+    errors = []
+    for num_steps in (250, 500, 1000):
+        found = lg.differentiate(
+            criteria,
+            problem.build,
+            problem.parameters,
+            t1=problem.t1,
+            num_steps=num_steps,
+            integrator=integrator,
+            method=lg.ContinuousAdjoint(treatment),
+        )
+        found = np.array([[found.gradient[c][p] * v for p, v in problem.parameters.items()] for c in criteria])
+        errors.append(error(found, wanted))
+    print(errors)
+    np.testing.assert_allclose(np.log2(errors[1] / errors[2]), 2.0, atol=0.1)
