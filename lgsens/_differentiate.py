@@ -136,8 +136,12 @@ def _index_reduced(criteria, build, start, p, t0, t1, method: IndexReduced):
     if start is not None:
         raise ValueError("IndexReduced starts from the consistent initial state of the model; leave `state0` out.")
     flat, unravel = ravel_pytree(p)
-    functions = _functions(criteria, build, jax.tree.structure(p), tuple(leaf.shape for leaf in jax.tree.leaves(p)))
-    found = integrate_index_reduced(*functions, flat, t0, t1, rtol=method.rtol, atol=method.atol, breaks=method.breaks)
+    rate, final, system = _functions(
+        criteria, build, jax.tree.structure(p), tuple(leaf.shape for leaf in jax.tree.leaves(p))
+    )
+    found = integrate_index_reduced(
+        rate, final, system, flat, t0, t1, rtol=method.rtol, atol=method.atol, breaks=method.breaks
+    )
     return tuple(found.value), tuple(unravel(row) for row in found.gradient)
 
 

@@ -55,8 +55,8 @@ class AbstractMotion(eqx.Module):
     def _multibody(self) -> MultibodySystem:
         if not isinstance(self.system, MultibodySystem):
             raise ValueError(
-                f"This motion is one of a {type(self.system).__name__}, which has no named bodies, joints or "
-                "forces; use the states themselves."
+                f"This is the motion of a {type(self.system).__name__}, which has no named bodies, joints or forces; "
+                "use `states` of a trajectory, `state` of an instant."
             )
         return self.system
 

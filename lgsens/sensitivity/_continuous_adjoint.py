@@ -95,9 +95,10 @@ def continuous_adjoint_sweep(
         ), of
 
     at = lambda n: jax.tree.map(lambda leaf: leaf[n], path)
-    ends = [node(at(-1 - i)) for i in range(3)]
-    final = _final_conditions(functional, p, system, at(-1), *ends[0])
-    motion = start(scheme, mass, tuple(end for end, _ in ends), final.mu, -final.mu_rate, h)
+    last, of_last = node(at(-1))
+    final = _final_conditions(functional, p, system, at(-1), last, of_last)
+    nodes = (last, node(at(-2))[0], node(at(-3))[0])
+    motion = start(scheme, mass, nodes, final.mu, -final.mu_rate, h)
     bar = final_cotangents(functional, p, system, at(-1), final.eta1, final.eta2)
     bar = accumulated(bar, functional, p, system, at(-1), motion.x, motion.lam, h / 2)
 

@@ -150,7 +150,7 @@ def differentiated(scheme: GeneralizedAlpha, values: Float[Array, "n d"], h) -> 
 def points(scheme: GeneralizedAlpha, states: State, t, h, *, derivatives: bool) -> Point:
     """All points of a trajectory, stacked."""
     if not derivatives:
-        none = (jnp.zeros((t.shape[0], 0), t.dtype),) * 2
-        return Point(states, t, none, none)
+        none = jnp.zeros((t.shape[0], 0), t.dtype)
+        return Point(states, t, (none, none), (none, none))
     y, lam_rate = differentiated(scheme, states.vdot, h), differentiated(scheme, states.lam, h)
     return Point(states, t, (y, differentiated(scheme, y, h)), (lam_rate, differentiated(scheme, lam_rate, h)))
