@@ -60,6 +60,44 @@ def test_convergence(constrained, tmp_path):
     assert is_png(plotting.save(fig, tmp_path / "a.png"))
 
 
+def test_errors_against_the_step_size(tmp_path):
+    h = np.array([8e-3, 4e-3, 2e-3])
+    left = plotting.ErrorPanel("left", "relative error [–]", {"one": (h, 3 * h**2), "two": (h, 2 * h**2)})
+    right = plotting.ErrorPanel("right", "error [N]", {"two": (h, h), "three": (h[1:], 5 * h[1:])}, order=1)
+    fig = plotting.errors([left, right], title="a title")
+    assert [axes.get_title() for axes in fig.axes] == ["left", "right"]
+    assert [axes.get_ylabel() for axes in fig.axes] == ["relative error [–]", "error [N]"]
+    assert fig.get_suptitle() == "a title"
+    for axes, panel in zip(fig.axes, (left, right)):
+        assert (axes.get_xscale(), axes.get_yscale(), axes.get_xlabel()) == ("log", "log", "step size h [s]")
+        *curves, slope = axes.lines
+        for curve, (name, (x, error)) in zip(curves, panel.series.items(), strict=True):
+            assert curve.get_label() == name
+            np.testing.assert_array_equal(curve.get_data(), (x, error))
+        # The line has the slope that it says, and is below all curves where h is least.
+        rise = np.diff(np.log(slope.get_ydata())) / np.diff(np.log(slope.get_xdata()))
+        np.testing.assert_allclose(rise, panel.order, rtol=1e-12)
+        assert slope.get_ydata()[0] < min(curve.get_ydata()[-1] for curve in curves)
+        assert [text.get_text() for text in axes.texts] == [f"slope {panel.order}"]
+    assert [text.get_text() for text in fig.axes[0].get_xticklabels()] == ["0.002", "0.004", "0.008"]
+    (legend,) = fig.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["one", "two", "three"]
+    # A name looks the same everywhere, and names differ without colours.
+    look = lambda line: (line.get_color(), line.get_marker(), line.get_markersize())
+    assert look(fig.axes[0].lines[1]) == look(fig.axes[1].lines[0])
+    markers = {style["marker"] for style in plotting.CURVES}
+    assert len(markers) == len(plotting.CURVES)
+    assert is_png(plotting.save(fig, tmp_path / "a.png"))
+
+
+def test_errors_over_time():
+    t = np.linspace(0, 20, 21)
+    panel = plotting.ErrorPanel("start", "error [N]", {"one": (t, np.exp(-t))}, order=None, horizontal="time [ms]")
+    (axes,) = plotting.errors([panel]).axes
+    assert (axes.get_xscale(), axes.get_yscale(), axes.get_xlabel()) == ("linear", "log", "time [ms]")
+    assert len(axes.lines) == 1 and not axes.texts
+
+
 def test_mechanism_of_the_quarter_car(car, tmp_path):
     fig = plotting.mechanism({"the car": car}, title="five links")
     (axes,) = fig.axes

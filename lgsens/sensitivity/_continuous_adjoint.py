@@ -34,7 +34,7 @@ from jaxtyping import Array, Float
 
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate import GeneralizedAlpha
-from lgsens.sensitivity._criterion_terms import Functional, Point, gradients
+from lgsens.sensitivity._criterion_terms import Functional, Point, gradients, near
 from lgsens.sensitivity._linear_alpha import Node, advance, start
 from lgsens.sensitivity._linearization import Parameters, pseudo_load_function
 
@@ -122,7 +122,8 @@ def continuous_adjoint_sweep(
 
 def _final_conditions(functional: Functional, p, system: AbstractSystem, point: Point, node: Node, of) -> Final:
     state, mass = point.state, system.mass_matrix()
-    g = gradients(lambda state: functional.final(p, system, state, point.t), system.group, state)
+    terminal = near(functional.final, p, system, state, point.t)
+    g = gradients(lambda state: terminal(p, system, state, point.t), system.group, state)
     jacobian_rate = along(system.constraint_jacobian, system, state)
     jacobian = node.constraint_jacobian
     mu, eta1 = constrained_solve(mass, jacobian, -(of.f_m + g.v).T, of.level.T)
@@ -135,10 +136,11 @@ def _final_conditions(functional: Functional, p, system: AbstractSystem, point: 
 def final_cotangents(functional: Functional, p, system: AbstractSystem, point: Point, eta1, eta2):
     """G_p + η₁ᵀ(Φ̇)_p + η₂ᵀΦ_p, on the numbers of the system and on p."""
     state = point.state
+    terminal = near(functional.final, p, system, state, point.t)
 
     def ends(system, p):
         rate = system.constraint_jacobian(state.q) @ state.v
-        return functional.final(p, system, state, point.t), rate, system.constraint(state.q)
+        return terminal(p, system, state, point.t), rate, system.constraint(state.q)
 
     values, pull_back = jax.vjp(ends, system, p)
     return jax.vmap(pull_back)((jnp.eye(values[0].shape[0], dtype=state.v.dtype), eta1.T, eta2.T))
@@ -147,10 +149,10 @@ def final_cotangents(functional: Functional, p, system: AbstractSystem, point: P
 def accumulated(bar, functional: Functional, p, system: AbstractSystem, point: Point, mu, nu, weight):
     """bar + weight (F_p + μᵀr_p + νᵀΦ_p), for every criterion."""
     state = point.state
+    rate = near(functional.rate, p, system, state, point.t)
 
     def integrand(system, p):
-        rate = functional.rate(p, system, state, point.t)
-        return rate, *pseudo_load_function(state)(system, point.t)
+        return rate(p, system, state, point.t), *pseudo_load_function(state)(system, point.t)
 
     values, pull_back = jax.vjp(integrand, system, p)
     one = weight * jnp.eye(values[0].shape[0], dtype=mu.dtype)

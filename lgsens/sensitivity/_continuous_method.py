@@ -10,8 +10,8 @@ from lgsens.integrate import GeneralizedAlpha
 from lgsens.sensitivity._continuous_adjoint import Cotangents, continuous_adjoint_sweep
 from lgsens.sensitivity._criterion_terms import (
     Functional,
+    OfState,
     derivative_terms,
-    of_state,
     plain_terms,
     points,
 )
@@ -65,6 +65,6 @@ class ContinuousAdjoint(eqx.Module):
         if self.accelerations == "first_order":
             return first_order_adjoint_sweep(path, parameters, functional, p)
         if self.accelerations == "state":
-            functional = Functional(*(of_state(f) if used else f for f, used in zip(functional, uses)))
+            functional = Functional(*(OfState(f) if used else f for f, used in zip(functional, uses)))
         terms = derivative_terms if derivatives else plain_terms
         return continuous_adjoint_sweep(scheme, path, parameters, functional, p, terms)

@@ -6,7 +6,7 @@ which a time integrator does not compute. Of the three ways that §7.2 lists, tw
 
 "state", the second of the paper: accelerations and multipliers are functions of the state, by eq. (41); then
     F̃(q, v, t, p) = F(q, v, v̇(q, v, t, p), λ(q, v, t, p), p) has F̃_M = 0 and F̃_λ = 0, and Ḟ̃_C is one derivative along
-    the motion (q ṽ, v̇, 1). The solve of eq. (41) is differentiated twice. Terminal terms may use v̇ and λ, too.
+    the motion (q ṽ, v̇, 1). Terminal terms may use v̇ and λ, too.
 
 "derivatives", the first of the paper: y = v̈ and z = v⃛ from additional differential equations, v̇' = y and y' = z, solved
     by the formulae (28)–(29) of generalized-α for y and z, started by finite differences; likewise for λ.
@@ -22,18 +22,28 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import AbstractSystem, State, accelerations
+from lgsens.dynamics import AbstractSystem, State, accelerations, kkt_solve
 from lgsens.integrate import GeneralizedAlpha
 from lgsens.sensitivity._linearization import Variation, cotangent_to_algebra
 
 Pointwise = Callable[[Any, AbstractSystem, State, Float[Array, ""]], Float[Array, " c"]]
 
 
+class OfState(NamedTuple):
+    """A function of (q, v, t, p): v̇ and λ in it are those of eq. (41)."""
+
+    function: Pointwise
+
+    def __call__(self, p, system: AbstractSystem, state: State, t) -> Float[Array, " c"]:
+        vdot, lam = accelerations(system, state.q, state.v, t)
+        return self.function(p, system, State(state.q, state.v, vdot, lam, vdot), t)
+
+
 class Functional(NamedTuple):
     """c criteria of eq. (31): F and G as functions of (p, system, state, t), each of shape (c,)."""
 
-    rate: Pointwise  # F
-    final: Pointwise  # G
+    rate: Pointwise | OfState  # F
+    final: Pointwise | OfState  # G
 
 
 class Point(NamedTuple):
@@ -63,14 +73,34 @@ def gradients(function: Callable[[State], Float[Array, " c"]], group, state: Sta
     return jax.vmap(lambda row: cotangent_to_algebra(group, state, row))(rows)
 
 
-def of_state(function: Pointwise) -> Pointwise:
-    """The function with v̇ and λ expressed through q and v, eq. (41)."""
+def near(function: Pointwise | OfState, p, system: AbstractSystem, state: State, t) -> Pointwise:
+    """What stands for a function in first derivatives at a state.
 
-    def reduced(p, system, state, t):
-        vdot, lam = accelerations(system, state.q, state.v, t)
-        return function(p, system, State(state.q, state.v, vdot, lam, vdot), t)
+    For an F of v̇(q, v, t, p) and λ(q, v, t, p), with Γ = B v̇ + Ḃ v and [[M, Bᵀ], [B, 0]] [a; b] = [F_v̇ᵀ; F_λᵀ], that is
 
-    return reduced
+        F(q, v, v̇, λ, p) − aᵀ r(q, v, v̇, λ, t, p) − bᵀ Γ(q, v, v̇, p),      v̇, λ, a, b fixed:
+
+    as r = 0 and Γ = 0 for every q, v and p, it has the value of F and its first derivatives. The solve of eq. (41)
+    is not differentiated; a second derivative differentiates v̇, λ, a and b, which are computed here.
+    """
+    if not isinstance(function, OfState):
+        return function
+    of = function.function
+    vdot, lam = accelerations(system, state.q, state.v, t)
+    at = lambda vdot, lam: of(p, system, State(state.q, state.v, vdot, lam, vdot), t)
+    f_vdot, f_lam = jax.jacrev(at, argnums=(0, 1))(vdot, lam)
+    jacobian = system.constraint_jacobian(state.q)
+    a, b = kkt_solve(system.mass_matrix(), jacobian, f_vdot.T, f_lam.T)
+
+    def fixed(p, system, state, t):
+        q, v = state.q, state.v
+        velocity = lambda q: system.constraint_jacobian(q) @ v
+        _, hidden = jax.jvp(velocity, (q,), (system.group.to_ambient(q, v),))
+        hidden = hidden + system.constraint_jacobian(q) @ vdot
+        residual = system.residual(q, v, vdot, lam, t)
+        return of(p, system, State(q, v, vdot, lam, vdot), t) - residual @ a - hidden @ b
+
+    return fixed
 
 
 def plain_terms(functional: Functional, p, system: AbstractSystem, point: Point) -> Terms:
@@ -78,11 +108,13 @@ def plain_terms(functional: Functional, p, system: AbstractSystem, point: Point)
     state, t, group = point.state, point.t, system.group
 
     def by_v(q, v, t):
-        at = lambda v: functional.rate(p, system, State(q, v, state.vdot, state.lam, state.a), t)
-        return jax.jacrev(at)(v)
+        moved = lambda v: State(q, v, state.vdot, state.lam, state.a)
+        rate = near(functional.rate, p, system, moved(v), t)
+        return jax.jacrev(lambda v: rate(p, system, moved(v), t))(v)
 
     f_v, rate_of_f_v = jax.jvp(by_v, (state.q, state.v, t), (*_along(group, state), jnp.ones_like(t)))
-    of = gradients(lambda state: functional.rate(p, system, state, t), group, state)
+    rate = near(functional.rate, p, system, state, t)
+    of = gradients(lambda state: rate(p, system, state, t), group, state)
     none, level = jnp.zeros_like(f_v), jnp.zeros((f_v.shape[0], state.lam.shape[0]), f_v.dtype)
     return Terms(
         load=rate_of_f_v - of.w - f_v @ group.ad(state.v), level=level, f_m=none, f_c=f_v, df_m=none, df_lam=level
