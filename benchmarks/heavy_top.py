@@ -2,8 +2,8 @@
 
 `python benchmarks/heavy_top.py [--out DIR]` prints the tables and writes heavy_top.json and heavy_top.png.
 
-The special start is that of Arnold, Brüls & Cardona (Numerische Mathematik 129, 2015). The exact motion is that of Euler's
-equations about the fixed point, by scipy's DOP853: no constraint, no multiplier and nothing of lgsens in it.
+The special start is that of Arnold, Brüls & Cardona (Numerische Mathematik 129, 2015). The exact motion is that of
+Euler's equations about the fixed point, by scipy's DOP853: no constraint, no multiplier and nothing of lgsens in it.
 """
 
 import argparse
@@ -30,7 +30,7 @@ FIRST = 20  # steps that count as the start
 SHOWN = 800  # steps of the run whose start is drawn
 RHO_INF = 0.9
 RTOL = 1e-13
-STARTS = {"second-order start": True, "a_0 = v'_0": False}
+STARTS = {"second-order start": True, "a_0 = vdot_0": False}
 UNITS = {"position": "m", "rotation": "rad", "velocity": "m/s", "angular velocity": "rad/s", "multiplier": "N"}
 
 

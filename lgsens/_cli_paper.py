@@ -34,8 +34,8 @@ METHODS: dict[str, Method] = {
 }
 # What else §7.2 does with accelerations in a criterion; the paper's Fig. 4b is made with the first of them.
 TREATMENTS: dict[str, Method] = {
-    "the same, v̇ differentiated": ContinuousAdjoint("derivatives"),
-    "the same, first-order equations": ContinuousAdjoint("first_order"),
+    "AVM, differentiated accelerations": ContinuousAdjoint("derivatives"),
+    "AVM, first-order equations": ContinuousAdjoint("first_order"),
 }
 RHO_INF = 0.9
 RTOL = 1e-12  # of the reference

@@ -167,20 +167,25 @@ def convergence(history: Any, *, tolerance: float, best: int | None = None, obje
 
 
 def errors(panels: Sequence[ErrorPanel], title: str = "") -> "Figure":
-    """Errors on a logarithmic axis, panels side by side, with a line of the slope that the order predicts.
+    """Errors on a logarithmic axis, panels side by side, four or more in two rows, with a line of the order's slope.
 
     A name looks the same in every panel, and is in one legend below them.
 
     Arguments:
-        panels: what to draw, from left to right.
+        panels: what to draw, at least one.
         title: over the figure.
 
     Raises `ImportError` without matplotlib.
     """
-    fig = figure(1.6 + 4.6 * len(panels), 5.2)
+    rows = 1 if len(panels) < 4 else 2
+    columns = -(-len(panels) // rows)
+    fig = figure(1.6 + 4.6 * columns, 1.0 + 4.2 * rows)
+    all_axes = fig.subplots(rows, columns, squeeze=False).ravel()
+    for axes in all_axes[len(panels) :]:
+        axes.remove()
     names = list(dict.fromkeys(name for panel in panels for name in panel.series))
     handles: dict[str, Any] = {}
-    for axes, panel in zip(fig.subplots(1, len(panels), squeeze=False)[0], panels):
+    for axes, panel in zip(all_axes, panels):
         for name, (x, error) in panel.series.items():
             style = CURVES[names.index(name) % len(CURVES)]
             (handles[name],) = axes.plot(np.asarray(x), np.asarray(error), label=name, **style)
@@ -189,10 +194,8 @@ def errors(panels: Sequence[ErrorPanel], title: str = "") -> "Figure":
         axes.set(title=panel.title, xlabel=panel.horizontal, ylabel=panel.label)
         if panel.order is not None:
             _slope(axes, panel, panel.order)
-    columns = min(len(names), 2 * len(panels))
-    fig.legend(
-        handles=list(handles.values()), loc="outside lower center", ncols=columns, frameon=False, handlelength=3.5
-    )
+    style = {"ncols": min(len(names), 2 * columns), "frameon": False, "handlelength": 3.5}
+    fig.legend(handles=list(handles.values()), loc="outside lower center", **style)
     if title:
         fig.suptitle(title)
     return fig

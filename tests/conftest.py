@@ -5,6 +5,7 @@ Nearly all their time is compilation, so XLA's costly optimizations are off, as 
 """
 
 import jax
+import pytest
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -17,3 +18,10 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     jax.config.update("jax_disable_most_optimizations", not config.getoption("--optimized"))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_programs():
+    """Compiled programs hold memory maps, of which a process has only so many; hardly any serves two modules."""
+    yield
+    jax.clear_caches()

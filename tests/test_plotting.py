@@ -90,6 +90,14 @@ def test_errors_against_the_step_size(tmp_path):
     assert is_png(plotting.save(fig, tmp_path / "a.png"))
 
 
+def test_many_errors_are_in_two_rows():
+    panels = [plotting.ErrorPanel(f"{i}", "error [N]", {"one": ([1e-3, 2e-3], [1.0, 4.0])}) for i in range(5)]
+    fig = plotting.errors(panels)
+    assert [axes.get_title() for axes in fig.axes] == ["0", "1", "2", "3", "4"]
+    columns = [axes.get_subplotspec().colspan.start for axes in fig.axes]
+    assert columns == [0, 1, 2, 0, 1]
+
+
 def test_errors_over_time():
     t = np.linspace(0, 20, 21)
     panel = plotting.ErrorPanel("start", "error [N]", {"one": (t, np.exp(-t))}, order=None, horizontal="time [ms]")

@@ -156,8 +156,8 @@ def _terminal(terminal: Callable[[Any, Any], Float[Array, ""]]) -> Criterion:
 
 
 def _kinetic_energy_of_crank(s, p):
-    rate = lambda body: s.body(body).angular_velocity[2]
-    return (p["J1"] * rate("crank") ** 2 + p["m2"] * s.body("slider").velocity[0] ** 2 + p["J2"] * rate("rod") ** 2) / 2
+    crank, conrod = (s.body(name).angular_velocity[2] for name in ("crank", "conrod"))
+    return (p["J1"] * crank**2 + p["m2"] * s.body("slider").velocity[0] ** 2 + p["J2"] * conrod**2) / 2
 
 
 def _distance_of_coupler(s, p):

@@ -42,25 +42,25 @@ def slider_crank(a=0.5, J1=1.0, m2=1.0, J2=2.0, k=1.0, c=1.0, l0=1.0, F=1.0) -> 
     return Model(
         bodies={
             "crank": RigidBody(mass=_CRANK_MASS, inertia=(J1, J1, J1)),
-            "rod": RigidBody(mass=m2 / 2, inertia=(J2, J2, J2), position=slider_pin),
+            "conrod": RigidBody(mass=m2 / 2, inertia=(J2, J2, J2), position=slider_pin),
             "slider": RigidBody(mass=m2 / 2, inertia=(J2, J2, J2), position=slider_pin),
         },
         joints={
             "pivot": RevoluteJoint(None, "crank", at=pivot, axis=e_z),
-            "crank_pin": SphericalJoint("crank", "rod", at=crank_pin),
-            "slider_pin": UniversalJoint("rod", "slider", at=slider_pin, axis_a=e_z, axis_b=e_y),
+            "crank_pin": SphericalJoint("crank", "conrod", at=crank_pin),
+            "slider_pin": UniversalJoint("conrod", "slider", at=slider_pin, axis_a=e_z, axis_b=e_y),
             "guide": PrismaticJoint(None, "slider", at=slider_pin, axis=e_x),
         },
         forces={
             "spring": SpringDamper(
                 "crank",
-                "rod",
+                "conrod",
                 at_a=crank_pin / 2,
                 at_b=(crank_pin + slider_pin) / 2,
                 stiffness=number(k),
                 damping=number(c),
                 free_length=number(l0),
             ),
-            "push": AppliedForce("rod", at=2 * slider_pin - crank_pin, force=vector(F, 0.0, 0.0)),
+            "push": AppliedForce("conrod", at=2 * slider_pin - crank_pin, force=vector(F, 0.0, 0.0)),
         },
     )

@@ -140,7 +140,7 @@ class InPlane(AbstractClosedFormConstraint):
 
 
 class Distance(AbstractClosedFormConstraint):
-    """Two body-fixed points keep their distance: Φ = |d| − L; λ is the compression of the rod [N].
+    """Two body-fixed points keep their distance: Φ = |d| − L; λ is the tension of the rod [N].
 
     With n = d/|d|: B = nᵀD and D_q(Bᵀλ) = λ (Dᵀ (I − n nᵀ)/|d| D + D_q(Dᵀn)|_n).
     """

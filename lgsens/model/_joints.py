@@ -251,7 +251,7 @@ class DistanceJoint(AbstractJoint):
         length: length of the rod [m], shape (); None: the distance of the two points in the reference
             configuration. With another length the mechanism is assembled before it moves.
 
-    The multiplier is the compression of the rod [N]. Raises `ValueError` for a wrong shape, a length
+    The multiplier is the tension of the rod [N]. Raises `ValueError` for a wrong shape, a length
     ≤ 0, or coinciding ends. Source: Haug (1989), §9.4.
     """
 

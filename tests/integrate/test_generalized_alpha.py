@@ -9,28 +9,11 @@ import numpy as np
 import pytest
 
 import lgsens as lg
+from lgsens.examples import heavy_top
 from lgsens.dynamics import State
 from lgsens.integrate import integrate
 
 HEAVY = json.loads((Path(__file__).parents[1] / "data" / "heavy_top_bruls2012.json").read_text())
-
-
-def heavy_top():
-    p = HEAVY["params"]
-    spin = np.array([0.0, p["Om2"], p["Om3"]])
-    arm = np.array([0.0, p["l"], 0.0])
-    body = lg.RigidBody(
-        mass=p["m"],
-        inertia=(p["J11"], p["J22"], p["J33"]),
-        position=arm,
-        velocity=np.cross(spin, arm),
-        angular_velocity=spin,
-    )
-    return lg.Model(
-        bodies={"top": body},
-        joints={"pivot": lg.SphericalJoint(None, "top", at=(0.0, 0.0, 0.0))},
-        forces={"gravity": lg.Gravity((0.0, 0.0, -p["g"]))},
-    )
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.9, 0.999])

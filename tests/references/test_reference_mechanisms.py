@@ -45,7 +45,7 @@ def test_motion_of_the_pendulum():
 
 def observe_slider_crank(trajectory):
     """(q, x, p) of the source, its rates and its two multipliers, which are the force in the crank's pin."""
-    crank, rod, slider = (trajectory.body(name) for name in ("crank", "rod", "slider"))
+    crank, rod, slider = (trajectory.body(name) for name in ("crank", "conrod", "slider"))
     start = -jnp.arcsin(PROBLEMS["slider_crank_sundials"].parameters["a"])
     angles = (jnp.pi / 2 + turned(crank.orientation), start + turned(rod.orientation))
     return {
@@ -79,7 +79,7 @@ def test_the_slider_crank_moves_in_its_plane():
     assert jacobian.shape == (17, 18)
     assert np.linalg.matrix_rank(jacobian) == 17
     trajectory = runs("slider_crank_sundials")[1].trajectory
-    for name in ("crank", "rod", "slider"):
+    for name in ("crank", "conrod", "slider"):
         body = trajectory.body(name)
         # Newton leaves the square of its tolerance of 1e-10; round-off of 1000 steps is what there is
         assert float(jnp.abs(body.position[:, 2]).max()) <= 1e-13

@@ -3,6 +3,10 @@
 The whole table, with costs, is printed by `benchmarks/methods.py`.
 """
 
+import importlib
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -68,6 +72,27 @@ def test_continuous_methods_converge_to_the_motions_derivative(name, method, lim
     # (ω h)² of the fastest motion: the car's wheel hop, 80 rad/s × 1e-3 s; derivatives cancel by another digit at most
     assert np.all(errors[1] <= 6e-3)
     np.testing.assert_allclose(np.log2(errors[0] / errors[1]), 2.0, atol=0.1)
+
+
+@pytest.mark.slow
+def test_final_conditions_as_printed_do_not_converge(monkeypatch, limits):
+    """Without η₁ᵀ(Φ̇)_p + η₂ᵀΦ_p an error remains that no step size removes, but for a criterion of positions."""
+    module = importlib.import_module("lgsens.sensitivity._continuous_adjoint")
+    original = module.final_cotangents
+
+    def as_printed(functional, p, system, point, eta1, eta2):
+        return original(functional, p, system, point, jnp.zeros_like(eta1), jnp.zeros_like(eta2))
+
+    monkeypatch.setattr(module, "final_cotangents", as_printed)
+    jax.clear_caches()
+    errors = [error(gradients("four_bar", lg.ContinuousAdjoint(), factor), limits("four_bar")) for factor in (1.0, 2.0)]
+    jax.clear_caches()
+    criteria = list(COMPARISON["four_bar"].criteria)
+    for name, coarse, fine in zip(criteria, *errors):
+        if name == "q":
+            assert abs(np.log2(coarse / fine) - 2.0) <= 0.1
+        else:
+            assert fine > 1e-2 and abs(fine / coarse - 1.0) <= 0.1, name
 
 
 def top_gradient(method, num_steps, **settings):
