@@ -108,7 +108,7 @@ def differentiate(
     if isinstance(method, ContinuousAdjoint) and num_steps < ContinuousAdjoint.LEAST_STEPS:
         raise ValueError(
             f"ContinuousAdjoint: `num_steps` must be at least {ContinuousAdjoint.LEAST_STEPS}, got {num_steps}; its "
-            "start needs three points. AdjointVariable() has no such limit."
+            "start needs four points. AdjointVariable() has no such limit."
         )
     names = tuple(f"Criterion {jax.tree_util.keystr(path)}".strip() for path, _ in paths)
     if isinstance(method, IndexReduced):

@@ -97,7 +97,7 @@ def continuous_adjoint_sweep(
     at = lambda n: jax.tree.map(lambda leaf: leaf[n], path)
     last, of_last = node(at(-1))
     final = _final_conditions(functional, p, system, at(-1), last, of_last)
-    nodes = (last, node(at(-2))[0], node(at(-3))[0])
+    nodes = (last, node(at(-2))[0], node(at(-3))[0], node(at(-4))[0])
     motion = start(scheme, mass, nodes, final.mu, -final.mu_rate, h)
     bar = final_cotangents(functional, p, system, at(-1), final.eta1, final.eta2)
     bar = accumulated(bar, functional, p, system, at(-1), motion.x, motion.lam, h / 2)

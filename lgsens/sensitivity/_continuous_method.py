@@ -31,7 +31,8 @@ class ContinuousAdjoint(eqx.Module):
         accelerations: "state" expresses v̇ and λ through q and v (eq. 41; F and G may use both); "derivatives"
             computes v̈ and v⃛ by additional differential equations; "first_order" solves the first-order adjoint
             equations of Bestle & Seybold (1992), extended to the Lie group, by BDF2; None leaves eqs. (39)–(43) as
-            they are, for criteria without accelerations. Criteria that use neither v̇ nor λ are the same in "state",
+            they are, for criteria without accelerations. Only "state" keeps second order for F of v̇ and λ; it
+            also costs most. Criteria that use neither v̇ nor λ are the same in "state",
             "derivatives" and None, and cost the same.
 
     At least 4 steps. Raises `ValueError` for another treatment. Source: Sonneville & Brüls (2014), §7.

@@ -12,6 +12,10 @@ which a time integrator does not compute. Of the three ways that §7.2 lists, tw
     by the formulae (28)–(29) of generalized-α for y and z, started by finite differences; likewise for λ.
 
 The third, "first_order", needs no derivative of F and is a sweep of its own (`_first_order_adjoint.py`).
+
+Only "state" is second order throughout. v̇_n and λ_n of generalized-α carry O(h²) (−ρ)^n of the start, and the other two
+differentiate them twice, "derivatives" in z, "first_order" through B μ = −F_λᵀ in ν: O(1) in the first steps, an O(h)
+of the gradient. With ρ∞ near 1 the filters amplify this by n³ (`benchmarks/methods.py`).
 """
 
 from collections.abc import Callable

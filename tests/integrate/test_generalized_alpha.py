@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import lgsens as lg
-from lgsens.examples import heavy_top
 from lgsens.dynamics import State
+from lgsens.examples import heavy_top
 from lgsens.integrate import integrate
 
 HEAVY = json.loads((Path(__file__).parents[1] / "data" / "heavy_top_bruls2012.json").read_text())
