@@ -194,7 +194,7 @@ def errors(panels: Sequence[ErrorPanel], title: str = "") -> "Figure":
         axes.set(title=panel.title, xlabel=panel.horizontal, ylabel=panel.label)
         if panel.order is not None:
             _slope(axes, panel, panel.order)
-    style = {"ncols": min(len(names), 2 * columns), "frameon": False, "handlelength": 3.5}
+    style = {"ncols": -(-len(names) // 2) if len(names) > 3 else len(names), "frameon": False, "handlelength": 3.5}
     fig.legend(handles=list(handles.values()), loc="outside lower center", **style)
     if title:
         fig.suptitle(title)
