@@ -22,7 +22,7 @@ LIMIT = "#b3262e"
 CURVES: tuple[dict[str, Any], ...] = (
     {"color": "#1b62a5", "marker": "o", "markersize": 11, "fillstyle": "none", "linestyle": "-", "linewidth": 2.4},
     {"color": "#d9822b", "marker": "s", "markersize": 4.5, "fillstyle": "full", "linestyle": "--", "linewidth": 1.2},
-    {"color": "#3a8a4d", "marker": "D", "markersize": 8, "fillstyle": "none", "linestyle": "-", "linewidth": 1.6},
+    {"color": "#3a8a4d", "marker": "D", "markersize": 8, "fillstyle": "none", "linestyle": "-.", "linewidth": 1.4},
     {"color": "#7a4b9a", "marker": "^", "markersize": 5.5, "fillstyle": "full", "linestyle": "--", "linewidth": 1.2},
     {"color": "#3c3c3c", "marker": "v", "markersize": 5, "fillstyle": "none", "linestyle": ":", "linewidth": 0.8},
     {"color": "#b3262e", "marker": "x", "markersize": 5, "fillstyle": "full", "linestyle": ":", "linewidth": 0.8},
