@@ -205,7 +205,8 @@ def measure(study: Study, coarse: bool, progress: bool) -> dict[str, dict[str, A
                 row = _timed(study, panel, methods[name], count, found[key]["reference"]["value"])
                 for column, number in zip(COLUMNS, row):
                     found[key]["methods"][name][column].append(number)
-        jax.clear_caches()  # a program of the quarter-car takes 6,000 of the 65,530 memory maps that Linux allows
+        if count == num_steps[-1]:
+            jax.clear_caches()  # a program of the quarter-car takes 6,000 of the 65,530 memory maps that Linux allows
     for curve in (curve for panel in found.values() for curve in panel["methods"].values()):
         h, error = np.log(curve["h"]), np.log(curve["relative_error"])
         curve["slopes_between"] = (np.diff(error) / np.diff(h)).tolist()
