@@ -1,7 +1,6 @@
 """`lgsens optimize quarter-car`: the suspension of the paper's §9, optimized, checked and drawn."""
 
 import argparse
-import contextlib
 import json
 import time
 from pathlib import Path
@@ -11,7 +10,7 @@ import jax
 import numpy as np
 
 from lgsens import plotting
-from lgsens._cli_report import document, table
+from lgsens._cli_report import document, output_folder, table
 from lgsens.dynamics import RESULTS
 from lgsens.examples import Response, SuspensionDesign
 from lgsens.optimize import GradientCheck, OptimizationResult, check_gradient, minimize
@@ -34,10 +33,11 @@ class Outcome(NamedTuple):
 
 def run(arguments: argparse.Namespace) -> int:
     """Optimize, write `result.json` and the figures, print a table; 1 if no design met the constraints."""
-    out: Path = arguments.out
-    if out.exists() and not (arguments.overwrite and out.is_dir()):
-        remedy = "choose another --out DIR, or give --overwrite to replace the files in it"
-        raise ValueError(f"output directory {str(out)!r} exists already: {remedy}")
+    with output_folder(arguments.out, arguments.overwrite) as out:
+        return _run(arguments, out)
+
+
+def _run(arguments: argparse.Namespace, out: Path) -> int:
     num_steps = round(arguments.t1 / arguments.dt)
     if num_steps < 1 or abs(num_steps * arguments.dt / arguments.t1 - 1) > 1e-6:
         raise ValueError(
@@ -51,15 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
         t1=arguments.t1,
         num_steps=num_steps,
     )
-    created = not out.exists()
-    out.mkdir(parents=True, exist_ok=True)  # asks for the right to write now, too
-    try:
-        outcome = _optimize(design, arguments.steps, progress=not arguments.quiet)
-    except BaseException:
-        if created:
-            with contextlib.suppress(OSError):
-                out.rmdir()
-        raise
+    outcome = _optimize(design, arguments.steps, progress=not arguments.quiet)
     settings = {name: value for name, value in vars(arguments).items() if name not in ("run", "command")}
     text = json.dumps(document(outcome, settings, TOLERANCE), indent=2, default=str, allow_nan=False)
     (out / "result.json").write_text(text + "\n", encoding="utf-8")

@@ -8,15 +8,14 @@ import os
 import platform
 import statistics
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from lgsens import plotting
-from lgsens._cli_report import version
+from lgsens._cli_report import output_folder, version
 from lgsens._cli_top import REFERENCE
 from lgsens._differentiate import Method, differentiate
 from lgsens._reference_methods import IndexReduced
@@ -140,7 +139,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Compute the chosen figures, write `paper.json` and the PNGs, print the tables."""
     plotting.figure()  # asks for matplotlib now, not after minutes
     names = [arguments.only] if arguments.only else list(STUDIES)
-    with _folder(arguments.out, arguments.overwrite) as out:
+    with output_folder(arguments.out, arguments.overwrite) as out:
         panels: dict[str, Any] = {}
         for name in names:
             study = STUDIES[name]()
@@ -156,23 +155,6 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.quiet:
         print(f"written to {out}: paper.json, {', '.join(f'{name}.png' for name in names)}")
     return 0
-
-
-@contextlib.contextmanager
-def _folder(out: Path, overwrite: bool) -> Iterator[Path]:
-    """A new folder, or with `overwrite` one that may exist, and gone again after a failure."""
-    if out.exists() and not (overwrite and out.is_dir()):
-        remedy = "choose another --out DIR, or give --overwrite to replace the files in it"
-        raise ValueError(f"output directory {str(out)!r} exists already: {remedy}")
-    created = not out.exists()
-    out.mkdir(parents=True, exist_ok=True)  # asks for the right to write now, too
-    try:
-        yield out
-    except BaseException:
-        if created:
-            with contextlib.suppress(OSError):
-                out.rmdir()
-        raise
 
 
 def measure(study: Study, coarse: bool, progress: bool) -> dict[str, dict[str, Any]]:

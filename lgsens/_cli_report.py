@@ -1,7 +1,10 @@
-"""What `lgsens optimize` says: the document of `result.json` and the table on the terminal."""
+"""What commands share, and what `lgsens optimize` says: the document of `result.json` and the table."""
 
+import contextlib
 import platform
+from collections.abc import Iterator
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +16,23 @@ CONSTRAINTS = (
     ("maximum spring length", "spring_length", "maximum_spring_length", "m"),
 )
 UNITS = {"stiffness": "N/m", "damping": "N s/m", "hardpoints": "m"}
+
+
+@contextlib.contextmanager
+def output_folder(out: Path, overwrite: bool) -> Iterator[Path]:
+    """A new folder, or with `overwrite` one that may exist, and gone again after a failure."""
+    if out.exists() and not (overwrite and out.is_dir()):
+        remedy = "choose another --out DIR, or give --overwrite to replace the files in it"
+        raise ValueError(f"output directory {str(out)!r} exists already: {remedy}")
+    created = not out.exists()
+    out.mkdir(parents=True, exist_ok=True)  # asks for the right to write now, too
+    try:
+        yield out
+    except BaseException:
+        if created:
+            with contextlib.suppress(OSError):
+                out.rmdir()
+        raise
 
 
 def version(distribution: str = "lgsens") -> str:

@@ -25,6 +25,7 @@ def coarse(tmp_path_factory):
     return status, out, json.loads((out / "paper.json").read_text(encoding="utf-8"))
 
 
+@pytest.mark.slow  # nine compilations of the top
 def test_all_four_methods_are_of_second_order(coarse):
     status, out, document = coarse
     assert status == 0
@@ -45,6 +46,7 @@ def test_all_four_methods_are_of_second_order(coarse):
     assert avm["gradient"] == pytest.approx(ddm["gradient"], rel=1e-12)  # one operator and its transpose
 
 
+@pytest.mark.slow  # nine compilations of the top
 def test_the_reference_is_computed_and_compared(coarse):
     _, _, document = coarse
     reference = document["panels"]["fig2"]["reference"]
@@ -55,6 +57,7 @@ def test_the_reference_is_computed_and_compared(coarse):
     assert "IndexReduced" in reference["route"] and reference["source"]
 
 
+@pytest.mark.slow  # nine compilations of the top
 def test_the_document_says_with_what_and_not_by_whom(coarse):
     _, out, document = coarse
     assert set(document["versions"]) >= {"python", "jax", "jaxlib", "numpy", "lgsens"}
@@ -66,6 +69,7 @@ def test_the_document_says_with_what_and_not_by_whom(coarse):
         assert private not in text
 
 
+@pytest.mark.slow  # nine compilations of the top
 def test_the_table_shows_the_numbers(coarse):
     _, _, document = coarse
     panel = document["panels"]["fig2"]
@@ -78,6 +82,7 @@ def test_the_table_shows_the_numbers(coarse):
         assert times.split() == [f"{1e3 * seconds:.1f}" for seconds in curve["seconds"]]
 
 
+@pytest.mark.slow  # nine compilations of the top
 def test_figures_and_table_of_any_study(coarse, tmp_path, capsys, monkeypatch):
     """The rest of the command with numbers in place of simulations: progress, tables, both files."""
     _, _, document = coarse
@@ -131,6 +136,7 @@ def test_bad_arguments_give_one_line(arguments, message, capsys):
     assert message in err and err.count("\n") == 1 and text == ""
 
 
+@pytest.mark.slow  # nine compilations of the top
 def test_an_existing_directory_is_left_alone(coarse, capsys):
     _, out, _ = coarse
     before = (out / "paper.json").read_bytes()

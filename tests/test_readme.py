@@ -1,4 +1,4 @@
-"""README.md: its example runs and gives what it says; its two commands are there."""
+"""README.md: its examples run and give what they say; its two commands are there."""
 
 import re
 from pathlib import Path
@@ -8,8 +8,9 @@ import numpy as np
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
 
-def test_example():
-    (source,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+def test_examples():
+    """One after the other, as a reader would."""
+    source = "\n".join(re.findall(r"```python\n(.*?)```", README, re.DOTALL))
     names: dict = {}
     exec(compile(source, "README.md", "exec"), names)
     jax, psi, top = names["jax"], names["psi"], names["top"]
@@ -18,6 +19,10 @@ def test_example():
     assert abs(gradient - printed) < 1e-8  # printed with eight decimals, cut
     assert names["g"].joints["pivot"].at.shape == (3,)
     assert float(np.abs(names["g"].bodies["top"].inertia).min()) > 0
+    by_jax = float(jax.grad(lambda length: psi(top(0.7, length=length)))(1.0))
+    # the same scheme in two programs, 1000 steps
+    np.testing.assert_allclose(names["found"].gradient["side"]["length"], by_jax, rtol=1e-9)
+    assert np.isfinite(names["found"].value["force"])
 
 
 def test_commands():

@@ -99,6 +99,7 @@ def temporary_memory(method, num_steps):
     return analysis.temp_size_in_bytes
 
 
+@pytest.mark.slow  # three compilations
 def test_direct_differentiation_stores_no_trajectory():
     """On the fly: what grows with the steps is Newton's statistics, four numbers a step, not the 33 of a state."""
     grown = temporary_memory(lg.DirectDifferentiation(), 2000) - temporary_memory(lg.DirectDifferentiation(), 1000)
