@@ -18,7 +18,7 @@ from lgsens._reference_methods import STENCIL, FiniteDifferences, IndexReduced
 from lgsens._simulate import as_system, begin, check_integrator, interval, outcome, run
 from lgsens._validate import as_count, as_float
 from lgsens.criteria import Criterion
-from lgsens.dynamics import RESULTS, AbstractSystem, State, independence
+from lgsens.dynamics import RESULTS, AbstractSystem, State, is_redundant
 from lgsens.integrate import GeneralizedAlpha
 from lgsens.model import Model
 from lgsens.sensitivity import (
@@ -226,8 +226,7 @@ def _differentiate_jit(criteria, names, build, start, p, t0, t1, num_steps, inte
     of_multipliers = [name for name, use in zip(names, uses) if use.multipliers]
     if of_multipliers and found.details is not None:
         note = f"{' and '.join(of_multipliers)}: multipliers are used."
-        eps = jnp.finfo(flat.dtype).eps
-        redundant = independence(found.details["jacobian"]) < eps**0.6  # as for an initial state of our own
+        redundant = is_redundant(found.details["jacobian"])  # a given state0 has not been asked
         result = jnp.where(redundant, RESULTS.redundant_constraints, result).astype(jnp.int32)
     gradient = tuple(unravel(row) for row in found.gradient)
     return tuple(found.value), gradient, result, found.details, system.constraint_names, note

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.dynamics._results import RESULTS
 from lgsens.dynamics._state import State
@@ -131,6 +131,14 @@ def independence(jacobian: Float[Array, "m k"]) -> Float[Array, ""]:
     return jnp.min(jnp.abs(jnp.diagonal(jnp.linalg.qr(unit.T, mode="r"))))
 
 
+def is_redundant(jacobian: Float[Array, "m k"]) -> Bool[Array, ""]:
+    """Whether rows of B are linearly dependent.
+
+    Redundant rows leave |R_ii| at round-off, independent ones near a singular configuration well above it.
+    """
+    return independence(lax.stop_gradient(jacobian)) < jnp.finfo(jacobian.dtype).eps ** 0.6
+
+
 def initial_state(system: AbstractSystem, t) -> Initial:
     """q, v, v̇, λ consistent with the constraints at position, velocity and acceleration level; a = v̇.
 
@@ -143,8 +151,7 @@ def initial_state(system: AbstractSystem, t) -> Initial:
     vdot, lam, vddot = acceleration_and_jerk(system, q, v, t)
     state = State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
     dtype = v.dtype
-    # Redundant rows leave |R_ii| at round-off, independent ones near a singular configuration well above it.
-    redundant = independence(lax.stop_gradient(system.constraint_jacobian(q))) < jnp.finfo(dtype).eps ** 0.6
+    redundant = is_redundant(system.constraint_jacobian(q))
     length = jnp.max(system.coordinate_scale())
     largest = jnp.max(jnp.abs(violation), initial=0.0)
     assembled = largest <= 1e3 * jnp.finfo(dtype).eps * jnp.maximum(length, 1.0)  # NaN is not assembled

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 
 from lgsens._validate import as_count
+from lgsens.examples._arrays import vector
 from lgsens.model import Gravity, Model, RevoluteJoint, RigidBody
 
 
@@ -18,10 +19,6 @@ def spatial_chain(num_links: int = 3, length=0.3, mass=0.5, tilt=1.0, spin=3.0, 
     Raises `ValueError` for fewer than 1 link. Source: a standard scene; its reference is `IndexReduced`.
     """
     num_links = as_count(num_links, "num_links", " (it is static)")
-    zero = jnp.zeros_like(jnp.asarray(length * 1.0))
-
-    def vector(x, y, z):
-        return jnp.stack([x + zero, y + zero, z + zero])
 
     def axis(i):
         return vector(0.0, jnp.cos(tilt * i), jnp.sin(tilt * i))
@@ -33,7 +30,7 @@ def spatial_chain(num_links: int = 3, length=0.3, mass=0.5, tilt=1.0, spin=3.0, 
     for i in range(num_links):
         centre = vector((i + 0.5) * length, 0.0, 0.0)
         bodies[f"link{i}"] = RigidBody(
-            mass=mass + zero,
+            mass=mass,
             inertia=inertia,
             position=centre,
             velocity=jnp.cross(rate, centre),

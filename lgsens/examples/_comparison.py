@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from lgsens.criteria import Criterion
 from lgsens.examples._chain import spatial_chain
 from lgsens.examples._four_bar import four_bar
-from lgsens.examples._problems import Problem
+from lgsens.examples._problems import FREE, Problem
 from lgsens.examples._quarter_car import QuarterCar
 from lgsens.examples._top import spinning_top
 from lgsens.model import Model
@@ -20,7 +20,7 @@ def _quarter_car(p) -> Model:
     members = lambda car: (car.spring.rate, car.damper.rate, car.links["trailing_arm"].chassis)
     moved = car.links["trailing_arm"].chassis + p["trailing_arm_y"] * jnp.asarray([0.0, 1.0, 0.0], car.bearing.dtype)
     car = eqx.tree_at(members, car, (*(jnp.asarray(p[n], car.bearing.dtype) for n in ("k", "c")), moved))
-    return car.model(free_length=0.3350681866287862, free_radius=0.336861050861)
+    return car.model(**FREE)
 
 
 def _five(terminal, q, v, vdot, lam) -> dict[str, Criterion]:

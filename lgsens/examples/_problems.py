@@ -133,6 +133,10 @@ def _spinning_top(p) -> Model:
     return spinning_top(p["alpha0"], p["m"], (p["J11"], p["J22"], p["J33"]), p["l"], p["omega0"], p["g"])
 
 
+# Those at which the quarter-car's design position is in equilibrium for the k below, printed with the reference [m].
+FREE = {"free_length": 0.3350681866287862, "free_radius": 0.336861050861}
+
+
 def _five_link(wheel: str) -> Callable[[Mapping[str, Any]], Model]:
     """The five-link quarter-car with given rates and bump; spring and tyre keep their free lengths."""
 
@@ -141,8 +145,7 @@ def _five_link(wheel: str) -> Callable[[Mapping[str, Any]], Model]:
             car = QuarterCar.load()
         members = lambda car: (car.spring.rate, car.damper.rate, car.bump_height)
         car = eqx.tree_at(members, car, tuple(jnp.asarray(p[name], car.bearing.dtype) for name in ("k", "c", "hb")))
-        # those at which the design position is in equilibrium for the k below, printed with the reference
-        return car.model(wheel=wheel, free_length=0.3350681866287862, free_radius=0.336861050861)
+        return car.model(wheel=wheel, **FREE)
 
     return build
 

@@ -32,7 +32,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import AbstractSystem, State
+from lgsens.dynamics import AbstractSystem, State, mass_scale
 from lgsens.integrate import GeneralizedAlpha
 from lgsens.sensitivity._criterion_terms import Functional, Point, gradients, near
 from lgsens.sensitivity._linear_alpha import Node, advance, start
@@ -59,7 +59,7 @@ class Final(NamedTuple):
 
 def constrained_solve(mass, jacobian, force, level):
     """x and η with M x + Bᵀη = force and B x = level, by [(I − B⁺B) M; B]⁺ of eqs. (42)–(43)."""
-    scale = jnp.trace(mass) / mass.shape[0]
+    scale = mass_scale(mass)
     inverse = jnp.linalg.pinv(jacobian)
     free = jnp.eye(mass.shape[0], dtype=mass.dtype) - inverse @ jacobian
     stacked = jnp.concatenate([free @ mass, scale * jacobian])
