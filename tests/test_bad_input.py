@@ -5,6 +5,7 @@ import pytest
 from helpers import says
 
 import lgsens as lg
+from lgsens.examples import spatial_chain
 
 BODY = lg.RigidBody(1.0, (1.0, 1.0, 1.0))
 TWO = {"chassis": BODY, "wheel": lg.RigidBody(1.0, (1.0, 1.0, 1.0), position=(1.0, 0.0, 0.0))}
@@ -207,6 +208,23 @@ CONSTRUCTORS = {
             ("GeneralizedAlpha: `max_iterations` must be", "at least 1", f"got {value!r}"),
         )
         for value in (0, -3, 2.5, "ten")
+    },
+    # the examples and the measurement of costs
+    **{
+        f"num_links = {value!r}": (
+            lambda value=value: spatial_chain(value),
+            ("`num_links` must be", f"got {value!r}"),
+        )
+        for value in (0, -1, 2.0, "two")
+    },
+    **{
+        f"repeats = {value!r}": (
+            lambda value=value: lg.measure_costs(
+                lg.Criterion(terminal=lambda s, p: p), lambda p: p, 1.0, repeats=value
+            ),
+            ("`repeats`", f"got {value!r}"),
+        )
+        for value in (0, 2.5, "five")
     },
 }
 
