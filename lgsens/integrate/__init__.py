@@ -2,6 +2,7 @@
 
 from lgsens.integrate._integrate import (
     Constants as Constants,
+    Guess as Guess,
     Stats as Stats,
     integrate as integrate,
     take_step as take_step,

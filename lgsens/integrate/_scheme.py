@@ -42,19 +42,24 @@ class GeneralizedAlpha(eqx.Module):
             scene, at which a step has converged. The error left is its square; below 64 round-offs
             it is raised to that (single precision).
         max_iterations: Newton iterations per step before the step has failed.
+        factor_every: steps that share one inverse of the iteration matrix (modified Newton). Its iterations cost a
+            tenth of a full one, and go on until the error left is what full Newton would leave; a step that they do
+            not bring there is finished by full Newton. 0: full Newton always. The sensitivities do not depend on it:
+            theirs is always the exact matrix of the converged step.
         second_order_start: start with a₀ = v̇₀ + (α_m − α_f) h v̈₀, because a_n stands for the acceleration at
             t_n + (α_m − α_f) h, and with v₀ moved by O(h²) along the constraint directions, where the scheme keeps
             it anyway: positions, velocities and multipliers are then second order from the first step.
             False: a₀ = v̇₀ and v₀ as it is; multipliers are first order in the first steps (Arnold,
             Brüls & Cardona, Numerische Mathematik 129, 2015, doi:10.1007/s00211-014-0633-1).
 
-    All static and hashable. Raises `ValueError` for ρ∞ outside [0, 1), a tolerance that is not positive, or
-    fewer than 1 iteration. Source: Sonneville & Brüls (2014), §4; Brüls, Cardona & Arnold (2012).
+    All static and hashable. Raises `ValueError` for ρ∞ outside [0, 1), a tolerance that is not positive, fewer than 1
+    iteration, or a negative `factor_every`. Source: Sonneville & Brüls (2014), §4; Brüls, Cardona & Arnold (2012).
     """
 
     rho_inf: float = eqx.field(static=True, default=0.9)
     tolerance: float = eqx.field(static=True, default=1e-10, kw_only=True)
     max_iterations: int = eqx.field(static=True, default=10, kw_only=True)
+    factor_every: int = eqx.field(static=True, default=20, kw_only=True)
     second_order_start: bool = eqx.field(static=True, default=True, kw_only=True)
 
     def __check_init__(self):
@@ -70,6 +75,11 @@ class GeneralizedAlpha(eqx.Module):
         if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
             raise ValueError(
                 f"GeneralizedAlpha: `max_iterations` must be an int, at least 1, got {self.max_iterations!r}."
+            )
+        if not isinstance(self.factor_every, int) or self.factor_every < 0:
+            raise ValueError(
+                "GeneralizedAlpha: `factor_every` must be an int, at least 0 (0: full Newton always), got "
+                f"{self.factor_every!r}."
             )
 
     @property
@@ -118,12 +128,14 @@ def advance(scheme: GeneralizedAlpha, system: AbstractSystem, previous: State, u
     return Motion(x, system.group.retract(previous.q, x), v, vdot)
 
 
-def factorize_iteration_matrix(scheme: GeneralizedAlpha, system: AbstractSystem, tangents: Tangents, mass, x, h):
-    """The factors of S above: one LU, which serves Newton, the DDM, and transposed, the AVM."""
+def factorize_iteration_matrix(
+    scheme: GeneralizedAlpha, system: AbstractSystem, tangents: Tangents, mass, x, h, kind: Any = Factors
+):
+    """The factors of S above: one LU, which serves Newton, the DDM, and transposed, the AVM. Or its `Inverse`."""
     group = system.group
     k = mass.shape[0]
     # A T(x) for the rows of K_t and B together
     rows = jnp.concatenate([tangents.stiffness, tangents.constraint_jacobian])
     rows = jax.vmap(lambda row: group.tangent_rmv(x, row))(rows)
     dynamic = scheme.inertia_factor * mass + (scheme.gamma * h) * tangents.damping + (scheme.beta * h**2) * rows[:k]
-    return Factors.of(dynamic, tangents.constraint_jacobian.T, rows[k:], mass_scale(mass))
+    return kind.of(dynamic, tangents.constraint_jacobian.T, rows[k:], mass_scale(mass))

@@ -24,18 +24,20 @@ and p̄ of t0 and h through t_{n+1} = t0 + (n+1) h. What is kept is the states; 
 d²F_M/dt² is needed, because accelerations and multipliers are unknowns here like the others.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from lgsens.dynamics import State
-from lgsens.integrate import GeneralizedAlpha, factorize_iteration_matrix
+from lgsens.integrate import GeneralizedAlpha
+from lgsens.sensitivity._blocks import Blocks, padded, sweep_blocks
 from lgsens.sensitivity._linearization import (
     Parameters,
     Variation,
+    linearized,
     pseudo_load_function,
-    step_increment,
-    step_tangents,
     steps,
 )
 
@@ -45,15 +47,11 @@ def adjoint_sweep(scheme: GeneralizedAlpha, states: State, parameters: Parameter
     system, h = parameters.system, parameters.h
     group, mass = system.group, parameters.system.mass_matrix()
     alpha_m, alpha_f = scheme.alpha_m, scheme.alpha_f
+    num_steps = states.v.shape[0] - 1
+    blocks = Blocks.of(num_steps, states.v.shape[1] + states.lam.shape[1])
 
-    def sweep(carry, inputs):
-        c, bar = carry
-        step, earlier = inputs
-        x, rates = step_increment(scheme, step, h)
-        tangents = step_tangents(system, step)
-        factors = factorize_iteration_matrix(scheme, system, tangents, mass, x, h)
-        k_t, c_t, jacobian = tangents
-
+    def one(c: Variation, inputs):
+        (x, _, (k_t, c_t, jacobian), factors), earlier = inputs
         mu_a, mu_lam = factors.solve(
             c.a
             + (scheme.beta * h**2) * group.tangent_rmv(x, c.w)
@@ -62,20 +60,10 @@ def adjoint_sweep(scheme: GeneralizedAlpha, states: State, parameters: Parameter
             c.lam,
             transposed=True,
         )
-        of_constraint = mu_lam / (scheme.beta * h**2)
-        mu_w = c.w - mu_a @ k_t - of_constraint @ jacobian
+        mu_w = c.w - mu_a @ k_t - (mu_lam / (scheme.beta * h**2)) @ jacobian
         mu_v = c.v - mu_a @ c_t
         mu_vdot = c.vdot - mu_a @ mass
         mu_x = group.tangent_rmv(x, mu_w)
-
-        _, pull_back = jax.vjp(pseudo_load_function(step.state), system, step.t)
-        bar_system, bar_t = pull_back((-mu_a, -of_constraint))
-        n = (step.t - parameters.t0) / h
-        bar = Parameters(
-            system=jax.tree.map(jnp.add, bar.system, bar_system),
-            t0=bar.t0 + bar_t,
-            h=bar.h + n * bar_t + jnp.dot(rates.x, mu_x) + jnp.dot(rates.v, mu_v),
-        )
         previous = Variation(
             w=earlier.w + group.Ad_inv_rmv(group.exp(x), mu_w),
             v=earlier.v + h * mu_x + mu_v,
@@ -86,9 +74,29 @@ def adjoint_sweep(scheme: GeneralizedAlpha, states: State, parameters: Parameter
             + (h * (1.0 - scheme.gamma)) * mu_v
             + (alpha_m / (1.0 - alpha_f)) * mu_vdot,
         )
-        return (previous, bar), Variation(mu_w, mu_v, mu_vdot, mu_lam, mu_a)
+        return previous, (Variation(mu_w, mu_v, mu_vdot, mu_lam, mu_a), mu_x)
 
+    def block(carry, inputs):
+        c, bar = carry
+        step, earlier = inputs
+        prepared = jax.vmap(partial(linearized, scheme, parameters, mass))(step)
+        c, (mu, mu_x) = lax.scan(one, c, (prepared, earlier), reverse=True)
+
+        loads = lambda system, t: jax.vmap(lambda state, t: pseudo_load_function(state)(system, t))(step.state, t)
+        _, pull_back = jax.vjp(loads, system, step.t)
+        bar_system, bar_t = pull_back((-mu.a, -mu.lam / (scheme.beta * h**2)))
+        n = (step.t - parameters.t0) / h
+        bar = Parameters(
+            system=jax.tree.map(jnp.add, bar.system, bar_system),
+            t0=bar.t0 + jnp.sum(bar_t),
+            h=bar.h + jnp.dot(n, bar_t) + jnp.sum(prepared.rates.x * mu_x) + jnp.sum(prepared.rates.v * mu.v),
+        )
+        return (c, bar), mu
+
+    # The steps that fill the last block come first, with zero cotangents, and leave them zero.
+    c = padded(c, blocks.padding, repeat=False)
     last = jax.tree.map(lambda leaf: leaf[-1], c)
     earlier = jax.tree.map(lambda leaf: leaf[:-1], c)
-    (first, bar), later = lax.scan(sweep, (last, c_p), (steps(states, parameters), earlier), reverse=True)
-    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), first, later), bar
+    inputs = (padded(steps(states, parameters), blocks.padding, repeat=True), earlier)
+    (first, bar), later = sweep_blocks(blocks, block, (last, c_p), inputs, reverse=True)
+    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest[:num_steps]]), first, later), bar

@@ -8,23 +8,26 @@ At each step, with the equations of `_linearization.py`, everything but u' = a'_
                    b.lam − (Φ_p p' + B w_0)/(βh²) ]
 
 with S the iteration matrix of eq. (30) at the converged state: one factorization per step, whatever the number of
-parameters (under `vmap` over right-hand sides S stays unbatched).
+parameters (under `vmap` over right-hand sides S stays unbatched). The steps after the last, which fill its block, are
+computed and dropped.
 """
+
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from lgsens.dynamics import State
-from lgsens.integrate import GeneralizedAlpha, factorize_iteration_matrix
+from lgsens.integrate import GeneralizedAlpha
+from lgsens.sensitivity._blocks import Blocks, padded, sweep_blocks
 from lgsens.sensitivity._linearization import (
+    Linearized,
     Parameters,
-    Step,
     Variation,
     kinematics,
+    linearized,
     pseudo_loads,
-    step_increment,
-    step_tangents,
     steps,
 )
 
@@ -33,22 +36,18 @@ def direct_step(
     scheme: GeneralizedAlpha,
     parameters: Parameters,
     mass,
-    step: Step,
+    step: Linearized,
+    loads,
     previous: Variation,
     row: Variation,
-    d: Parameters,
+    dh,
 ) -> Variation:
-    """δ_{n+1} from δ_n, the right-hand side of its equations and p'. What does not depend on these three is shared
-    by all of them under `vmap`: the tangents and one factorization."""
-    system, h = parameters.system, parameters.h
-    group = system.group
-    x, rates = step_increment(scheme, step, h)
-    tangents = step_tangents(system, step)
-    factors = factorize_iteration_matrix(scheme, system, tangents, mass, x, h)
-    r_p, phi_p = pseudo_loads(step, parameters, d)
-    k_t, c_t, jacobian = tangents
+    """δ_{n+1} from δ_n, the right-hand side of its equations, its pseudo-loads (r_p p', Φ_p p') and h'."""
+    h, group = parameters.h, parameters.system.group
+    x, rates, (k_t, c_t, jacobian), factors = step
+    r_p, phi_p = loads
 
-    w, v, vdot = kinematics(scheme, group, x, rates, h, previous, jnp.zeros_like(previous.a), d.h)
+    w, v, vdot = kinematics(scheme, group, x, rates, h, previous, jnp.zeros_like(previous.a), dh)
     w, v, vdot = w + row.w, v + row.v, vdot + row.vdot
     u, lam = factors.solve(
         row.a - r_p - (mass @ vdot + c_t @ v + k_t @ w),
@@ -66,12 +65,22 @@ def direct_step(
 def direct_sweep(scheme: GeneralizedAlpha, states: State, parameters: Parameters, b: Variation, d: Parameters):
     """Solve L (δ, p') = (b, d) forwards in time; returns δ stacked, and p' = d."""
     mass = parameters.system.mass_matrix()
+    blocks = Blocks.of(states.v.shape[0] - 1, states.v.shape[1] + states.lam.shape[1])
 
-    def sweep(previous: Variation, inputs):
-        current = direct_step(scheme, parameters, mass, inputs[0], previous, inputs[1], d)
+    def one(previous: Variation, inputs):
+        step, loads, row = inputs
+        current = direct_step(scheme, parameters, mass, step, loads, previous, row, d.h)
         return current, current
+
+    def block(previous: Variation, inputs):
+        step, rows = inputs
+        prepared = jax.vmap(partial(linearized, scheme, parameters, mass))(step)
+        loads = jax.vmap(lambda step: pseudo_loads(step, parameters, d))(step)
+        return lax.scan(one, previous, (prepared, loads, rows))
 
     first = jax.tree.map(lambda leaf: leaf[0], b)
     rows = jax.tree.map(lambda leaf: leaf[1:], b)
-    _, later = lax.scan(sweep, first, (steps(states, parameters), rows))
-    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), first, later), d
+    inputs = padded((steps(states, parameters), rows), blocks.padding, repeat=True)
+    _, later = sweep_blocks(blocks, block, first, inputs)
+    num_steps = states.v.shape[0] - 1
+    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest[:num_steps]]), first, later), d

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import AbstractSystem, State, Tangents
-from lgsens.integrate import GeneralizedAlpha, increment
+from lgsens.integrate import Factors, GeneralizedAlpha, factorize_iteration_matrix, increment
 
 
 class Parameters(NamedTuple):
@@ -84,6 +84,23 @@ def step_tangents(system: AbstractSystem, step: Step) -> Tangents:
     """K_t, C_t and B at the converged state."""
     state = step.state
     return system.tangents(state.q, state.v, state.vdot, state.lam, step.t)
+
+
+class Linearized(NamedTuple):
+    """What the equations of one step need of its converged state, whatever their right-hand side."""
+
+    x: Float[Array, " k"]
+    rates: Rates
+    tangents: Tangents
+    factors: Factors
+
+
+def linearized(scheme: GeneralizedAlpha, parameters: Parameters, mass, step: Step) -> Linearized:
+    """The tangents and the factors of the exact iteration matrix at the converged state."""
+    system, h = parameters.system, parameters.h
+    x, rates = step_increment(scheme, step, h)
+    tangents = step_tangents(system, step)
+    return Linearized(x, rates, tangents, factorize_iteration_matrix(scheme, system, tangents, mass, x, h))
 
 
 def kinematics(scheme: GeneralizedAlpha, group, x, rates: Rates, h, previous: Variation, u, dh):

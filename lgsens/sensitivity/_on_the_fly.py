@@ -1,7 +1,8 @@
 """The direct differentiation method on the fly (§6.3): motion, sensitivities, criteria in one scan, nothing stored.
 
 After Newton's iteration has converged, the tangents and the factors of eq. (30) are formed once for all parameters,
-each of which costs its pseudo-loads and one solve. The criteria and their derivatives,
+each of which costs its pseudo-loads and one solve; the same factors serve modified Newton in the next step. The
+criteria and their derivatives,
 
     F' = F_q w + F_v v' + F_v̇ v̇' + F_λ λ' + F_p         (33)
 
@@ -17,10 +18,19 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import State
-from lgsens.integrate import Constants, GeneralizedAlpha, Stats, take_step
+from lgsens.integrate import Constants, GeneralizedAlpha, Guess, Stats, take_step
 from lgsens.sensitivity._criterion_terms import Functional
 from lgsens.sensitivity._direct import direct_step
-from lgsens.sensitivity._linearization import Parameters, Step, Variation, to_algebra, to_ambient
+from lgsens.sensitivity._linearization import (
+    Linearized,
+    Parameters,
+    Step,
+    Variation,
+    linearized,
+    pseudo_loads,
+    to_algebra,
+    to_ambient,
+)
 
 
 class OnTheFly(NamedTuple):
@@ -57,24 +67,34 @@ def direct_on_the_fly(
 
         return jax.vmap(along, out_axes=(None, 0))(directions, d.system, delta)
 
+    def linearized_at(previous: State, state: State, t) -> tuple[Step, Linearized]:
+        step = Step(previous, state, t)
+        return step, linearized(scheme, parameters, constants.mass, step)
+
     def step(carry, n):
-        previous, running, delta, total = carry
+        previous, guess, factors, running, delta, total = carry
         t = parameters.t0 + (n + 1) * h
-        state, stats = take_step(scheme, system, constants, previous, running, t, h)
-        converged = Step(previous, state, t)
-        delta = jax.vmap(lambda delta, d: direct_step(scheme, parameters, constants.mass, converged, delta, none, d))(
-            delta, d
-        )
+        earlier = factors if scheme.factor_every else None
+        state, guess, stats = take_step(scheme, system, constants, previous, guess, earlier, running, t, h)
+        converged, prepared = linearized_at(previous, state, t)
+
+        def along(delta, d: Parameters):
+            loads = pseudo_loads(converged, parameters, d)
+            return direct_step(scheme, parameters, constants.mass, prepared, loads, delta, none, d.h)
+
+        delta = jax.vmap(along)(delta, d)
         rate = with_derivative(functional.rate, state, t, delta)
         # the last point has the weight h/2
         weight = jnp.where(n == num_steps - 1, h / 2, h)
         total = jax.tree.map(lambda total, f: total + weight * f, total, rate)
-        return (state, stats.converged, delta, total), stats
+        return (state, guess, prepared.factors, stats.converged, delta, total), stats
 
     delta0 = jax.vmap(lambda tangent: to_algebra(group, state0, tangent))(d_state0)
     first = with_derivative(functional.rate, state0, parameters.t0, delta0)
-    start = (state0, jnp.ones((), bool), delta0, jax.tree.map(lambda f: h / 2 * f, first))
-    (state, _, delta, integral), stats = lax.scan(step, start, jnp.arange(num_steps, dtype=p.dtype))
+    _, prepared = linearized_at(state0, state0, parameters.t0)
+    half = jax.tree.map(lambda f: h / 2 * f, first)
+    start = (state0, Guess.first(state0), prepared.factors, jnp.ones((), bool), delta0, half)
+    (state, *_, delta, integral), stats = lax.scan(step, start, jnp.arange(num_steps, dtype=p.dtype))
     final = with_derivative(functional.final, state, parameters.t0 + num_steps * h, delta)
     value, derivative = jax.tree.map(jnp.add, integral, final)
     return OnTheFly(value, derivative.T, stats, begun)
