@@ -20,8 +20,20 @@ def pytest_configure(config):
     jax.config.update("jax_disable_most_optimizations", not config.getoption("--optimized"))
 
 
-@pytest.fixture(autouse=True, scope="module")
-def forget_programs():
+def _forget_programs():
     """Compiled programs hold memory maps, of which a process has only so many; hardly any serves two modules."""
-    yield
     jax.clear_caches()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_programs_of_a_module():
+    yield
+    _forget_programs()
+
+
+@pytest.fixture(autouse=True)
+def forget_large_programs(request):
+    """A dozen optimized programs of the quarter-car are too many for one module."""
+    yield
+    if request.node.get_closest_marker("slow"):
+        _forget_programs()

@@ -3,7 +3,8 @@
 An iteration with the matrix of an earlier step (modified Newton) evaluates the residual only, and contracts by 1e-3 to
 1e-2 on the quarter-car when the matrix is up to 20 steps old. Started from extrapolated accelerations and multipliers
 it takes three or four to round-off, each a tenth of a full one. Its increment d_i leaves an error of about κ d_i, with
-κ = d_i/d_{i−1}; it ends where that is the square of the tolerance, which full Newton would leave.
+κ = d_i/d_{i−1}. Where that is the square of the tolerance, or round-off, one more iteration ends it: to ask for less
+would be to ask for increments that the round-off of the constraints does not allow.
 """
 
 from functools import partial
@@ -51,16 +52,23 @@ class Constants(NamedTuple):
 
 
 class Guess(NamedTuple):
-    """What a step starts from besides the state: the accelerations and multipliers before it, and how fast modified
-    Newton contracted there."""
+    """Where the next step's iteration starts, the parabola through the last three accelerations and multipliers, and
+    how fast modified Newton contracted in this one."""
 
-    a: Float[Array, " k"]
-    lam: Float[Array, " m"]
+    a: tuple[Float[Array, " k"], Float[Array, " k"]]  # a_n, a_{n-1}
+    lam: tuple[Float[Array, " m"], Float[Array, " m"]]
     contraction: Float[Array, ""]
 
     @classmethod
     def first(cls, state0: State) -> "Guess":
-        return cls(state0.a, state0.lam, jnp.ones((), state0.a.dtype))
+        return cls((state0.a, state0.a), (state0.lam, state0.lam), jnp.ones((), state0.a.dtype))
+
+    def extrapolated(self, state: State):
+        """u and λ: 3 x_n − 3 x_{n−1} + x_{n−2}."""
+        return tuple(3.0 * (x - last) + before for x, (last, before) in ((state.a, self.a), (state.lam, self.lam)))
+
+    def after(self, state: State, contraction) -> "Guess":
+        return Guess((state.a, self.a[0]), (state.lam, self.lam[0]), contraction)
 
 
 class _Iterate(NamedTuple):
@@ -70,6 +78,7 @@ class _Iterate(NamedTuple):
     contraction: Float[Array, ""]
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
+    settled: Bool[Array, ""]  # what modified Newton left before this iteration was small enough
 
 
 def take_step(
@@ -90,8 +99,7 @@ def take_step(
     mass, scale = constants
     eps = float(jnp.finfo(mass.dtype).eps)
     tolerance = max(scheme.tolerance, 64 * eps)
-    # at the fastest contraction an increment of four round-offs: constraints cannot be evaluated to better
-    target = max(tolerance**2, 4 * eps * _FASTEST)
+    target = max(tolerance**2, 4 * eps)
 
     def corrected(factors: Factors | Inverse | None, iterate: _Iterate) -> _Iterate:
         motion = advance(scheme, system, previous, iterate.u, h)
@@ -102,28 +110,28 @@ def take_step(
             factors = factorize_iteration_matrix(scheme, system, system.tangents(*point), mass, motion.x, h)
         du, dlam = factors.solve(residual, violation)
         size = jnp.max(jnp.abs(du) * (scheme.beta * h**2) / scale)
-        contraction = jnp.where(iterate.iterations > 0, size / iterate.increment, iterate.contraction)
+        measured = (iterate.iterations > 0) & (iterate.increment > 64 * eps)  # increments below are round-off
+        contraction = jnp.where(measured, jnp.maximum(size / iterate.increment, _FASTEST), iterate.contraction)
+        settled = iterate.increment * iterate.contraction <= target
         largest, count = jnp.max(jnp.abs(residual)), iterate.iterations + 1
-        return _Iterate(iterate.u - du, iterate.lam - dlam, size, jnp.maximum(contraction, _FASTEST), largest, count)
+        return _Iterate(iterate.u - du, iterate.lam - dlam, size, contraction, largest, count, settled)
 
     # NaN compares false, and ends the iterations
 
     def contracting(iterate: _Iterate):
         fast = (iterate.iterations < 2) | (iterate.contraction < _SLOW)
-        left = iterate.increment * iterate.contraction > target
-        return running & left & fast & (iterate.iterations < _MODIFIED_LIMIT)
+        return running & ~iterate.settled & fast & (iterate.iterations < _MODIFIED_LIMIT)
 
     def unfinished(iterate: _Iterate):
         return running & (iterate.increment > tolerance) & (iterate.iterations < scheme.max_iterations)
 
-    infinite, none = jnp.full((), jnp.inf, mass.dtype), jnp.zeros((), jnp.int32)
-    u, lam = 2.0 * previous.a - guess.a, 2.0 * previous.lam - guess.lam
-    iterate = _Iterate(u, lam, infinite, guess.contraction, infinite, none)
+    infinite, none, no = jnp.full((), jnp.inf, mass.dtype), jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    u, lam = guess.extrapolated(previous)
+    iterate = _Iterate(u, lam, infinite, guess.contraction, infinite, none, no)
     contraction = guess.contraction
     before = none
     if earlier is not None:
         iterate = lax.while_loop(contracting, partial(corrected, earlier), iterate)
-        finished = iterate.increment * iterate.contraction <= target
         closer = iterate.contraction < 1.0
         contraction = jnp.where(jnp.isfinite(iterate.contraction), iterate.contraction, 1.0)
         before = iterate.iterations
@@ -131,10 +139,11 @@ def take_step(
             u=jnp.where(closer, iterate.u, u),
             lam=jnp.where(closer, iterate.lam, lam),
             # an increment that ends full Newton before its first iteration
-            increment=jnp.where(finished, jnp.minimum(iterate.increment, tolerance), infinite),
+            increment=jnp.where(iterate.settled, jnp.minimum(iterate.increment, tolerance), infinite),
             contraction=contraction,
             residual=iterate.residual,
             iterations=none,
+            settled=no,
         )
     iterate = lax.while_loop(unfinished, partial(corrected, None), iterate)
     motion = advance(scheme, system, previous, iterate.u, h)
@@ -143,7 +152,7 @@ def take_step(
     converged = running & (iterate.increment <= tolerance) & finite
     state = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), state)
     stats = Stats(before + iterate.iterations, iterate.increment, iterate.residual, converged)
-    return state, Guess(previous.a, previous.lam, contraction), stats
+    return state, guess.after(previous, contraction), stats
 
 
 def integrate(

@@ -14,12 +14,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens.liegroups import skew
+from lgsens.liegroups import cross, skew
 from lgsens.model._frames import (
     ROTATION_A,
     ROTATION_B,
     Frame,
     separation,
+    separation_force,
     separation_stiffness,
 )
 
@@ -45,6 +46,10 @@ class AbstractClosedFormConstraint(AbstractConstraint):
         """B with δΦ = B [δx_a, δθ_a, δx_b, δθ_b]."""
 
     @abc.abstractmethod
+    def force(self, a: Frame, b: Frame, lam) -> Float[Array, "12"]:
+        """Bᵀ λ, without B."""
+
+    @abc.abstractmethod
     def geometric_stiffness(self, a: Frame, b: Frame, lam) -> Float[Array, "12 12"]:
         """D_q(Bᵀ λ) at fixed λ: what the constraint adds to K_t."""
 
@@ -64,6 +69,9 @@ class Coincidence(AbstractClosedFormConstraint):
 
     def jacobian(self, a, b):
         return separation(a, b, self.point_a, self.point_b)[1]
+
+    def force(self, a, b, lam):
+        return separation_force(a, b, self.point_a, self.point_b, lam)
 
     def geometric_stiffness(self, a, b, lam):
         return separation_stiffness(a, b, self.point_a, self.point_b, lam)
@@ -85,13 +93,19 @@ class Orthogonality(AbstractClosedFormConstraint):
         return 1
 
     def value(self, a, b):
-        return jnp.dot(a.axis(self.axis_a), b.axis(self.axis_b))[None]
+        return jnp.sum(a.axis(self.axis_a) * b.axis(self.axis_b))[None]
+
+    def _row(self, a, b):
+        zero = jnp.zeros(3, self.axis_a.dtype)
+        row_a = cross(self.axis_a, a.local_axis(b.axis(self.axis_b)))
+        row_b = cross(self.axis_b, b.local_axis(a.axis(self.axis_a)))
+        return jnp.concatenate([zero, row_a, zero, row_b])
 
     def jacobian(self, a, b):
-        zero = jnp.zeros(3, self.axis_a.dtype)
-        row_a = jnp.cross(self.axis_a, a.local_axis(b.axis(self.axis_b)))
-        row_b = jnp.cross(self.axis_b, b.local_axis(a.axis(self.axis_a)))
-        return jnp.concatenate([zero, row_a, zero, row_b])[None, :]
+        return self._row(a, b)[None, :]
+
+    def force(self, a, b, lam):
+        return self._row(a, b) * lam[0]
 
     def geometric_stiffness(self, a, b, lam):
         e_a, e_b = skew(self.axis_a), skew(self.axis_b)
@@ -121,7 +135,7 @@ class InPlane(AbstractClosedFormConstraint):
         return 1
 
     def value(self, a, b):
-        return jnp.dot(a.axis(self.axis_a), b.point(self.point_b) - a.point(self.point_a))[None]
+        return jnp.sum(a.axis(self.axis_a) * (b.point(self.point_b) - a.point(self.point_a)))[None]
 
     def _axis_gradient(self, a):
         return jnp.zeros((3, 12), self.axis_a.dtype).at[:, ROTATION_A].set(-a.orientation @ skew(self.axis_a))
@@ -129,6 +143,13 @@ class InPlane(AbstractClosedFormConstraint):
     def jacobian(self, a, b):
         d, gradient = separation(a, b, self.point_a, self.point_b)
         return (d @ self._axis_gradient(a) + a.axis(self.axis_a) @ gradient)[None, :]
+
+    def force(self, a, b, lam):
+        d = b.point(self.point_b) - a.point(self.point_a)
+        along = separation_force(a, b, self.point_a, self.point_b, a.axis(self.axis_a))
+        zero = jnp.zeros(3, d.dtype)
+        turning = jnp.concatenate([zero, cross(self.axis_a, a.local_axis(d)), zero, zero])
+        return (along + turning) * lam[0]
 
     def geometric_stiffness(self, a, b, lam):
         d, gradient = separation(a, b, self.point_a, self.point_b)
@@ -160,6 +181,10 @@ class Distance(AbstractClosedFormConstraint):
     def jacobian(self, a, b):
         d, gradient = separation(a, b, self.point_a, self.point_b)
         return (d / jnp.linalg.norm(d) @ gradient)[None, :]
+
+    def force(self, a, b, lam):
+        d = b.point(self.point_b) - a.point(self.point_a)
+        return separation_force(a, b, self.point_a, self.point_b, d / jnp.linalg.norm(d) * lam[0])
 
     def geometric_stiffness(self, a, b, lam):
         d, gradient = separation(a, b, self.point_a, self.point_b)

@@ -10,11 +10,25 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens.liegroups import skew
+from lgsens.liegroups import cross, skew
 
 BODY_A, BODY_B = slice(0, 6), slice(6, 12)
 ROTATION = slice(3, 6)  # within one body
 ROTATION_A, TRANSLATION_B, ROTATION_B = slice(3, 6), slice(6, 9), slice(9, 12)  # within an element's 12
+
+
+# Written out, products of 3 × 3 matrices become part of the loops around them; as dots each is an operation of its own,
+# and a step is as slow as it has operations.
+
+
+def turn(rotation: Float[Array, "3 3"], x: Float[Array, "3"]) -> Float[Array, "3"]:
+    """R x."""
+    return jnp.sum(rotation * x[None, :], axis=1)
+
+
+def turn_back(rotation: Float[Array, "3 3"], x: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Rᵀ x."""
+    return jnp.sum(rotation * x[:, None], axis=0)
 
 
 class Frame(NamedTuple):
@@ -25,19 +39,19 @@ class Frame(NamedTuple):
 
     def point(self, local: Float[Array, "3"]) -> Float[Array, "3"]:
         """x + R X: a body-fixed point in the inertial frame [m]."""
-        return self.position + self.orientation @ local
+        return self.position + turn(self.orientation, local)
 
     def axis(self, local: Float[Array, "3"]) -> Float[Array, "3"]:
         """R e: a body-fixed direction in the inertial frame."""
-        return self.orientation @ local
+        return turn(self.orientation, local)
 
     def local_point(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
         """Rᵀ(p − x): an inertial point in the body frame [m]."""
-        return self.orientation.T @ (point - self.position)
+        return turn_back(self.orientation, point - self.position)
 
     def local_axis(self, axis: Float[Array, "3"]) -> Float[Array, "3"]:
         """Rᵀ e: an inertial direction in the body frame."""
-        return self.orientation.T @ axis
+        return turn_back(self.orientation, axis)
 
 
 def ground_frame(dtype) -> Frame:
@@ -56,6 +70,13 @@ def separation(a: Frame, b: Frame, point_a, point_b) -> tuple[Float[Array, "3"],
     eye = jnp.eye(3, dtype=d.dtype)
     gradient = jnp.concatenate([-eye, a.orientation @ skew(point_a), eye, -b.orientation @ skew(point_b)], axis=1)
     return d, gradient
+
+
+def separation_force(a: Frame, b: Frame, point_a, point_b, force) -> Float[Array, "12"]:
+    """Dᵀ f = [−f, −X̃_a R_aᵀ f, f, X̃_b R_bᵀ f] for a force f in the inertial frame, with D of `separation`."""
+    moment_a = cross(a.local_axis(force), point_a)
+    moment_b = cross(point_b, b.local_axis(force))
+    return jnp.concatenate([-force, moment_a, force, moment_b])
 
 
 def separation_stiffness(a: Frame, b: Frame, point_a, point_b, force) -> Float[Array, "12 12"]:

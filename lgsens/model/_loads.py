@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens.liegroups import skew
+from lgsens.liegroups import cross, skew
 from lgsens.model._frames import (
     BODY_B,
     ROTATION,
@@ -21,6 +21,7 @@ from lgsens.model._frames import (
     TRANSLATION_B,
     Frame,
     separation,
+    separation_force,
     separation_stiffness,
 )
 from lgsens.model._roads import AbstractSignal
@@ -88,32 +89,39 @@ class SpringDamperLoad(AbstractClosedFormLoad):
     free_length: Float[Array, ""]
     preload: Float[Array, ""]
 
-    def _geometry(self, a, b):
-        d, gradient = separation(a, b, self.point_a, self.point_b)
-        square = jnp.dot(d, d)
+    def _line(self, a, b):
+        """n, |d|, and |d| or 1 to divide by."""
+        d = b.point(self.point_b) - a.point(self.point_a)
+        square = jnp.sum(d * d)
         # Points that meet give no direction: the force vanishes there instead of being NaN.
         meet = square == 0.0
         length = jnp.where(meet, 0.0, jnp.sqrt(jnp.where(meet, 1.0, square)))
-        return d / jnp.where(meet, 1.0, length), length, gradient, jnp.where(meet, 1.0, length)
+        divisor = jnp.where(meet, 1.0, length)
+        return d / divisor, length, divisor
 
     def measure(self, a, b, va, vb, t) -> LineForce:
-        n, length, gradient, _ = self._geometry(a, b)
-        rate = jnp.dot(n, gradient @ jnp.concatenate([va, vb]))
+        n, length, _ = self._line(a, b)
+        speed_a, speed_b = (
+            v[: ROTATION.start] + frame.axis(cross(v[ROTATION], point))
+            for v, frame, point in ((va, a, self.point_a), (vb, b, self.point_b))
+        )
+        rate = jnp.sum(n * (speed_b - speed_a))
         tension = self.preload + self.stiffness * (length - self.free_length) + self.damping * rate
         return LineForce(length, rate, tension)
 
     def force(self, a, b, va, vb, t):
-        n, _, gradient, _ = self._geometry(a, b)
-        return -(self.measure(a, b, va, vb, t).tension * n) @ gradient
+        n, _, _ = self._line(a, b)
+        return -separation_force(a, b, self.point_a, self.point_b, self.measure(a, b, va, vb, t).tension * n)
 
     def tangents(self, a, b, va, vb, t):
-        n, _, gradient, divisor = self._geometry(a, b)
+        n, _, divisor = self._line(a, b)
+        _, gradient = separation(a, b, self.point_a, self.point_b)
         tension = self.measure(a, b, va, vb, t).tension
         along = n @ gradient
         speed = gradient @ jnp.concatenate([va, vb])
         turning = jnp.zeros((3, 12), n.dtype)
-        turning = turning.at[:, ROTATION_A].set(-a.orientation @ skew(jnp.cross(self.point_a, va[ROTATION])))
-        turning = turning.at[:, ROTATION_B].set(b.orientation @ skew(jnp.cross(self.point_b, vb[ROTATION])))
+        turning = turning.at[:, ROTATION_A].set(-a.orientation @ skew(cross(self.point_a, va[ROTATION])))
+        turning = turning.at[:, ROTATION_B].set(b.orientation @ skew(cross(self.point_b, vb[ROTATION])))
         across = (gradient - jnp.outer(n, along)) / divisor  # P D
         rate_gradient = speed @ across + n @ turning
         position = (
@@ -141,8 +149,8 @@ class TyreLoad(AbstractClosedFormLoad):
         return self.preload + self.stiffness * (self.road(t) + self.free_radius - b.point(self.point_b)[2])
 
     def _vertical(self, a, b):
-        _, gradient = separation(a, b, jnp.zeros_like(self.point_b), self.point_b)
-        return gradient[2].at[: BODY_B.start].set(0.0)
+        up = jnp.asarray([0.0, 0.0, 1.0], self.point_b.dtype)
+        return jnp.concatenate([jnp.zeros(BODY_B.start, up.dtype), up, cross(self.point_b, b.orientation[2])])
 
     def force(self, a, b, va, vb, t):
         return self.measure(a, b, va, vb, t) * self._vertical(a, b)
@@ -166,7 +174,7 @@ class PointForce(AbstractClosedFormLoad):
     signal: AbstractSignal
 
     def force(self, a, b, va, vb, t):
-        moment = self.moment + jnp.cross(self.point_b, b.local_axis(self.vector))
+        moment = self.moment + cross(self.point_b, b.local_axis(self.vector))
         zero = jnp.zeros(6, self.vector.dtype)
         return self.signal(t) * jnp.concatenate([zero, self.vector, moment])
 

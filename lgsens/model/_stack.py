@@ -110,6 +110,13 @@ def constraint_jacobian(element: AbstractConstraint, a: Frame, b: Frame):
     return jax.jacfwd(lambda x: element.value(_moved(a, x[BODY_A]), _moved(b, x[BODY_B])))(zero)
 
 
+def constraint_force(element: AbstractConstraint, a: Frame, b: Frame, lam):
+    """Bᵀλ of one element, shape (12,)."""
+    if isinstance(element, AbstractClosedFormConstraint):
+        return element.force(a, b, lam)
+    return lam @ constraint_jacobian(element, a, b)
+
+
 def constraint_stiffness(element: AbstractConstraint, a: Frame, b: Frame, lam):
     """D_q(Bᵀλ) of one element, shape (12, 12)."""
     if isinstance(element, AbstractClosedFormConstraint):

@@ -10,13 +10,14 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import suggestion
 from lgsens.dynamics import AbstractSystem, Tangents
-from lgsens.liegroups import Pose, Power, R3xSO3, skew
+from lgsens.liegroups import Pose, Power, R3xSO3, cross, skew
 from lgsens.model._constraints import AbstractConstraint
-from lgsens.model._frames import ROTATION
+from lgsens.model._frames import ROTATION, turn
 from lgsens.model._loads import AbstractLoad
 from lgsens.model._stack import (
     BODY_DIM,
     Stack,
+    constraint_force,
     constraint_jacobian,
     constraint_stiffness,
     load_tangents,
@@ -112,12 +113,13 @@ class MultibodySystem(AbstractSystem):
     def residual(self, q, v, vdot, lam, t):
         twist = v.reshape(-1, BODY_DIM)
         spin = twist[:, ROTATION]
-        momentum = jnp.einsum("nij,nj->ni", self.inertia, spin)
         acceleration = vdot.reshape(-1, BODY_DIM)
+        turned = jax.vmap(turn)
+        gyroscopic = jax.vmap(cross)(spin, turned(self.inertia, spin))
         inertial = jnp.concatenate(
             [
                 self.mass[:, None] * acceleration[:, : ROTATION.start],
-                jnp.einsum("nij,nj->ni", self.inertia, acceleration[:, ROTATION]) + jnp.cross(spin, momentum),
+                turned(self.inertia, acceleration[:, ROTATION]) + gyroscopic,
             ],
             axis=1,
         )
@@ -127,7 +129,7 @@ class MultibodySystem(AbstractSystem):
             index.append(stack.coordinates.ravel())
             values.append(-force[:, stack.part].ravel())
         for stack, rows in zip(self.constraints, self._rows):
-            force = stack.map(lambda e, a, b, lam: lam @ constraint_jacobian(e, a, b), q, extra=(lam[rows],))
+            force = stack.map(constraint_force, q, extra=(lam[rows],))
             index.append(stack.coordinates.ravel())
             values.append(force[:, stack.part].ravel())
         return jnp.zeros_like(v).at[np.concatenate(index)].add(jnp.concatenate(values))
