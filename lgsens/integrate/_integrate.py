@@ -107,8 +107,10 @@ def take_step(
         residual = system.residual(*point)
         violation = system.constraint(motion.q) / (scheme.beta * h**2)
         if factors is None:
-            factors = factorize_iteration_matrix(scheme, system, system.tangents(*point), mass, motion.x, h)
-        du, dlam = factors.solve(residual, violation)
+            solver = factorize_iteration_matrix(scheme, system, system.tangents(*point), mass, motion.x, h)
+        else:
+            solver = factors
+        du, dlam = solver.solve(residual, violation)
         size = jnp.max(jnp.abs(du) * (scheme.beta * h**2) / scale)
         measured = (iterate.iterations > 0) & (iterate.increment > 64 * eps)  # increments below are round-off
         contraction = jnp.where(measured, jnp.maximum(size / iterate.increment, _FASTEST), iterate.contraction)
