@@ -41,7 +41,7 @@ class GeneralizedAlpha(eqx.Module):
         tolerance: the last Newton increment of a configuration, relative to 1 rad or the length of the
             scene, at which a step has converged. The error left is its square; below 64 round-offs
             it is raised to that (single precision).
-        max_iterations: Newton iterations per step before the step has failed.
+        max_iterations: full Newton iterations per step before the step has failed.
         factor_every: steps that share one inverse of the iteration matrix (modified Newton). Its iterations cost a
             tenth of a full one, and go on until the error left is what full Newton would leave; a step that they do
             not bring there is finished by full Newton. 0: full Newton always. The sensitivities do not depend on it:
