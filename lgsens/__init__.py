@@ -18,7 +18,12 @@ from lgsens._simulate import (
     initial_state as initial_state,
     simulate as simulate,
 )
-from lgsens._trajectory import BodyMotion as BodyMotion, Instant as Instant, Trajectory as Trajectory
+from lgsens._trajectory import (
+    BodyMotion as BodyMotion,
+    Instant as Instant,
+    Saved as Saved,
+    Trajectory as Trajectory,
+)
 from lgsens.criteria import Criterion as Criterion, time_integral as time_integral
 from lgsens.dynamics import RESULTS as RESULTS, AbstractSystem as AbstractSystem, State as State
 from lgsens.integrate import GeneralizedAlpha as GeneralizedAlpha

@@ -127,6 +127,24 @@ class Trajectory(AbstractMotion):
         return jax.tree.map(lambda leaf: leaf[index], self.states)
 
 
+class Saved(eqx.Module):
+    """What `simulate` returns with `save`: the outputs asked for, and no trajectory.
+
+    Attributes:
+        t: the times t0 + n h [s], shape (n+1,).
+        values: what `save` returned, every array with a leading axis n + 1.
+        final: the state at t1, from which a simulation can be continued.
+        result: a value of `RESULTS`, shape (), int32; 0 is success.
+        stats: Newton's iterations, increments and residuals.
+    """
+
+    t: Float[Array, " n+1"]
+    values: Any
+    final: State
+    result: Int[Array, ""]
+    stats: Stats
+
+
 class Instant(AbstractMotion):
     """One instant of a motion: what the integrand of a `Criterion` sees.
 

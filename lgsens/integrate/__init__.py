@@ -5,6 +5,7 @@ from lgsens.integrate._integrate import (
     Guess as Guess,
     Stats as Stats,
     integrate as integrate,
+    integrate_outputs as integrate_outputs,
     take_step as take_step,
 )
 from lgsens.integrate._linear import Factors as Factors

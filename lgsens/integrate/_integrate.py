@@ -7,8 +7,9 @@ it takes three or four to round-off, each a tenth of a full one. Its increment d
 would be to ask for increments that the round-off of the constraints does not allow.
 """
 
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -164,6 +165,20 @@ def integrate(
 
     A step that does not converge ends the simulation: it and the steps after it are NaN, and `Stats` says so.
     """
+    states, _, stats = integrate_outputs(scheme, num_steps, system, state0, t0, h, lambda state, _: state)
+    return states, stats
+
+
+def integrate_outputs(
+    scheme: GeneralizedAlpha,
+    num_steps: int,
+    system: AbstractSystem,
+    state0: State,
+    t0,
+    h,
+    output: Callable[[State, Any], Any],
+) -> tuple[Any, State, Stats]:
+    """`output(state, t)` stacked instead of the states, the final state, and what Newton did."""
     constants = Constants.of(system)
 
     def inverse(state: State, n) -> Inverse:
@@ -179,10 +194,9 @@ def integrate(
             due = jnp.mod(n, scheme.factor_every) == 0
             renewed = lambda carry: (jnp.zeros((), bool), inverse(previous, n))
             _, earlier = lax.while_loop(lambda carry: carry[0], renewed, (due, earlier))
-        state, guess, stats = take_step(
-            scheme, system, constants, previous, guess, earlier, running, t0 + (n + 1) * h, h
-        )
-        return (state, guess, earlier, stats.converged), (state, stats)
+        t = t0 + (n + 1) * h
+        state, guess, stats = take_step(scheme, system, constants, previous, guess, earlier, running, t, h)
+        return (state, guess, earlier, stats.converged), (output(state, t), stats)
 
     count = jnp.arange(num_steps, dtype=constants.mass.dtype)
     earlier = None
@@ -190,6 +204,7 @@ def integrate(
         shape = jax.eval_shape(inverse, state0, count[0])
         earlier = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
     start = (state0, Guess.first(state0), earlier, jnp.ones((), bool))
-    _, (states, stats) = lax.scan(step, start, count)
-    states = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), state0, states)
-    return states, stats
+    (final, *_), (outputs, stats) = lax.scan(step, start, count)
+    first = jax.tree.map(jnp.asarray, output(state0, t0))
+    outputs = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), first, outputs)
+    return outputs, final, stats

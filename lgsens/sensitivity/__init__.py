@@ -5,6 +5,7 @@ from lgsens.sensitivity._criterion_terms import Functional as Functional
 from lgsens.sensitivity._linearization import (
     Parameters as Parameters,
     configuration_cotangent as configuration_cotangent,
+    times as times,
 )
 from lgsens.sensitivity._methods import (
     AbstractSensitivity as AbstractSensitivity,
@@ -14,3 +15,4 @@ from lgsens.sensitivity._methods import (
     DirectDifferentiation as DirectDifferentiation,
 )
 from lgsens.sensitivity._on_the_fly import direct_on_the_fly as direct_on_the_fly
+from lgsens.sensitivity._saved import SavedRun as SavedRun, saved_run as saved_run

@@ -62,13 +62,16 @@ class Step(NamedTuple):
 
 def steps(states: State, parameters: Parameters) -> Step:
     """All steps of a trajectory, stacked."""
-    num_steps = states.v.shape[0] - 1
-    count = jnp.arange(1, num_steps + 1, dtype=states.v.dtype)
     return Step(
         previous=jax.tree.map(lambda leaf: leaf[:-1], states),
         state=jax.tree.map(lambda leaf: leaf[1:], states),
-        t=parameters.t0 + count * parameters.h,
+        t=times(states.v.shape[0] - 1, parameters)[1:],
     )
+
+
+def times(num_steps: int, parameters: Parameters) -> Float[Array, " n+1"]:
+    """t0 + n h."""
+    return parameters.t0 + jnp.arange(num_steps + 1, dtype=parameters.h.dtype) * parameters.h
 
 
 def step_increment(scheme: GeneralizedAlpha, step: Step, h) -> tuple[Float[Array, " k"], Rates]:

@@ -94,14 +94,21 @@ class Autodiff(AbstractSensitivity):
 
 def _run(scheme, num_steps, state0, parameters):
     states, stats = integrate(scheme, num_steps, parameters.system, state0, parameters.t0, parameters.h)
-    return states, jax.tree.map(lambda leaf: leaf.astype(states.v.dtype), stats)
+    return states, encoded(stats, states.v.dtype)
+
+
+def encoded(stats: Stats, dtype) -> Stats:
+    return jax.tree.map(lambda leaf: leaf.astype(dtype), stats)
+
+
+def decoded(stats: Stats) -> Stats:
+    stats = lax.stop_gradient(stats)
+    return stats._replace(iterations=stats.iterations.astype(jnp.int32), converged=stats.converged.astype(bool))
 
 
 def _decoded(run) -> tuple[State, Stats]:
-    states, encoded = run
-    stats = lax.stop_gradient(encoded)
-    stats = stats._replace(iterations=stats.iterations.astype(jnp.int32), converged=stats.converged.astype(bool))
-    return states, stats
+    states, stats = run
+    return states, decoded(stats)
 
 
 # Direct differentiation. The tangent of the trajectory solves L (δ, p') = (b, p'), b = (δ_0, 0, …, 0).
