@@ -9,6 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from lgsens._errors import throw_if_failed
+from lgsens._index_reduced_ode import IndexReducedODE, integrate_ode, ode_failure
+from lgsens._richardson import Richardson, extrapolate_runs
 from lgsens._trajectory import Trajectory
 from lgsens._validate import as_count, as_float, require
 from lgsens.dynamics import (
@@ -105,18 +107,19 @@ def simulate(
     t0=0.0,
     t1,
     num_steps: int,
-    integrator: GeneralizedAlpha = GeneralizedAlpha(),
+    integrator: GeneralizedAlpha | Richardson | IndexReducedODE = GeneralizedAlpha(),
     sensitivity: AbstractSensitivity = DirectDifferentiation(),
     state0: State | None = None,
     throw: bool = True,
 ) -> Trajectory:
-    """Integrate the motion of a model from t0 to t1 with the Lie-group generalized-α scheme (paper §4).
+    """Integrate the motion of a model from t0 to t1, by default with the Lie-group generalized-α scheme (paper §4).
 
     Arguments:
         model: the scene, or an `AbstractSystem`.
         t0, t1: initial and final time [s], shape (); t1 > t0.
         num_steps: number of steps of equal size h = (t1 − t0)/num_steps; a Python int.
-        integrator: the scheme and its Newton settings.
+        integrator: the scheme and its Newton settings, `GeneralizedAlpha`. `Richardson` extrapolates two such runs,
+            of n and 2n steps, to nearly fourth order. `IndexReducedODE`: an explicit Runge–Kutta scheme of high order.
         sensitivity: how the trajectory is differentiated. `DirectDifferentiation` supports every JAX
             transformation; `AdjointVariable` is reverse mode only.
         state0: the state at t0, used as it is: one of `equilibrium`, or `Trajectory.state` to continue. None: the
@@ -133,7 +136,12 @@ def simulate(
     """
     system = as_system(model)
     warn_of_single_precision(system)
-    check_integrator(integrator)
+    if not isinstance(integrator, Richardson | IndexReducedODE):
+        check_integrator(integrator)
+    if isinstance(integrator, IndexReducedODE) and sensitivity != DirectDifferentiation():
+        raise ValueError(
+            f"`sensitivity` = {sensitivity!r} is for generalized-α; leave it out, IndexReducedODE has its own."
+        )
     if not isinstance(sensitivity, AbstractSensitivity):
         raise ValueError(
             "`sensitivity` must be DirectDifferentiation(), AdjointVariable(), ContinuousDirect() or Autodiff(), got "
@@ -148,8 +156,14 @@ def simulate(
 
 
 def check_integrator(integrator: GeneralizedAlpha) -> None:
-    if not isinstance(integrator, GeneralizedAlpha):
-        raise ValueError(f"`integrator` must be a GeneralizedAlpha, got {integrator!r}.")
+    if isinstance(integrator, GeneralizedAlpha):
+        return
+    advice = ""
+    if isinstance(integrator, Richardson):
+        advice = " Extrapolate what it finds: `richardson(lambda n: differentiate(…, num_steps=n)[:2], num_steps)`."
+    elif isinstance(integrator, IndexReducedODE):
+        advice = " `jax.grad` and `jax.jacfwd` of a criterion of `simulate` differentiate this one."
+    raise ValueError(f"`integrator` must be a GeneralizedAlpha, got {integrator!r}.{advice}")
 
 
 def interval(t0, t1):
@@ -161,8 +175,34 @@ def interval(t0, t1):
 
 @eqx.filter_jit
 def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0):
-    start = begin(integrator, system, t0, (t1 - t0) / num_steps, state0)
-    return run(system, start, t0, t1, num_steps, integrator, sensitivity)
+    initial = None if state0 is not None else _initial(system, t0)
+    if isinstance(integrator, IndexReducedODE):
+        return _run_ode(system, begin(_AS_IT_IS, system, t0, t1, state0, initial), t0, t1, num_steps, integrator)
+
+    def steps(scheme, num_steps):
+        start = begin(scheme, system, t0, (t1 - t0) / num_steps, state0, initial)
+        return run(system, start, t0, t1, num_steps, scheme, sensitivity)
+
+    if not isinstance(integrator, Richardson):
+        return steps(integrator, num_steps)
+    (coarse, of_coarse), (fine, of_fine) = (steps(integrator.integrator, n) for n in (num_steps, 2 * num_steps))
+    failed = coarse.result != RESULTS.successful
+    details = jax.tree.map(lambda first, second: jnp.where(failed, first, second), of_coarse, of_fine)
+    return extrapolate_runs(coarse, fine), details | {"run": jnp.where(failed, 1, 2)}
+
+
+_AS_IT_IS = GeneralizedAlpha(second_order_start=False)  # nothing of the scheme in the initial state
+
+
+def _run_ode(system: AbstractSystem, start: "Begin", t0, t1, num_steps: int, integrator: IndexReducedODE):
+    """`run` of the index-reduced equations."""
+    h = (t1 - t0) / num_steps
+    states, stats = integrate_ode(integrator, num_steps, system, start.state, t0, h)
+    result, details = ode_failure(stats, t0, h)
+    result = jnp.where(start.result == RESULTS.successful, result, start.result).astype(jnp.int32)
+    details = jax.lax.stop_gradient(details | {"violation": start.violation, "jacobian": start.jacobian})
+    t = _times(t0, h, num_steps)
+    return Trajectory(t=t, states=states, result=result, stats=stats, system=system, order=4), details
 
 
 class Begin(NamedTuple):
@@ -175,12 +215,14 @@ class Begin(NamedTuple):
     jacobian: Float[Array, "m k"]
 
 
-def begin(integrator: GeneralizedAlpha, system: AbstractSystem, t0, h, state0: State | None) -> Begin:
-    """The state at t0: `state0` as it is, or the consistent one of the reference configuration."""
+def begin(
+    integrator: GeneralizedAlpha, system: AbstractSystem, t0, h, state0: State | None, initial: Initial | None = None
+) -> Begin:
+    """The state at t0: `state0` as it is, or the consistent one of the reference configuration, `initial` if known."""
     if state0 is not None:
         jacobian = system.constraint_jacobian(state0.q)
         return Begin(state0, state0.v, jnp.zeros((), jnp.int32), system.constraint(state0.q), jacobian)
-    initial = _initial(system, t0)
+    initial = _initial(system, t0) if initial is None else initial
     usable = initial.result == RESULTS.successful
     state = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), _started(integrator, system, initial, h))
     jacobian = system.constraint_jacobian(initial.state.q)
@@ -211,8 +253,12 @@ def run(system: AbstractSystem, start: Begin, t0, t1, num_steps: int, integrator
     h = (t1 - t0) / num_steps
     states, stats = sensitivity.trajectory(integrator, num_steps, start.state, Parameters(system, t0, h))
     result, details = outcome(integrator, start, stats, t0, h)
-    count = jnp.arange(num_steps + 1, dtype=h.dtype)
-    return Trajectory(t=t0 + count * h, states=states, result=result, stats=stats, system=system), details
+    t = _times(t0, h, num_steps)
+    return Trajectory(t=t, states=states, result=result, stats=stats, system=system), details
+
+
+def _times(t0, h, num_steps: int):
+    return t0 + jnp.arange(num_steps + 1, dtype=h.dtype) * h
 
 
 def _started(integrator: GeneralizedAlpha, system: AbstractSystem, initial: Initial, h) -> State:
