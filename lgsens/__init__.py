@@ -12,7 +12,9 @@ from lgsens._advice import Advice as Advice, Costs as Costs, direct_or_adjoint a
 from lgsens._cost import measure_costs as measure_costs
 from lgsens._differentiate import Sensitivities as Sensitivities, differentiate as differentiate
 from lgsens._errors import SimulationError as SimulationError
+from lgsens._index_reduced_ode import IndexReducedODE as IndexReducedODE
 from lgsens._reference_methods import FiniteDifferences as FiniteDifferences, IndexReduced as IndexReduced
+from lgsens._richardson import Extrapolated as Extrapolated, Richardson as Richardson, richardson as richardson
 from lgsens._simulate import (
     equilibrium as equilibrium,
     initial_state as initial_state,
@@ -22,6 +24,7 @@ from lgsens._trajectory import (
     BodyMotion as BodyMotion,
     Instant as Instant,
     Saved as Saved,
+    StateError as StateError,
     Trajectory as Trajectory,
 )
 from lgsens.criteria import Criterion as Criterion, time_integral as time_integral

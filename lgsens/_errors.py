@@ -10,6 +10,9 @@ from jax.core import Tracer
 
 from lgsens.dynamics import RESULTS
 
+# Which of several runs: `details["run"]`.
+_RUNS = ("", " of the coarser of two runs", " of the finer of two runs")
+
 
 class SimulationError(RuntimeError):
     """A simulation or an equilibrium that failed; the message says at which step, when, and what to try."""
@@ -35,13 +38,18 @@ def describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> st
     if code is RESULTS.redundant_constraints:
         return f"{code.message} Joints involved: {redundant_names(details['jacobian'], names)}."
     if code is RESULTS.newton_failed:
-        step = int(details["step"])
+        step, run = int(details["step"]), _RUNS[int(details.get("run", 0))]
         return (
-            f"{code.message} It failed at step {step} of {int(details['num_steps'])}, "
+            f"{code.message} It failed at step {step} of {int(details['num_steps'])}{run}, "
             f"t = {details['time']:.6g} s, after {int(details['iterations'])} iterations: last increment "
             f"{details['increment']:.3g} (tolerance {details['tolerance']:.3g}), "
             f"residual {details['residual']:.3g}. "
             "`throw=False` returns the data up to the step before."
+        )
+    if code is RESULTS.integration_failed:
+        return (
+            f"{code.message} It failed in interval {int(details['step'])} of {int(details['num_steps'])}, from "
+            f"t = {details['time']:.6g} s on, in {int(details['steps'])} steps. `throw=False` returns the data before."
         )
     return code.message
 

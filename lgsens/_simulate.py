@@ -1,7 +1,8 @@
 """`simulate`, `initial_state` and `equilibrium`: the model in, a trajectory or a state out."""
 
 import warnings
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, overload
 
 import equinox as eqx
 import jax
@@ -9,7 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from lgsens._errors import throw_if_failed
-from lgsens._trajectory import Trajectory
+from lgsens._index_reduced_ode import IndexReducedODE, integrate_ode, ode_failure
+from lgsens._richardson import Richardson, extrapolate_runs
+from lgsens._trajectory import Instant, Saved, Trajectory
 from lgsens._validate import as_count, as_float, require
 from lgsens.dynamics import (
     RESULTS,
@@ -22,7 +25,7 @@ from lgsens.dynamics import (
 )
 from lgsens.integrate import GeneralizedAlpha, Stats
 from lgsens.model import Model
-from lgsens.sensitivity import AbstractSensitivity, DirectDifferentiation, Parameters
+from lgsens.sensitivity import AbstractSensitivity, DirectDifferentiation, Parameters, saved_run, times
 
 
 def as_system(model: Model | AbstractSystem) -> AbstractSystem:
@@ -99,28 +102,68 @@ def _checked(system: AbstractSystem, initial: Initial, throw: bool) -> State:
     return throw_if_failed(initial.state, initial.result, details, system.constraint_names)
 
 
+Integrator = GeneralizedAlpha | Richardson | IndexReducedODE
+Save = Callable[[Instant], Any]
+
+
+@overload
+def simulate(
+    model: Model | AbstractSystem,
+    *,
+    t0: Any = ...,
+    t1: Any,
+    num_steps: int,
+    integrator: Integrator = ...,
+    sensitivity: AbstractSensitivity = ...,
+    state0: State | None = ...,
+    save: None = ...,
+    throw: bool = ...,
+) -> Trajectory: ...
+
+
+@overload
+def simulate(
+    model: Model | AbstractSystem,
+    *,
+    t0: Any = ...,
+    t1: Any,
+    num_steps: int,
+    integrator: Integrator = ...,
+    sensitivity: AbstractSensitivity = ...,
+    state0: State | None = ...,
+    save: Save,
+    throw: bool = ...,
+) -> Saved: ...
+
+
 def simulate(
     model: Model | AbstractSystem,
     *,
     t0=0.0,
     t1,
     num_steps: int,
-    integrator: GeneralizedAlpha = GeneralizedAlpha(),
+    integrator: Integrator = GeneralizedAlpha(),
     sensitivity: AbstractSensitivity = DirectDifferentiation(),
     state0: State | None = None,
+    save: Save | None = None,
     throw: bool = True,
-) -> Trajectory:
-    """Integrate the motion of a model from t0 to t1 with the Lie-group generalized-α scheme (paper §4).
+):
+    """Integrate the motion of a model from t0 to t1, by default with the Lie-group generalized-α scheme (paper §4).
 
     Arguments:
         model: the scene, or an `AbstractSystem`.
         t0, t1: initial and final time [s], shape (); t1 > t0.
         num_steps: number of steps of equal size h = (t1 − t0)/num_steps; a Python int.
-        integrator: the scheme and its Newton settings.
+        integrator: the scheme and its Newton settings, `GeneralizedAlpha`. `Richardson` extrapolates two such runs,
+            of n and 2n steps, to nearly fourth order. `IndexReducedODE`: an explicit Runge–Kutta scheme of high order.
         sensitivity: how the trajectory is differentiated. `DirectDifferentiation` supports every JAX
             transformation; `AdjointVariable` is reverse mode only.
         state0: the state at t0, used as it is: one of `equilibrium`, or `Trajectory.state` to continue. None: the
             consistent initial state of the model.
+        save: what to return of each instant instead of the trajectory, a function s ↦ pytree of an `Instant`, of
+            `GeneralizedAlpha` only; the result is a `Saved`. Without derivatives no state is stored, so that a batch of
+            designs takes the memory of what it asks for. Define it once: a new lambda in each call compiles anew.
+            Numbers that it depends on come through the model, or are constants.
         throw: raise if the simulation fails. With False `Trajectory.result` says so, and the data are
             finite up to the failure and NaN from there on.
 
@@ -133,23 +176,39 @@ def simulate(
     """
     system = as_system(model)
     warn_of_single_precision(system)
-    check_integrator(integrator)
+    if not isinstance(integrator, Richardson | IndexReducedODE):
+        check_integrator(integrator)
+    if isinstance(integrator, IndexReducedODE) and sensitivity != DirectDifferentiation():
+        raise ValueError(
+            f"`sensitivity` = {sensitivity!r} is for generalized-α; leave it out, IndexReducedODE has its own."
+        )
     if not isinstance(sensitivity, AbstractSensitivity):
         raise ValueError(
             "`sensitivity` must be DirectDifferentiation(), AdjointVariable(), ContinuousDirect() or Autodiff(), got "
             f"{sensitivity!r}; ContinuousAdjoint() needs a Criterion, see `differentiate`."
         )
+    if save is not None and not (callable(save) and isinstance(integrator, GeneralizedAlpha)):
+        raise ValueError(
+            f"`save` must be a function of an Instant, with a GeneralizedAlpha as `integrator`; got {save!r} and "
+            f"{integrator!r}. Leave `save` out to have the trajectory."
+        )
     num_steps = as_count(num_steps, "num_steps", " (it is static)")
     t0, t1 = interval(t0, t1)
-    trajectory, details = _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0)
+    found, details = _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, save)
     if throw:
-        trajectory = throw_if_failed(trajectory, trajectory.result, details, system.constraint_names)
-    return trajectory
+        found = throw_if_failed(found, found.result, details, system.constraint_names)
+    return found
 
 
 def check_integrator(integrator: GeneralizedAlpha) -> None:
-    if not isinstance(integrator, GeneralizedAlpha):
-        raise ValueError(f"`integrator` must be a GeneralizedAlpha, got {integrator!r}.")
+    if isinstance(integrator, GeneralizedAlpha):
+        return
+    advice = ""
+    if isinstance(integrator, Richardson):
+        advice = " Extrapolate what it finds: `richardson(lambda n: differentiate(…, num_steps=n)[:2], num_steps)`."
+    elif isinstance(integrator, IndexReducedODE):
+        advice = " `jax.grad` and `jax.jacfwd` of a criterion of `simulate` differentiate this one."
+    raise ValueError(f"`integrator` must be a GeneralizedAlpha, got {integrator!r}.{advice}")
 
 
 def interval(t0, t1):
@@ -160,9 +219,37 @@ def interval(t0, t1):
 
 
 @eqx.filter_jit
-def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0):
-    start = begin(integrator, system, t0, (t1 - t0) / num_steps, state0)
-    return run(system, start, t0, t1, num_steps, integrator, sensitivity)
+def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, save):
+    initial = None if state0 is not None else _initial(system, t0)
+    if isinstance(integrator, IndexReducedODE):
+        return _run_ode(system, begin(_AS_IT_IS, system, t0, t1, state0, initial), t0, t1, num_steps, integrator)
+
+    def steps(scheme, num_steps):
+        start = begin(scheme, system, t0, (t1 - t0) / num_steps, state0, initial)
+        if save is not None:
+            return _run_saved(system, start, t0, t1, num_steps, scheme, sensitivity, save)
+        return run(system, start, t0, t1, num_steps, scheme, sensitivity)
+
+    if not isinstance(integrator, Richardson):
+        return steps(integrator, num_steps)
+    (coarse, of_coarse), (fine, of_fine) = (steps(integrator.integrator, n) for n in (num_steps, 2 * num_steps))
+    failed = coarse.result != RESULTS.successful
+    details = jax.tree.map(lambda first, second: jnp.where(failed, first, second), of_coarse, of_fine)
+    return extrapolate_runs(coarse, fine), details | {"run": jnp.where(failed, 1, 2)}
+
+
+_AS_IT_IS = GeneralizedAlpha(second_order_start=False)  # nothing of the scheme in the initial state
+
+
+def _run_ode(system: AbstractSystem, start: "Begin", t0, t1, num_steps: int, integrator: IndexReducedODE):
+    """`run` of the index-reduced equations."""
+    h = (t1 - t0) / num_steps
+    states, stats = integrate_ode(integrator, num_steps, system, start.state, t0, h)
+    result, details = ode_failure(stats, t0, h)
+    result = jnp.where(start.result == RESULTS.successful, result, start.result).astype(jnp.int32)
+    details = jax.lax.stop_gradient(details | {"violation": start.violation, "jacobian": start.jacobian})
+    t = times(num_steps, Parameters(system, t0, h))
+    return Trajectory(t=t, states=states, result=result, stats=stats, system=system, order=4), details
 
 
 class Begin(NamedTuple):
@@ -175,12 +262,14 @@ class Begin(NamedTuple):
     jacobian: Float[Array, "m k"]
 
 
-def begin(integrator: GeneralizedAlpha, system: AbstractSystem, t0, h, state0: State | None) -> Begin:
-    """The state at t0: `state0` as it is, or the consistent one of the reference configuration."""
+def begin(
+    integrator: GeneralizedAlpha, system: AbstractSystem, t0, h, state0: State | None, initial: Initial | None = None
+) -> Begin:
+    """The state at t0: `state0` as it is, or the consistent one of the reference configuration, `initial` if known."""
     if state0 is not None:
         jacobian = system.constraint_jacobian(state0.q)
         return Begin(state0, state0.v, jnp.zeros((), jnp.int32), system.constraint(state0.q), jacobian)
-    initial = _initial(system, t0)
+    initial = _initial(system, t0) if initial is None else initial
     usable = initial.result == RESULTS.successful
     state = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), _started(integrator, system, initial, h))
     jacobian = system.constraint_jacobian(initial.state.q)
@@ -208,11 +297,29 @@ def outcome(integrator: GeneralizedAlpha, start: Begin, stats: Stats, t0, h):
 
 def run(system: AbstractSystem, start: Begin, t0, t1, num_steps: int, integrator, sensitivity: AbstractSensitivity):
     """`simulate` without its checks: the trajectory, and what the message of a failure needs."""
-    h = (t1 - t0) / num_steps
-    states, stats = sensitivity.trajectory(integrator, num_steps, start.state, Parameters(system, t0, h))
-    result, details = outcome(integrator, start, stats, t0, h)
-    count = jnp.arange(num_steps + 1, dtype=h.dtype)
-    return Trajectory(t=t0 + count * h, states=states, result=result, stats=stats, system=system), details
+    parameters = Parameters(system, t0, (t1 - t0) / num_steps)
+    states, stats = sensitivity.trajectory(integrator, num_steps, start.state, parameters)
+    result, details = outcome(integrator, start, stats, t0, parameters.h)
+    t = times(num_steps, parameters)
+    return Trajectory(t=t, states=states, result=result, stats=stats, system=system), details
+
+
+def _run_saved(system, start: "Begin", t0, t1, num_steps: int, integrator, sensitivity, save: Save):
+    """`run` without a trajectory."""
+    parameters = Parameters(system, t0, (t1 - t0) / num_steps)
+    output = _Output(save)
+    values, final, stats = saved_run(sensitivity, output, integrator, num_steps, start.state, parameters)
+    result, details = outcome(integrator, start, stats, t0, parameters.h)
+    return Saved(times(num_steps, parameters), values, final, result, stats), details
+
+
+class _Output(eqx.Module):
+    """`save` as a function of the state; equal, for one compilation, where `save` is."""
+
+    save: Save = eqx.field(static=True)
+
+    def __call__(self, system, state: State, t):
+        return self.save(Instant(t=t, state=state, system=system))
 
 
 def _started(integrator: GeneralizedAlpha, system: AbstractSystem, initial: Initial, h) -> State:

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float, Int
 
 from lgsens._validate import suggestion
 from lgsens.dynamics import AbstractSystem, State
-from lgsens.integrate import Stats
 from lgsens.model import MultibodySystem
 
 
@@ -41,6 +40,22 @@ class BodyMotion(NamedTuple):
         """
         local = self.orientation[0].T @ (jnp.asarray(at, self.position.dtype) - self.position[0])
         return self.position + self.orientation @ local
+
+
+class StateError(NamedTuple):
+    """Errors of the states of a trajectory, estimated; every array has a leading axis over the n + 1 times.
+
+    Attributes:
+        w: of the configuration, in Lie-algebra coordinates (the true one is q exp(w̃) or thereabouts), shape (n+1, k).
+        v: of the velocity, shape (n+1, k).
+        vdot: of the acceleration, shape (n+1, k).
+        lam: of the multipliers, shape (n+1, m).
+    """
+
+    w: Float[Array, "n+1 k"]
+    v: Float[Array, "n+1 k"]
+    vdot: Float[Array, "n+1 k"]
+    lam: Float[Array, "n+1 m"]
 
 
 class AbstractMotion(eqx.Module):
@@ -109,15 +124,19 @@ class Trajectory(AbstractMotion):
         t: the times t0 + n h [s], shape (n+1,).
         states: the states, stacked along a leading axis.
         result: a value of `RESULTS`, shape (), int32; 0 is success.
-        stats: Newton's iterations, increments and residuals.
+        stats: Newton's iterations, increments and residuals; what the integrator says of its steps.
         system: the equations that were integrated.
+        error: an estimate of the errors of the states, from integrators that have one (`Richardson`); else None.
+        order: 2, or 4 where the states deserve a rule of fourth order: what to give `time_integral`, static.
     """
 
     t: Float[Array, " n+1"]
     states: State
     result: Int[Array, ""]
-    stats: Stats
+    stats: Any
     system: AbstractSystem
+    error: StateError | None = None
+    order: int = eqx.field(static=True, default=2)
 
     def _kinematics(self):
         return self.states, self.t
@@ -142,7 +161,7 @@ class Saved(eqx.Module):
     values: Any
     final: State
     result: Int[Array, ""]
-    stats: Stats
+    stats: Any
 
 
 class Instant(AbstractMotion):

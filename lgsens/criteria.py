@@ -6,10 +6,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from lgsens._trajectory import Instant, Trajectory
-from lgsens._validate import as_float
+from lgsens._validate import as_float, require
 from lgsens.dynamics import AbstractSystem, State
 
 Pointwise = Callable[[Instant, Any], Float[Array, ""]]
@@ -25,9 +26,9 @@ class Criterion(eqx.Module):
             `s.state`, `s.t`), `p` the design parameters. None: no integral.
         terminal: G(s, p) → scalar, of the instant t1. None: no terminal term.
 
-    `criterion(trajectory, p)` is Ψ, by the trapezoidal rule, and can be differentiated like any function of a
-    trajectory; `differentiate` gives its value and gradient by every method of the paper. Numbers that F and G
-    depend on come through `p`, or are constants.
+    `criterion(trajectory, p)` is Ψ, by `time_integral` of the order of the trajectory, and can be differentiated like
+    any function of a trajectory; `differentiate` gives its value and gradient by every method of the paper. Numbers
+    that F and G depend on come through `p`, or are constants.
 
     Raises `ValueError` if both are None or one cannot be called, and, when it is evaluated, for a value that is
     not a scalar. Source: Sonneville & Brüls (2014), §5.
@@ -57,7 +58,8 @@ class Criterion(eqx.Module):
         value = self.final(system, trajectory.state(-1), t[-1], p)
         if self.integrand is None:
             return value
-        return value + time_integral(t, jax.vmap(lambda state, t: self.rate(system, state, t, p))(states, t))
+        rates = jax.vmap(lambda state, t: self.rate(system, state, t, p))(states, t)
+        return value + time_integral(t, rates, order=trajectory.order)
 
 
 def _scalar(name: str, function: Pointwise | None, system, state: State, t, p) -> Float[Array, ""]:
@@ -76,22 +78,42 @@ def _scalar(name: str, function: Pointwise | None, system, state: State, t, p) -
     return jnp.asarray(value, t.dtype)
 
 
-def time_integral(t: Float[Array, " n"], f: Float[Array, " n ..."]) -> Float[Array, " ..."]:
-    """∫ f dt by the trapezoidal rule, second order like the integrator.
+def time_integral(t: Float[Array, " n"], f: Float[Array, " n ..."], *, order: int = 2) -> Float[Array, " ..."]:
+    """∫ f dt: by the trapezoidal rule, second order like the integrator, or by Gregory's rule of fourth order.
 
-        Ψ = Σ_n (t_{n+1} − t_n) (f_n + f_{n+1})/2
+        order 2:  T = Σ_n (t_{n+1} − t_n) (f_n + f_{n+1})/2
+        order 4:  T − h/12 (∇f_N − Δf_0) − h/24 (∇²f_N + Δ²f_0)
 
     Arguments:
         t: times [s], shape (n,), `Trajectory.t`.
         f: the integrand at these times, shape (n, …).
+        order: 2 or 4, static; `Trajectory.order` says what the states deserve. 4 needs equidistant times, three at
+            least, and an integrand with a continuous slope; with a slope that jumps between two times both
+            rules are of second order. Unlike Simpson's rule it weighs all times in the interior alike.
 
-    Returns the integral [unit of f × s], shape (…). Raises `ValueError` for lengths that differ.
-    Source: Sonneville & Brüls (2014), eq. (31).
+    Returns the integral [unit of f × s], shape (…). Raises `ValueError` for lengths that differ, another order, and for
+    order 4 with too few times or times that are not equidistant. Sources: Sonneville & Brüls (2014), eq. (31);
+    Hildebrand, Introduction to Numerical Analysis (1974), §5.8 (Gregory).
     """
     t, f = as_float(t, None, "`t`"), as_float(f, None, "`f`")
     if t.ndim != 1 or f.ndim < 1 or t.shape[0] != f.shape[0]:
         raise ValueError(
             f"`time_integral`: `t` must have shape (n,) and `f` shape (n, …), got {t.shape} and {f.shape}."
         )
+    if order not in (2, 4):
+        raise ValueError(f"`time_integral`: `order` must be 2 (trapezoidal) or 4 (Gregory), got {order!r}.")
     weight = jnp.diff(t).reshape((-1,) + (1,) * (f.ndim - 1))
-    return jnp.sum(jnp.broadcast_to(weight, f[1:].shape) * (f[1:] + f[:-1]), axis=0) / 2
+    trapezoidal = jnp.sum(jnp.broadcast_to(weight, f[1:].shape) * (f[1:] + f[:-1]), axis=0) / 2
+    if order == 2:
+        return trapezoidal
+    if t.shape[0] < 3:
+        raise ValueError(f"`time_integral`: order 4 needs at least 3 times, got {t.shape[0]}; order=2 does with fewer.")
+    require(
+        lambda t: np.ptp(np.diff(t)) <= 1e-6 * (t[-1] - t[0]) / (len(t) - 1) + 16 * np.spacing(np.abs(t).max()),
+        "`time_integral`: order 4 needs equidistant times `t`, as `Trajectory.t`; use order=2 for others.",
+        t,
+    )
+    first, last = f[:3], f[:-4:-1]  # from either end inwards: ∇ of the end is −Δ seen from there
+    slopes = (first[1] - first[0]) + (last[1] - last[0])
+    bends = (first[2] - 2.0 * first[1] + first[0]) + (last[2] - 2.0 * last[1] + last[0])
+    return trapezoidal + (t[-1] - t[0]) / (t.shape[0] - 1) * (slopes / 12.0 - bends / 24.0)

@@ -1,5 +1,11 @@
 """Constrained dynamics on any Lie group (paper, §3)."""
 
+from lgsens.dynamics._accelerations import (
+    ConstrainedInertia as ConstrainedInertia,
+    Inertia as Inertia,
+    constraint_velocity as constraint_velocity,
+    factorized_accelerations as factorized_accelerations,
+)
 from lgsens.dynamics._equilibrium import equilibrium as equilibrium
 from lgsens.dynamics._initial import (
     Initial as Initial,

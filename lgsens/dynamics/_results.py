@@ -11,6 +11,7 @@ class RESULTS(IntEnum):
     redundant_constraints = 2
     newton_failed = 3
     equilibrium_failed = 4
+    integration_failed = 5
 
     @property
     def message(self) -> str:
@@ -35,5 +36,9 @@ _MESSAGES = {
     RESULTS.equilibrium_failed: (
         "No static equilibrium was found near the reference configuration. Start closer to it, or check "
         "that the forces can balance (a body that nothing holds falls)."
+    ),
+    RESULTS.integration_failed: (
+        "The explicit integration left the finite numbers, or took more than `max_steps` steps in an output interval. "
+        "Try more `num_steps`, a looser `rtol`, more `max_steps`, or, for stiff forces, GeneralizedAlpha."
     ),
 }

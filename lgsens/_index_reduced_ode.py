@@ -1,0 +1,261 @@
+"""The index-reduced equations by an explicit Runge–Kutta scheme, as an integrator of `simulate`.
+
+With the constraint at acceleration level v̇ and λ are functions of the state, eq. (41). From one output time to the next
+the configuration is written q = q_n exp(x̃), which keeps rotations orthogonal whatever the scheme, and
+
+    ẋ = T⁻¹(x) v,     v̇ = v̇(q_n exp(x̃), v, t),     x(t_n) = 0                                      (9), (41)
+
+is an ordinary differential equation in R^{2k}. At the output time the drift from the constraints, Φ = 0 and B v = 0,
+is taken out again along M⁻¹Bᵀ, the directions in which the joints push: one step of Newton's iteration for q, then v,
+
+    q ← q exp(−M⁻¹Bᵀ S⁻¹ Φ(q)),     v ← v − M⁻¹Bᵀ S⁻¹ B v,      S = B M⁻¹ Bᵀ,
+
+with one factorization for both. Drift is of the order of the local error, what is left of the order of its square.
+
+Each evaluation has one factorization, which serves its derivative and the transpose too (`factorized_accelerations`). A
+step is recomputed in reverse mode: only the states at the output times are kept.
+
+Sources: Sonneville & Brüls (2014), eqs. (9) and (41); Munthe-Kaas, Applied Numerical Mathematics 29 (1999),
+doi:10.1016/S0168-9274(98)00030-0; Hairer & Wanner, Solving Ordinary Differential Equations II (1996), §VII.2.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from lgsens._validate import as_count
+from lgsens.dynamics import (
+    RESULTS,
+    AbstractSystem,
+    ConstrainedInertia,
+    Inertia,
+    State,
+    constraint_velocity,
+    factorized_accelerations,
+)
+
+MODES = ("reverse", "forward")
+
+
+class IndexReducedODE(eqx.Module):
+    """The index-reduced equations by an explicit Runge–Kutta scheme of diffrax: an integrator of `simulate`.
+
+        q̇ = q ṽ,     [[M, Bᵀ], [B, 0]] [v̇; λ] = [ad(v)ᵀ M v − f(q, v, t); −Ḃ v]                       (41)
+
+    For smooth motions without stiff forces: of the order of the scheme where generalized-α is of second.
+
+    Arguments:
+        solver: an explicit Runge–Kutta scheme of diffrax, `diffrax.Dopri8()` say. None: `diffrax.Tsit5()`, order 5.
+        rtol: None: `num_steps` steps of equal length. Else the tolerance of a step relative to the motion, from which
+            each of the `num_steps` output intervals is divided into as many steps as it needs, one at least.
+        atol: the absolute tolerance [m, rad, m/s, rad/s]; None: `rtol`.
+        max_steps: with `rtol`, how many steps an output interval may take.
+        mode: with `rtol`, which derivatives: "reverse" (`grad`, `jacrev`) or "forward" (`jvp`, `jacfwd`). Without
+            `rtol` every JAX transformation goes through, nested ones too.
+
+    `Trajectory.order` is 4, so integrals need `time_integral(…, order=4)`; times at which forces are not smooth should
+    be output times. Joints hold to the square of the error of a step at every output time, rotations to round-off; no
+    body may turn by half a revolution in an output interval. a is v̇.
+
+    **Step size.** An explicit scheme is stable up to |h ω| of about 3 for the fastest mode. The steps also integrate
+    the sensitivities, and tolerances on the motion do not see these: from rest the controller of diffrax alone takes
+    steps beyond stability, with Ψ right and gradients wrong by factors. Here no step is longer than an output
+    interval, so choose `num_steps` for stability, h = 5 ms for a suspension, and double it to see what gradients do.
+
+    The derivative is that of the numerical solution, to round-off, at equal steps; with `rtol` at the steps taken, as
+    if their lengths were given. All static and hashable. Raises `ValueError` for a solver that is not explicit
+    Runge–Kutta and for settings out of range. Source: Sonneville & Brüls (2014), eq. (41).
+    """
+
+    solver: Any = eqx.field(static=True, default=None)
+    rtol: float | None = eqx.field(static=True, default=None, kw_only=True)
+    atol: float | None = eqx.field(static=True, default=None, kw_only=True)
+    max_steps: int = eqx.field(static=True, default=256, kw_only=True)
+    mode: str = eqx.field(static=True, default="reverse", kw_only=True)
+
+    def __check_init__(self):
+        for name in ("rtol", "atol"):
+            value = getattr(self, name)
+            if value is not None and (not isinstance(value, int | float) or not 0.0 < value < math.inf):
+                raise ValueError(
+                    f"IndexReducedODE: `{name}` must be positive or None, got {value!r}; 1e-6 is a good start."
+                )
+        if self.atol is not None and self.rtol is None:
+            raise ValueError(f"IndexReducedODE: `atol` = {self.atol!r} needs `rtol`: without it all steps are equal.")
+        as_count(self.max_steps, "max_steps", " (it is static)")
+        if self.mode not in MODES:
+            raise ValueError(f"IndexReducedODE: `mode` must be one of {MODES}, got {self.mode!r}.")
+        if self.solver is not None:
+            _tableau(self.solver)
+
+
+def _tableau(solver) -> Any:
+    import diffrax  # takes its time to import
+
+    if not isinstance(solver, diffrax.AbstractERK):
+        raise ValueError(
+            "IndexReducedODE: `solver` must be an explicit Runge–Kutta scheme of diffrax, such as diffrax.Tsit5() or "
+            f"diffrax.Dopri8(), got {solver!r}."
+        )
+    return solver.tableau
+
+
+class StepStats(NamedTuple):
+    """What happened in each output interval.
+
+    Attributes:
+        steps: steps tried, shape (n,), int32; 0 after a failure.
+        drift: max |Φ| [m, –] at its end before the projection, shape (n,).
+        converged: whether its end was reached with finite numbers, shape (n,), bool.
+    """
+
+    steps: Int[Array, " n"]
+    drift: Float[Array, " n"]
+    converged: Bool[Array, " n"]
+
+
+class _Local(NamedTuple):
+    """The state in coordinates at q_n, or its rate."""
+
+    x: Float[Array, " k"]
+    v: Float[Array, " k"]
+
+
+class _Problem(eqx.Module):
+    """What all steps share."""
+
+    inertia: Inertia
+    system: AbstractSystem
+
+    def rate(self, q, local: _Local, t) -> _Local:
+        group = self.system.group
+        vdot, _ = factorized_accelerations(self.inertia, self.system, group.retract(q, local.x), local.v, t)
+        return _Local(group.tangent_inv_mv(local.x, local.v), vdot)
+
+    def projected(self, q, v):
+        """q and v on the constraints, and the drift taken out."""
+        system = self.system
+        if not system.constraint_names:
+            return q, v, jnp.zeros((), v.dtype)
+        kkt = ConstrainedInertia.of(self.inertia, system.constraint_jacobian(q))
+        violation = system.constraint(q)
+        free = jnp.zeros_like(v)
+        x, _ = kkt.solve(free, -violation)
+        q = system.group.retract(q, x)
+        correction, _ = kkt.solve(free, -constraint_velocity(system, q, v))
+        return q, v + correction, lax.stop_gradient(jnp.max(jnp.abs(violation)))
+
+
+def _one_step(tableau, problem: _Problem, q, first: _Local, v, t, h) -> _Local:
+    """One step of an explicit Runge–Kutta scheme from x = 0, whose first stage is known.
+
+    Stages that only the error estimate uses are left out.
+    """
+    rows = [np.zeros(0), *tableau.a_lower]
+    used = max(np.flatnonzero(tableau.b_sol)) + 1
+    matrix = np.zeros((used, used))
+    for i in range(used):
+        matrix[i, :i] = rows[i]
+    nodes = np.concatenate([[0.0], tableau.c])[:used]
+    start = _Local(jnp.zeros_like(v), v)
+
+    def advance(slopes, weights):
+        return jax.tree.map(lambda y, k: y + h * (weights @ k), start, slopes)
+
+    def stage(slopes, inputs):
+        i, weights, node = inputs
+        slope = problem.rate(q, advance(slopes, weights), t + node * h)
+        return jax.tree.map(lambda k, new: k.at[i].set(new), slopes, slope), None
+
+    slopes = jax.tree.map(lambda k: jnp.zeros((used, *k.shape), k.dtype).at[0].set(k), first)
+    inputs = (jnp.arange(1, used), jnp.asarray(matrix[1:], v.dtype), jnp.asarray(nodes[1:], v.dtype))
+    slopes, _ = lax.scan(stage, slopes, inputs)
+    return advance(slopes, jnp.asarray(tableau.b_sol[:used], v.dtype))
+
+
+def _adaptive(settings: IndexReducedODE, problem: _Problem, q, v, t, h, running):
+    """From one output time to the next under error control; nowhere unless `running`."""
+    import diffrax  # takes its time to import
+
+    rtol = 0.0 if settings.rtol is None else settings.rtol
+    atol = rtol if settings.atol is None else settings.atol
+    reverse = diffrax.RecursiveCheckpointAdjoint(checkpoints=settings.max_steps)
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, local, args: args[0].rate(args[1], local, t)),
+        diffrax.Tsit5() if settings.solver is None else settings.solver,
+        *(t, jnp.where(running, t + h, t), h, _Local(jnp.zeros_like(v), v), (problem, q)),
+        # the largest entry, so that more bodies do not loosen the control
+        stepsize_controller=diffrax.PIDController(rtol, atol, norm=_largest),
+        adjoint=reverse if settings.mode == "reverse" else diffrax.ForwardMode(),
+        max_steps=settings.max_steps,
+        throw=False,
+    )
+    assert solution.ys is not None
+    local = jax.tree.map(lambda leaf: leaf[0], solution.ys)
+    return local, solution.result == diffrax.RESULTS.successful, solution.stats["num_steps"]
+
+
+def _largest(tree) -> Float[Array, ""]:
+    return jnp.max(jnp.stack([jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(tree)]))
+
+
+def integrate_ode(settings: IndexReducedODE, num_steps: int, system: AbstractSystem, start: State, t0, h):
+    """The states at t0 + n h, n = 0 … num_steps, stacked along a leading axis, and what happened in between.
+
+    An interval that fails ends the simulation: its end and all after it are NaN, and `StepStats` says so.
+    """
+    import diffrax  # takes its time to import
+
+    problem = _Problem(Inertia.of(system), system)
+    tableau = _tableau(diffrax.Tsit5() if settings.solver is None else settings.solver)
+
+    def state(q, v, t) -> State:
+        vdot, lam = factorized_accelerations(problem.inertia, system, q, v, t)
+        return State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
+
+    def interval(problem: _Problem, begin: State, t, running):
+        if settings.rtol is None:
+            first = _Local(begin.v, begin.vdot)  # T(0) is the unit matrix
+            local = _one_step(tableau, problem, begin.q, first, begin.v, t, h)
+            finished, steps = jnp.ones((), bool), jnp.ones((), jnp.int32)
+        else:
+            local, finished, steps = _adaptive(settings, problem, begin.q, begin.v, t, h, running)
+        q, v, drift = problem.projected(system.group.retract(begin.q, local.x), local.v)
+        return q, v, drift, finished, steps
+
+    # In reverse mode nothing is kept of an interval but how it begins.
+    interval = jax.checkpoint(interval, prevent_cse=False)
+
+    def step(carry, n):
+        begin, running = carry
+        q, v, drift, finished, steps = interval(problem, begin, t0 + n * h, running)
+        end = state(q, v, t0 + (n + 1) * h)
+        finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(end)]))
+        converged = running & finished & finite
+        end = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), end)
+        steps = jnp.where(running, steps, 0).astype(jnp.int32)
+        return (end, converged), (end, StepStats(steps, drift, converged))
+
+    first = state(start.q, start.v, t0)
+    count = jnp.arange(num_steps, dtype=h.dtype)
+    _, (states, stats) = lax.scan(step, (first, jnp.ones((), bool)), count)
+    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), first, states), stats
+
+
+def ode_failure(stats: StepStats, t0, h):
+    """Whether and where the integration failed: the result code, and what its message needs."""
+    failed = jnp.argmin(stats.converged)  # the first interval that failed, 0 if none did
+    result = jnp.where(jnp.all(stats.converged), RESULTS.successful, RESULTS.integration_failed)
+    details = {
+        "step": failed + 1,
+        "num_steps": jnp.asarray(stats.converged.shape[0]),
+        "time": t0 + failed.astype(h.dtype) * h,
+        "steps": stats.steps[failed],
+    }
+    return result, details

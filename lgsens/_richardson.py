@@ -1,0 +1,128 @@
+"""Richardson extrapolation in the step size: of a trajectory, and of any function of the number of steps.
+
+What a convergent scheme of second order computes with step h is ψ_h = ψ + c₂ h² + c₃ h³ + …, so with two runs
+
+    ψ ≈ ψ_{h/2} + e,      e = (ψ_{h/2} − ψ_h)/3,
+
+is at least one order better, and e estimates the error that the finer run had. For generalized-α c₃ is there, it
+vanishes with the numerical damping (ρ∞ → 1): at ρ∞ = 0.9 errors fall by 13 to 16 when h is halved, at 0.3 by 8 to 10.
+In a Lie group the difference of two configurations is a logarithm,
+
+    q = q_{h/2} exp(w̃),   w = log(q_h⁻¹ q_{h/2})/3,
+
+exact to the order of w² ~ h⁴. Both formulas are differentiated as they stand: the derivative is the same extrapolation
+of the exact derivatives of the two runs.
+
+Sources: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I (2008), §II.4 and §II.8; Arnold, Brüls &
+Cardona, Numerische Mathematik 129 (2015), doi:10.1007/s00211-014-0633-1, for the error of generalized-α.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import PyTree
+
+from lgsens._trajectory import StateError, Trajectory
+from lgsens._validate import as_count
+from lgsens.dynamics import RESULTS, State
+from lgsens.integrate import GeneralizedAlpha
+
+
+class Richardson(eqx.Module):
+    """Two generalized-α runs, one step half the other, extrapolated: an integrator of `simulate`.
+
+        x ≈ x_{h/2} + (x_{h/2} − x_h)/3   for v, v̇, λ,       q ≈ q_{h/2} exp(log(q_h⁻¹ q_{h/2})~/3)
+
+    Arguments:
+        integrator: the scheme of both runs, a `GeneralizedAlpha`.
+
+    The trajectory has the n + 1 times of the coarser run; `Trajectory.error` is what was added to the finer run, an
+    estimate of its error, and more than what is left. `Trajectory.order` is 4: criteria that are integrals need
+    `time_integral(…, order=4)`, because the trapezoidal rule on n steps would cost more than extrapolation gains.
+    `stats` are those of the n steps of the coarser run, then of the 2n of the finer. a is v̇, since the algorithmic
+    acceleration belongs to a step size.
+
+    Errors fall by 13 to 16 when the number of steps is doubled, at ρ∞ = 0.9 and in smooth motions; a force that is not
+    smooth in time (a bump that ends) should change on a time step. In the first steps v̇ and λ have transients
+    (−ρ∞)ⁿ h² that differ in the two runs and stay. Constraints are not solved for: Φ is of the
+    order of w². The cost is that of 3n steps. Start from the consistent initial state of the model, or from a `state0`
+    at rest: that of another run brings the a of its own step size, and one order is lost.
+
+    Raises `ValueError` for anything but a `GeneralizedAlpha`.
+    """
+
+    integrator: GeneralizedAlpha = GeneralizedAlpha()
+
+    def __check_init__(self):
+        if not isinstance(self.integrator, GeneralizedAlpha):
+            raise ValueError(f"Richardson: `integrator` must be a GeneralizedAlpha, got {self.integrator!r}.")
+
+
+class Extrapolated(NamedTuple):
+    """What `richardson` returns.
+
+    Attributes:
+        value: the extrapolated values, a pytree as the function returns.
+        error: the estimated errors of the finer run, value − fn(2 num_steps), as large or larger than what is left.
+    """
+
+    value: PyTree
+    error: PyTree
+
+
+def richardson(fn: Callable[[int], Any], num_steps: int) -> Extrapolated:
+    """The limit of a function of the number of steps, of second order, from two of its values.
+
+        ψ ≈ ψ_{2n} + e,   e = (ψ_{2n} − ψ_n)/3
+
+    Arguments:
+        fn: number of steps ↦ a pytree of floats; for instance criteria, their gradients, or both:
+            `lambda n: differentiate(criteria, build, p, t1=1.0, num_steps=n)[:2]`.
+        num_steps: n, a Python int; `fn` is called with n and 2n.
+
+    Every JAX transformation goes through as it does through `fn`. Raises `ValueError` for a number of steps that is not
+    one, and for values that are not floats.
+    """
+    num_steps = as_count(num_steps, "num_steps", " (it is static)")
+    if not callable(fn):
+        raise ValueError(f"`fn` must be a function of the number of steps, got {fn!r}.")
+    coarse, fine = fn(num_steps), fn(2 * num_steps)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(fine):
+        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+            raise ValueError(
+                f"`fn` must return floats, got {jnp.result_type(leaf)} in its value{jax.tree_util.keystr(path)}; "
+                "return only what shall be extrapolated."
+            )
+    error = jax.tree.map(_third, coarse, fine)
+    return Extrapolated(jax.tree.map(jnp.add, fine, error), error)
+
+
+def _third(coarse, fine):
+    return (fine - coarse) / 3.0
+
+
+def extrapolate_runs(coarse: Trajectory, fine: Trajectory) -> Trajectory:
+    """The trajectory on the times of `coarse` from two runs of the same system, `fine` with half the step."""
+    group = coarse.system.group
+    halved = jax.tree.map(lambda leaf: leaf[::2], fine.states)
+
+    def at(rough: State, better: State) -> tuple[State, StateError]:
+        w = group.log(group.compose(group.inverse(rough.q), better.q)) / 3.0
+        v, vdot, lam = (_third(getattr(rough, name), getattr(better, name)) for name in ("v", "vdot", "lam"))
+        acceleration = better.vdot + vdot
+        state = State(group.retract(better.q, w), better.v + v, acceleration, better.lam + lam, acceleration)
+        return state, StateError(w, v, vdot, lam)
+
+    states, error = jax.vmap(at)(coarse.states, halved)
+    return Trajectory(
+        t=coarse.t,
+        states=states,
+        result=jnp.where(coarse.result == RESULTS.successful, fine.result, coarse.result),
+        stats=jax.tree.map(lambda first, second: jnp.concatenate([first, second]), coarse.stats, fine.stats),
+        system=coarse.system,
+        error=error,
+        order=4,
+    )

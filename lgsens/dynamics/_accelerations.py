@@ -1,0 +1,118 @@
+"""Accelerations and multipliers with a hand-derived derivative: one factorization for value, tangent and transpose.
+
+The equations of the motion through (q, v) at t, eq. (41),
+
+    E(v̇, λ; z) = [ r(q, v, v̇, λ, t);  D²Φ(q)·(q ṽ, q ṽ) + DΦ(q)·(q v̇~) ] = 0,      z = (numbers of the system, q, v, t),
+
+are linear in (v̇, λ) with the matrix A = [[M, Bᵀ], [B, 0]]. Differentiated at the solution,
+
+    A [v̇'; λ'] = −E_z z',
+
+the right-hand side being the derivative of r and of the constraint at acceleration level for fixed v̇ and λ: vectors
+only, no derivative of M, B or Ḃ as a matrix. A is symmetric, so the transpose of the rule solves with A as well.
+
+M is constant. With N = M⁻¹, made once outside the time loop, and the Cholesky factors of the complement S = B N Bᵀ,
+
+    A [x; μ] = [f; c]:     S μ = B N f − c,     x = N (f − Bᵀ μ),
+
+m³/3 instead of 2 (k + m)³/3 operations: an eighteenth on the quarter-car (k = 48, m = 45). S is scaled to a unit
+diagonal, since the rows of B have different units.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg as jsl
+from jax import lax
+from jaxtyping import Array, Float
+
+from lgsens.dynamics._system import AbstractSystem
+
+
+class Inertia(eqx.Module):
+    """M and its inverse: what all evaluations share."""
+
+    mass: Float[Array, "k k"]
+    inverse: Float[Array, "k k"]
+
+    @classmethod
+    def of(cls, system: AbstractSystem) -> "Inertia":
+        mass = system.mass_matrix()
+        # N serves to solve only, and needs no derivative: that of the solution comes from M.
+        fixed = lax.stop_gradient(mass)
+        return cls(mass, jnp.linalg.solve(fixed, jnp.eye(fixed.shape[0], dtype=fixed.dtype)))
+
+
+class ConstrainedInertia(eqx.Module):
+    """A = [[M, Bᵀ], [B, 0]] at one configuration, factorized."""
+
+    inertia: Inertia
+    jacobian: Float[Array, "m k"]
+    factor: Float[Array, "m m"]  # lower triangular, of D S D
+    scale: Float[Array, " m"]  # D
+
+    @classmethod
+    def of(cls, inertia: Inertia, jacobian) -> "ConstrainedInertia":
+        fixed = lax.stop_gradient(jacobian)
+        complement = fixed @ inertia.inverse @ fixed.T
+        scale = lax.rsqrt(jnp.diagonal(complement))
+        factor = jnp.linalg.cholesky(complement * scale[:, None] * scale[None, :], symmetrize_input=False)
+        return cls(inertia, jacobian, factor, scale)
+
+    def _apply(self, unknown):
+        k = self.inertia.mass.shape[0]
+        x, mu = unknown[:k], unknown[k:]
+        return jnp.concatenate([self.inertia.mass @ x + mu @ self.jacobian, self.jacobian @ x])
+
+    def _eliminate(self, rhs):
+        inverse, jacobian = lax.stop_gradient((self.inertia.inverse, self.jacobian))
+        f, c = rhs[: inverse.shape[0]], rhs[inverse.shape[0] :]
+        free = inverse @ f
+        mu = self.scale * jsl.cho_solve((self.factor, True), self.scale * (jacobian @ free - c))
+        return jnp.concatenate([free - inverse @ (mu @ jacobian), mu])
+
+    def solve(self, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
+        """x and μ of A [x; μ] = [force; rate]; its own transpose, and differentiable through M and B."""
+        rhs = jnp.concatenate([force, rate])
+        solution = lax.custom_linear_solve(self._apply, rhs, lambda _, rhs: self._eliminate(rhs), symmetric=True)
+        return solution[: force.shape[0]], solution[force.shape[0] :]
+
+
+def constraint_velocity(system: AbstractSystem, q, v) -> Float[Array, " m"]:
+    """dΦ/dt = DΦ·(q ṽ) = B v, without B."""
+    return jax.jvp(system.constraint, (q,), (system.group.to_ambient(q, v),))[1]
+
+
+def constraint_acceleration(system: AbstractSystem, q, v, vdot) -> Float[Array, " m"]:
+    """d²Φ/dt² = D²Φ·(q ṽ, q ṽ) + DΦ·(q v̇~) of the motion through (q, v) with the acceleration v̇."""
+    velocity = lambda q: constraint_velocity(system, q, v)
+    _, rate = jax.jvp(velocity, (q,), (system.group.to_ambient(q, v),))
+    return rate + constraint_velocity(system, q, vdot)
+
+
+def _equations(system: AbstractSystem, q, v, vdot, lam, t):
+    return system.residual(q, v, vdot, lam, t), constraint_acceleration(system, q, v, vdot)
+
+
+def _solved(inertia: Inertia, system: AbstractSystem, q, v, t):
+    kkt = ConstrainedInertia.of(inertia, system.constraint_jacobian(q))
+    free = jnp.zeros_like(v), jnp.zeros(kkt.jacobian.shape[0], v.dtype)
+    left = _equations(system, q, v, *free, t)
+    return kkt.solve(*jax.tree.map(jnp.negative, left)), kkt
+
+
+@jax.custom_jvp
+def factorized_accelerations(inertia: Inertia, system: AbstractSystem, q: Any, v, t):
+    """v̇, shape (k,), and λ, shape (m,), of the motion through (q, v) at t; `inertia` is that of the system."""
+    return _solved(inertia, system, q, v, t)[0]
+
+
+@factorized_accelerations.defjvp
+def _rule(primals, tangents):
+    inertia, z = primals[0], primals[1:]
+    (vdot, lam), kkt = _solved(inertia, *z)
+    equations = lambda system, q, v, t: _equations(system, q, v, vdot, lam, t)
+    _, change = jax.jvp(equations, z, tangents[1:])  # M is one of the numbers of the system
+    return (vdot, lam), kkt.solve(*jax.tree.map(jnp.negative, change))
