@@ -215,11 +215,12 @@ def integrate_ode(settings: IndexReducedODE, num_steps: int, system: AbstractSys
     problem = _Problem(Inertia.of(system), system)
     tableau = _tableau(diffrax.Tsit5() if settings.solver is None else settings.solver)
 
-    def state(q, v, t) -> State:
-        vdot, lam = factorized_accelerations(problem.inertia, system, q, v, t)
+    def state(problem: _Problem, q, v, t) -> State:
+        vdot, lam = factorized_accelerations(problem.inertia, problem.system, q, v, t)
         return State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
 
-    def interval(problem: _Problem, begin: State, t, running):
+    def interval(problem: _Problem, begin: State, n, running):
+        t = t0 + n * h
         if settings.rtol is None:
             first = _Local(begin.v, begin.vdot)  # T(0) is the unit matrix
             local = _one_step(tableau, problem, begin.q, first, begin.v, t, h)
@@ -227,22 +228,21 @@ def integrate_ode(settings: IndexReducedODE, num_steps: int, system: AbstractSys
         else:
             local, finished, steps = _adaptive(settings, problem, begin.q, begin.v, t, h, running)
         q, v, drift = problem.projected(system.group.retract(begin.q, local.x), local.v)
-        return q, v, drift, finished, steps
+        return state(problem, q, v, t0 + (n + 1) * h), drift, finished, steps
 
     # In reverse mode nothing is kept of an interval but how it begins.
     interval = jax.checkpoint(interval, prevent_cse=False)
 
     def step(carry, n):
         begin, running = carry
-        q, v, drift, finished, steps = interval(problem, begin, t0 + n * h, running)
-        end = state(q, v, t0 + (n + 1) * h)
+        end, drift, finished, steps = interval(problem, begin, n, running)
         finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(end)]))
         converged = running & finished & finite
         end = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), end)
         steps = jnp.where(running, steps, 0).astype(jnp.int32)
         return (end, converged), (end, StepStats(steps, drift, converged))
 
-    first = state(start.q, start.v, t0)
+    first = state(problem, start.q, start.v, t0)
     count = jnp.arange(num_steps, dtype=h.dtype)
     _, (states, stats) = lax.scan(step, (first, jnp.ones((), bool)), count)
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), first, states), stats

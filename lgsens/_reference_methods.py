@@ -31,7 +31,7 @@ class IndexReduced(eqx.Module):
 
     A Runge–Kutta method of order 8 with error control over motion and sensitivities together. It knows nothing of
     generalized-α, its linearization, or adjoint equations: the reference for all of these. `num_steps` and `integrator`
-    are not used.
+    are not used. To simulate with these equations: `IndexReducedODE`.
 
     Arguments:
         rtol, atol: tolerances, relative and absolute.

@@ -222,7 +222,7 @@ def interval(t0, t1):
 def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, save):
     initial = None if state0 is not None else _initial(system, t0)
     if isinstance(integrator, IndexReducedODE):
-        return _run_ode(system, begin(_AS_IT_IS, system, t0, t1, state0, initial), t0, t1, num_steps, integrator)
+        return _run_ode(system, state0, initial, t0, (t1 - t0) / num_steps, num_steps, integrator)
 
     def steps(scheme, num_steps):
         start = begin(scheme, system, t0, (t1 - t0) / num_steps, state0, initial)
@@ -238,12 +238,9 @@ def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, sa
     return extrapolate_runs(coarse, fine), details | {"run": jnp.where(failed, 1, 2)}
 
 
-_AS_IT_IS = GeneralizedAlpha(second_order_start=False)  # nothing of the scheme in the initial state
-
-
-def _run_ode(system: AbstractSystem, start: "Begin", t0, t1, num_steps: int, integrator: IndexReducedODE):
-    """`run` of the index-reduced equations."""
-    h = (t1 - t0) / num_steps
+def _run_ode(system: AbstractSystem, state0, initial, t0, h, num_steps: int, integrator: IndexReducedODE):
+    """`run` of the index-reduced equations, with nothing of generalized-α in the initial state."""
+    start = begin(GeneralizedAlpha(second_order_start=False), system, t0, h, state0, initial)
     states, stats = integrate_ode(integrator, num_steps, system, start.state, t0, h)
     result, details = ode_failure(stats, t0, h)
     result = jnp.where(start.result == RESULTS.successful, result, start.result).astype(jnp.int32)
