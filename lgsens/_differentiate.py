@@ -15,7 +15,8 @@ from lgsens._advice import direct_or_adjoint
 from lgsens._criterion_use import Use, checked_for
 from lgsens._errors import throw_if_failed
 from lgsens._reference_methods import STENCIL, FiniteDifferences, IndexReduced
-from lgsens._simulate import as_system, begin, check_integrator, interval, outcome, run
+from lgsens._simulate import as_system, check_integrator, interval, outcome, run
+from lgsens._start import begin
 from lgsens._validate import as_count, as_float
 from lgsens.criteria import Criterion
 from lgsens.dynamics import RESULTS, AbstractSystem, State, is_redundant

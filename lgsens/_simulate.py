@@ -2,16 +2,16 @@
 
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple, overload
+from typing import Any, overload
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
 
 from lgsens._errors import throw_if_failed
 from lgsens._index_reduced_ode import IndexReducedODE, integrate_ode, ode_failure
 from lgsens._richardson import Richardson, extrapolate_runs
+from lgsens._start import Begin, begin
 from lgsens._trajectory import Instant, Saved, Trajectory
 from lgsens._validate import as_count, as_float, require
 from lgsens.dynamics import (
@@ -21,7 +21,6 @@ from lgsens.dynamics import (
     State,
     equilibrium as _equilibrium,
     initial_state as _initial,
-    split_velocity,
 )
 from lgsens.integrate import GeneralizedAlpha, Stats
 from lgsens.model import Model
@@ -224,12 +223,14 @@ def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, sa
     if isinstance(integrator, IndexReducedODE):
         return _run_ode(system, state0, initial, t0, (t1 - t0) / num_steps, num_steps, integrator)
 
-    def steps(scheme, num_steps):
-        start = begin(scheme, system, t0, (t1 - t0) / num_steps, state0, initial)
-        if save is not None:
-            return _run_saved(system, start, t0, t1, num_steps, scheme, sensitivity, save)
-        return run(system, start, t0, t1, num_steps, scheme, sensitivity)
+    def started(scheme, num_steps):
+        return begin(scheme, system, t0, (t1 - t0) / num_steps, state0, initial)
 
+    def steps(scheme, num_steps):
+        return run(system, started(scheme, num_steps), t0, t1, num_steps, scheme, sensitivity)
+
+    if save is not None:
+        return _run_saved(system, started(integrator, num_steps), t0, t1, num_steps, integrator, sensitivity, save)
     if not isinstance(integrator, Richardson):
         return steps(integrator, num_steps)
     (coarse, of_coarse), (fine, of_fine) = (steps(integrator.integrator, n) for n in (num_steps, 2 * num_steps))
@@ -247,30 +248,6 @@ def _run_ode(system: AbstractSystem, state0, initial, t0, h, num_steps: int, int
     details = jax.lax.stop_gradient(details | {"violation": start.violation, "jacobian": start.jacobian})
     t = times(num_steps, Parameters(system, t0, h))
     return Trajectory(t=t, states=states, result=result, stats=stats, system=system, order=4), details
-
-
-class Begin(NamedTuple):
-    """The initial state as the scheme starts from it, and how its computation ended."""
-
-    state: State
-    consistent_v: Float[Array, " k"]  # v_0 without the scheme's O(h²)
-    result: Int[Array, ""]
-    violation: Float[Array, " m"]
-    jacobian: Float[Array, "m k"]
-
-
-def begin(
-    integrator: GeneralizedAlpha, system: AbstractSystem, t0, h, state0: State | None, initial: Initial | None = None
-) -> Begin:
-    """The state at t0: `state0` as it is, or the consistent one of the reference configuration, `initial` if known."""
-    if state0 is not None:
-        jacobian = system.constraint_jacobian(state0.q)
-        return Begin(state0, state0.v, jnp.zeros((), jnp.int32), system.constraint(state0.q), jacobian)
-    initial = _initial(system, t0) if initial is None else initial
-    usable = initial.result == RESULTS.successful
-    state = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), _started(integrator, system, initial, h))
-    jacobian = system.constraint_jacobian(initial.state.q)
-    return Begin(state, initial.state.v, initial.result, initial.violation, jacobian)
 
 
 def outcome(integrator: GeneralizedAlpha, start: Begin, stats: Stats, t0, h):
@@ -301,7 +278,7 @@ def run(system: AbstractSystem, start: Begin, t0, t1, num_steps: int, integrator
     return Trajectory(t=t, states=states, result=result, stats=stats, system=system), details
 
 
-def _run_saved(system, start: "Begin", t0, t1, num_steps: int, integrator, sensitivity, save: Save):
+def _run_saved(system, start: Begin, t0, t1, num_steps: int, integrator, sensitivity, save: Save):
     """`run` without a trajectory."""
     parameters = Parameters(system, t0, (t1 - t0) / num_steps)
     output = _Output(save)
@@ -317,31 +294,3 @@ class _Output(eqx.Module):
 
     def __call__(self, system, state: State, t):
         return self.save(Instant(t=t, state=state, system=system))
-
-
-def _started(integrator: GeneralizedAlpha, system: AbstractSystem, initial: Initial, h) -> State:
-    """The starting values of the scheme; see `GeneralizedAlpha.second_order_start`.
-
-    With exact values, and a_n = v̇(t_n + Δ h), Δ = α_m − α_f, the increment (27) misses the true one,
-    h v + h²/2 v̇ + h³ (v̈/6 + ad(v) v̇/12) (from ẋ = T⁻¹(x) v, T⁻¹ = I + ½ ad(x) + …), by h³ c with
-
-        c = (1/6 − β − Δ/2) v̈ + ad(v) v̇/12.
-
-    The constraint at t_{n+1} takes B c h³ out again, through the velocity once the scheme is under way: B v_n = −h² B c
-    there. Started with B v_0 = 0 it must do so through the first accelerations, and λ is off by O(h) for some steps.
-    So v_0 receives h² P c, P the M-orthogonal projection on the constraint directions.
-    """
-    if not integrator.second_order_start:
-        return initial.state
-    state = initial.state
-    delta = integrator.alpha_m - integrator.alpha_f
-    missed = (1.0 / 6.0 - integrator.beta - delta / 2.0) * initial.jerk
-    missed = missed + system.group.ad(state.v) @ state.vdot / 12.0
-    _, normal = split_velocity(system, state.q, missed)
-    return State(
-        q=state.q,
-        v=state.v + h**2 * normal,
-        vdot=state.vdot,
-        lam=state.lam,
-        a=state.vdot + (delta * h) * initial.jerk,
-    )

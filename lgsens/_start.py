@@ -1,0 +1,62 @@
+"""The initial state of a model, as the scheme starts from it."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from lgsens.dynamics import RESULTS, AbstractSystem, Initial, State, initial_state, split_velocity
+from lgsens.integrate import GeneralizedAlpha
+
+
+class Begin(NamedTuple):
+    """The initial state as the scheme starts from it, and how its computation ended."""
+
+    state: State
+    consistent_v: Float[Array, " k"]  # v_0 without the scheme's O(h²)
+    result: Int[Array, ""]
+    violation: Float[Array, " m"]
+    jacobian: Float[Array, "m k"]
+
+
+def begin(
+    integrator: GeneralizedAlpha, system: AbstractSystem, t0, h, state0: State | None, initial: Initial | None = None
+) -> Begin:
+    """The state at t0: `state0` as it is, or the consistent one of the reference configuration, `initial` if known."""
+    if state0 is not None:
+        jacobian = system.constraint_jacobian(state0.q)
+        return Begin(state0, state0.v, jnp.zeros((), jnp.int32), system.constraint(state0.q), jacobian)
+    initial = initial_state(system, t0) if initial is None else initial
+    usable = initial.result == RESULTS.successful
+    state = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), _started(integrator, system, initial, h))
+    jacobian = system.constraint_jacobian(initial.state.q)
+    return Begin(state, initial.state.v, initial.result, initial.violation, jacobian)
+
+
+def _started(integrator: GeneralizedAlpha, system: AbstractSystem, initial: Initial, h) -> State:
+    """The starting values of the scheme; see `GeneralizedAlpha.second_order_start`.
+
+    With exact values, and a_n = v̇(t_n + Δ h), Δ = α_m − α_f, the increment (27) misses the true one,
+    h v + h²/2 v̇ + h³ (v̈/6 + ad(v) v̇/12) (from ẋ = T⁻¹(x) v, T⁻¹ = I + ½ ad(x) + …), by h³ c with
+
+        c = (1/6 − β − Δ/2) v̈ + ad(v) v̇/12.
+
+    The constraint at t_{n+1} takes B c h³ out again, through the velocity once the scheme is under way: B v_n = −h² B c
+    there. Started with B v_0 = 0 it must do so through the first accelerations, and λ is off by O(h) for some steps.
+    So v_0 receives h² P c, P the M-orthogonal projection on the constraint directions.
+    """
+    if not integrator.second_order_start:
+        return initial.state
+    state = initial.state
+    delta = integrator.alpha_m - integrator.alpha_f
+    missed = (1.0 / 6.0 - integrator.beta - delta / 2.0) * initial.jerk
+    missed = missed + system.group.ad(state.v) @ state.vdot / 12.0
+    _, normal = split_velocity(system, state.q, missed)
+    return State(
+        q=state.q,
+        v=state.v + h**2 * normal,
+        vdot=state.vdot,
+        lam=state.lam,
+        a=state.vdot + (delta * h) * initial.jerk,
+    )
