@@ -18,6 +18,7 @@ from lgsens.model._forces import (
     TyreSpring as TyreSpring,
 )
 from lgsens.model._frames import Frame as Frame
+from lgsens.model._free import ALL_FREE as ALL_FREE
 from lgsens.model._joints import (
     AbstractJoint as AbstractJoint,
     CylindricalJoint as CylindricalJoint,

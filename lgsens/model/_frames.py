@@ -18,7 +18,10 @@ ROTATION_A, TRANSLATION_B, ROTATION_B = slice(3, 6), slice(6, 9), slice(9, 12)  
 
 
 class Frame(NamedTuple):
-    """Pose of a body: centre of mass [m] in the inertial frame, and orientation R (body to inertial)."""
+    """Pose of a body: centre of mass [m] in the inertial frame, and orientation R (body to inertial).
+
+    The frame of a body with a pivot has its origin there, and its velocity [ẋ, Ω] is that of the pivot: ẋ = 0.
+    """
 
     position: Float[Array, "3"]
     orientation: Float[Array, "3 3"]
