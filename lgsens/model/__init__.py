@@ -44,5 +44,6 @@ from lgsens.model._roads import (
     FlatRoad as FlatRoad,
     SampledRoad as SampledRoad,
 )
+from lgsens.model._summary import Summary as Summary
 from lgsens.model._system import MultibodySystem as MultibodySystem
 from lgsens.model._trim import static_preload as static_preload

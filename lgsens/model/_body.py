@@ -123,8 +123,8 @@ class RigidBody(eqx.Module):
         rest = "" if self.pivot is None else " (that of the centre of mass follows from the rotation about `pivot`)"
         require(
             lambda given: not np.delete(given, np.asarray(self.coordinates, int)).any(),
-            f"RigidBody: `velocity` {self.velocity} and `angular_velocity` {self.angular_velocity} must be zero but for "
-            f"the degrees of freedom `free` = {self.free!r}; free the others too, or leave their velocity out{rest}.",
+            f"RigidBody: `velocity` {self.velocity} and `angular_velocity` {self.angular_velocity} must vanish but for "
+            f"the degrees of freedom `free` = {self.free!r}; free the others too, or leave out their velocity{rest}.",
             jnp.concatenate([self.velocity, self.angular_velocity]),
         )
 

@@ -17,6 +17,7 @@ from lgsens.model._frames import Frame, ground_frame
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._needed import needed
 from lgsens.model._stack import Placed, stack
+from lgsens.model._summary import Summary, summarize
 from lgsens.model._system import MultibodySystem
 
 
@@ -132,6 +133,15 @@ class Model(eqx.Module):
             free=tuple(body.coordinates for body in ordered),
             assembled=all(joint.assembled for joint in self.joints.values()),
         )
+
+    def summary(self) -> Summary:
+        """Bodies with their free coordinates, joints with their equations, force elements, and the totals.
+
+        `print(model.summary())` shows a table: unknown coordinates, constraint equations, and their difference,
+        the degrees of freedom of a mechanism without redundant equations.
+        """
+        system = eqx.filter_eval_shape(Model.system, self)
+        return summarize(self.bodies, self.joints, self.forces, system.constraint_names)
 
 
 def _is_same_connection(one: AbstractJoint, other: AbstractJoint) -> bool:
