@@ -80,17 +80,7 @@ class AbstractMotion(eqx.Module):
         system, (states, _) = self._multibody(), self._kinematics()
         if name not in system.body_names:
             raise ValueError(f"`body`: {suggestion(name, system.body_names)}.")
-        index = system.body_names.index(name)
-        count = len(system.body_names)
-        v, vdot = (x.reshape(*x.shape[:-1], count, 2, 3)[..., index, :, :] for x in (states.v, states.vdot))
-        return BodyMotion(
-            states.q.position[..., index, :],
-            states.q.orientation[..., index, :, :],
-            v[..., 0, :],
-            v[..., 1, :],
-            vdot[..., 0, :],
-            vdot[..., 1, :],
-        )
+        return BodyMotion(*system.motion(system.body_names.index(name), states.q, states.v, states.vdot))
 
     def multiplier(self, joint: str) -> Float[Array, "*n rows"]:
         """The Lagrange multipliers of a joint, shape (n+1, its equations); the joint says what they mean.

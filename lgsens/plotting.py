@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from lgsens.model import Model, RevoluteJoint, SpringDamper, TyreSpring
+from lgsens.model import DistanceJoint, Model, RevoluteJoint, SpringDamper, TyreSpring
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -217,7 +217,7 @@ def mechanism(models: Mapping[str, Model], title: str = "", view: tuple[float, f
     """Mechanisms in their reference configuration, in space; the last in colour, those before it in grey.
 
     A body is drawn from the points at which joints hold it: two make a bar, more a solid; one with a tyre
-    is a wheel. The axes are equal. Springs are coils, dampers tubes with a rod.
+    is a wheel. The axes are equal. Springs are coils, dampers tubes with a rod, massless rods lines.
 
     Arguments:
         models: scenes by name, drawn over each other.
@@ -276,6 +276,9 @@ def _draw(axes: Any, model: Model, colours: Mapping[str, str]) -> list[np.ndarra
             axes.add_collection3d(Poly3DCollection(faces, facecolor=colours["body"], alpha=0.16, linewidth=0))
             for face in faces if len(faces) > 1 else ():
                 axes.plot(*np.concatenate([face, face[:1]]).T, color=colours["body"], linewidth=0.4, alpha=0.5)
+    for joint in model.joints.values():
+        if isinstance(joint, DistanceJoint):
+            axes.plot(*np.transpose([joint.at_a, joint.at_b]), color=colours["link"], linewidth=3)
     for force in model.forces.values():
         if isinstance(force, SpringDamper):
             a, b = np.asarray(force.at_a), np.asarray(force.at_b)

@@ -2,6 +2,7 @@
 
 import math
 import tomllib
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, require
+from lgsens.examples._point_masses import with_point_masses
 from lgsens.model import (
+    ALL_FREE,
     BumpRoad,
+    DistanceJoint,
     FixedJoint,
     Gravity,
     Model,
@@ -60,7 +64,8 @@ class QuarterCar(eqx.Module):
     Five links, knuckle, wheel and chassis are eight rigid bodies. Each link has a universal joint at the
     chassis and a spherical joint at the knuckle; the wheel turns on a hinge of the knuckle or is locked to
     it; the chassis heaves only. With 48 coordinates and 45 (46) constraints the mechanism has 3 (2) degrees
-    of freedom. Frame: x forward, y left, z up; SI units.
+    of freedom; a reduced scene has the same with 19 and 16 (17), see `model`. Frame: x forward, y left, z up;
+    SI units.
 
     Source: Sonneville & Brüls (2014), §9; hardpoints, masses and rates from BPMinaker/eom_pkg,
     input_5link.m (R. Rieveley 2009).
@@ -89,35 +94,59 @@ class QuarterCar(eqx.Module):
         """
         return _parse(*_read(path))
 
-    def model(self, *, wheel: str = "hinged", free_length=None, free_radius=None) -> Model:
+    def model(
+        self,
+        *,
+        wheel: str = "hinged",
+        chassis: str = "guided",
+        links: str = "bodies",
+        free_length=None,
+        free_radius=None,
+    ) -> Model:
         """The scene at rest on its springs at the design position, a bump ahead.
 
         Arguments:
             wheel: "hinged" (45 constraints, 3 degrees of freedom) or "locked" (46 and 2).
+            chassis: "guided" by a prismatic joint (6 coordinates, 5 constraints), or "heave": a body that has that
+                one coordinate. The motion is the same.
+            links: "bodies", or "rods": the links on which neither spring nor damper acts become massless rods
+                (`DistanceJoint`), 1 constraint for 6 coordinates and 7 constraints each. Half the mass of each
+                goes to either end, on the knuckle and on the chassis, whose centres of mass and inertias
+                move with it. Mass and centre of mass of a uniform bar stay so, and with them the static forces; its
+                moment of inertia about its centre becomes m L²/4 for m L²/12. A link that carries the spring or
+                the damper is bent and not only pulled, and remains a body.
             free_length: free length of the spring [m]. None: the preloads of spring and tyre are those that
                 hold the car at the design position, whatever the parameters, and so are their derivatives.
             free_radius: free radius of the tyre [m], with `free_length`.
 
-        Raises `ValueError` for an unknown kind of wheel.
+        Raises `ValueError` for an unknown kind of wheel, chassis or links.
         """
-        if wheel not in ("hinged", "locked"):
-            raise ValueError(f"`wheel` must be 'hinged' or 'locked', got {wheel!r}.")
+        _check_choice("wheel", wheel, ("hinged", "locked"))
+        _check_choice("chassis", chassis, ("guided", "heave"))
+        _check_choice("links", links, ("bodies", "rods"))
+        carriers = {self.spring.link, self.damper.link}
+        rods = {name: link for name, link in self.links.items() if links == "rods" and name not in carriers}
         frozen = free_length is not None
+        heaves = "z" if chassis == "heave" else ALL_FREE
         bodies = {
-            "chassis": _body(self.chassis),
-            "knuckle": _body(self.knuckle),
+            "chassis": _body(self.chassis, [(rod.mass / 2, rod.chassis) for rod in rods.values()], heaves),
+            "knuckle": _body(self.knuckle, [(rod.mass / 2, rod.knuckle) for rod in rods.values()]),
             "wheel": _body(self.wheel),
-        } | {name: _bar(link, self.link_radius) for name, link in self.links.items()}
+        } | {name: _bar(link, self.link_radius) for name, link in self.links.items() if name not in rods}
         along_x = jnp.asarray([1.0, 0.0, 0.0], self.bearing.dtype)
         along_y = jnp.asarray([0.0, 1.0, 0.0], self.bearing.dtype)
         along_z = jnp.asarray([0.0, 0.0, 1.0], self.bearing.dtype)
         joints: dict[str, Any] = {
-            "heave": PrismaticJoint(None, "chassis", at=self.chassis.centre, axis=along_z),
             "hub": RevoluteJoint("knuckle", "wheel", at=self.bearing, axis=along_y)
             if wheel == "hinged"
             else FixedJoint("knuckle", "wheel", at=self.bearing),
         }
+        if chassis == "guided":
+            joints["heave"] = PrismaticJoint(None, "chassis", at=self.chassis.centre, axis=along_z)
         for name, link in self.links.items():
+            if name in rods:
+                joints[name] = DistanceJoint("chassis", "knuckle", at_a=link.chassis, at_b=link.knuckle)
+                continue
             joints[f"{name}_chassis"] = UniversalJoint(
                 "chassis",
                 name,
@@ -167,8 +196,17 @@ class QuarterCar(eqx.Module):
         return model
 
 
-def _body(part: Part) -> RigidBody:
-    return RigidBody(mass=part.mass, inertia=part.inertia, position=part.centre)
+def _check_choice(name: str, value: str, known: tuple[str, str]) -> None:
+    if value not in known:
+        raise ValueError(f"`{name}` must be {known[0]!r} or {known[1]!r}, got {value!r}.")
+
+
+def _body(part: Part, points: Sequence[tuple[Array, Array]] = (), free: str | Sequence[str] = ALL_FREE) -> RigidBody:
+    """A part with point masses, pairs of a mass and a place, fixed to it."""
+    mass, inertia, centre = part.mass, part.inertia, part.centre
+    if points:
+        mass, inertia, centre = with_point_masses(mass, inertia, centre, points)
+    return RigidBody(mass=mass, inertia=inertia, position=centre, free=free)
 
 
 def _bar(link: Link, radius) -> RigidBody:

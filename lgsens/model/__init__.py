@@ -18,6 +18,7 @@ from lgsens.model._forces import (
     TyreSpring as TyreSpring,
 )
 from lgsens.model._frames import Frame as Frame
+from lgsens.model._free import ALL_FREE as ALL_FREE
 from lgsens.model._joints import (
     AbstractJoint as AbstractJoint,
     CylindricalJoint as CylindricalJoint,
@@ -43,5 +44,6 @@ from lgsens.model._roads import (
     FlatRoad as FlatRoad,
     SampledRoad as SampledRoad,
 )
+from lgsens.model._summary import Summary as Summary
 from lgsens.model._system import MultibodySystem as MultibodySystem
 from lgsens.model._trim import static_preload as static_preload

@@ -1,5 +1,7 @@
 """The rigid body."""
 
+from collections.abc import Iterable
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, require
 from lgsens.model._frames import Frame
+from lgsens.model._free import ALL_FREE, Free, as_free, is_along, places, single_rotation
 
 
 class RigidBody(eqx.Module):
@@ -24,11 +27,24 @@ class RigidBody(eqx.Module):
         orientation: rotation matrix R, body to inertial frame, shape (3, 3).
         velocity: velocity of the centre of mass [m/s], inertial frame, shape (3,).
         angular_velocity: angular velocity Ω [rad/s], body frame, shape (3,).
+        free: the degrees of freedom that the body has, names among "x", "y", "z" (translation of the centre of
+            mass along the axes of the inertial frame) and "rx", "ry", "rz" (rotation about the body axes), in a tuple
+            or in one string: `free="z"` heaves only, `free="x y rz"` moves in the plane, `free=()` is held. The
+            others are no unknowns, and joints lose the equations that can no longer be violated. Default: all six.
+        pivot: a fixed point about which the body turns [m], inertial frame, shape (3,), for a body with
+            rotations only: `free="rx ry rz", pivot=…` is a body on a ball joint, `free="ry", pivot=…` one on
+            a hinge. Its velocity is then that of its rotation: leave out `velocity`. None: the body turns about its
+            centre of mass.
 
     The initial velocities are projected on those that the joints allow (`initial_state`).
 
+    The rotation of a body that has only one is about an inertial axis too: its body axis of that name lies along the
+    inertial axis of that name. So which equations of a joint are needed does not depend on numbers.
+
     Raises `ValueError` for wrong shapes, a mass that is not positive, an inertia that no body can
-    have, or an orientation that is not a rotation. Source: Sonneville & Brüls (2014), §3.2.
+    have, an orientation that is not a rotation; an unknown degree of freedom, two rotations (which are no group), one
+    about an axis that is not an inertial one, a pivot with translations, or an initial velocity that is not free.
+    Source: Sonneville & Brüls (2014), §3.2.
     """
 
     mass: Float[Array, ""]
@@ -37,6 +53,8 @@ class RigidBody(eqx.Module):
     orientation: Float[Array, "3 3"]
     velocity: Float[Array, "3"]
     angular_velocity: Float[Array, "3"]
+    pivot: Float[Array, "3"] | None
+    free: Free = eqx.field(static=True)
 
     def __init__(
         self,
@@ -46,6 +64,9 @@ class RigidBody(eqx.Module):
         orientation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
         velocity=(0.0, 0.0, 0.0),
         angular_velocity=(0.0, 0.0, 0.0),
+        *,
+        free: str | Iterable[str] = ALL_FREE,
+        pivot=None,
     ):
         self.mass = as_float(mass, (), "RigidBody: `mass`")
         self.inertia = as_float(inertia, None, "RigidBody: `inertia`")
@@ -53,6 +74,8 @@ class RigidBody(eqx.Module):
         self.orientation = as_float(orientation, (3, 3), "RigidBody: `orientation`")
         self.velocity = as_float(velocity, (3,), "RigidBody: `velocity`")
         self.angular_velocity = as_float(angular_velocity, (3,), "RigidBody: `angular_velocity`")
+        self.free = as_free(free, "RigidBody: `free`")
+        self.pivot = None if pivot is None else as_float(pivot, (3,), "RigidBody: `pivot`")
         if self.inertia.shape not in ((3,), (3, 3)):
             raise ValueError(
                 "RigidBody: `inertia` must be three principal moments, shape (3,), or the matrix about the "
@@ -77,10 +100,55 @@ class RigidBody(eqx.Module):
             self.orientation,
         )
 
+        self._check_free()
+
+    def _check_free(self) -> None:
+        axis = single_rotation(self.free)
+        if axis is not None:
+            name = self.free[-1]
+            require(
+                lambda orientation: is_along(orientation[:, axis], axis),
+                f"RigidBody: `free` has the one rotation {name!r}, so the body's {name[1]} axis must lie along the "
+                f"inertial {name[1]} axis, got `orientation` {self.orientation}; choose other body axes, or free all "
+                "rotations and add a RevoluteJoint.",
+                self.orientation,
+            )
+        if self.pivot is not None and (not self.free or self.free[0] in "xyz"):
+            raise ValueError(
+                f"RigidBody: `pivot` is for a body with rotations only, got `free` = {self.free!r}; leave it "
+                "out, or free 'rx', 'ry', 'rz' or one of them."
+            )
+        if self.free == ALL_FREE:
+            return
+        rest = "" if self.pivot is None else " (that of the centre of mass follows from the rotation about `pivot`)"
+        require(
+            lambda given: not np.delete(given, np.asarray(self.coordinates, int)).any(),
+            f"RigidBody: `velocity` {self.velocity} and `angular_velocity` {self.angular_velocity} must vanish but for "
+            f"the degrees of freedom `free` = {self.free!r}; free the others too, or leave out their velocity{rest}.",
+            jnp.concatenate([self.velocity, self.angular_velocity]),
+        )
+
+    @property
+    def coordinates(self) -> tuple[int, ...]:
+        """Which of the six coordinates [x, θ] the body has."""
+        return places(self.free)
+
+    @property
+    def free_velocity(self) -> tuple[Float[Array, " n"], ...]:
+        """The velocities of the coordinates that the body has, in pieces."""
+        if self.free == ALL_FREE:
+            return self.velocity, self.angular_velocity
+        return (jnp.concatenate([self.velocity, self.angular_velocity])[np.asarray(self.coordinates, int)],)
+
     @property
     def frame(self) -> Frame:
-        """The pose in the reference configuration."""
-        return Frame(self.position, self.orientation)
+        """The body frame in the reference configuration: the orientation at the centre of mass, or at the pivot."""
+        return Frame(self.position if self.pivot is None else self.pivot, self.orientation)
+
+    @property
+    def centre(self) -> Float[Array, "3"]:
+        """The centre of mass in the body frame [m]: zero without a pivot."""
+        return self.frame.local_point(self.position)
 
     @property
     def inertia_matrix(self) -> Float[Array, "3 3"]:
@@ -88,6 +156,15 @@ class RigidBody(eqx.Module):
         if self.inertia.ndim == 1:
             return jnp.diag(self.inertia)
         return (self.inertia + self.inertia.T) / 2
+
+    @property
+    def frame_inertia(self) -> Float[Array, "3 3"]:
+        """J about the origin of the body frame [kg m²]: with a pivot at −c it is J + m (|c|² I − c cᵀ) (Steiner)."""
+        if self.pivot is None:
+            return self.inertia_matrix
+        arm = self.centre
+        parallel = jnp.dot(arm, arm) * jnp.eye(3, dtype=arm.dtype) - jnp.outer(arm, arm)
+        return self.inertia_matrix + self.mass * parallel
 
 
 def _is_physical(inertia) -> bool:

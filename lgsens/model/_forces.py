@@ -39,7 +39,10 @@ class AbstractForce(eqx.Module):
 
     @abc.abstractmethod
     def loads(self, bodies: Mapping[str, RigidBody]) -> tuple[Attached, ...]:
-        """The loads of the element, given the bodies in their reference configuration."""
+        """The loads of the element, given the bodies in their reference configuration.
+
+        Points fixed to a body are given in its frame, `bodies[name].frame`, which `RigidBody.pivot` may move.
+        """
 
 
 def _frame(bodies: Mapping[str, RigidBody], name: str | None, dtype) -> Frame:
@@ -63,7 +66,13 @@ class Gravity(AbstractForce):
         return ()
 
     def loads(self, bodies):
-        return tuple(Attached(Weight(body.mass, self.acceleration), None, name) for name, body in bodies.items())
+        return tuple(Attached(self._weight(body), None, name) for name, body in bodies.items())
+
+    def _weight(self, body: RigidBody) -> AbstractLoad:
+        if body.pivot is None:
+            return Weight(body.mass, self.acceleration)
+        no_moment = jnp.zeros_like(self.acceleration)
+        return PointForce(body.centre, body.mass * self.acceleration, no_moment, _one())
 
 
 class SpringDamper(AbstractForce):
@@ -192,5 +201,5 @@ class AppliedForce(AbstractForce):
 
     def loads(self, bodies):
         frame = bodies[self.body].frame
-        at = frame.position if self.at is None else self.at
+        at = bodies[self.body].position if self.at is None else self.at
         return (Attached(PointForce(frame.local_point(at), self.force, self.moment, self.signal), None, self.body),)

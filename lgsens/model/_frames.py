@@ -32,7 +32,10 @@ def turn_back(rotation: Float[Array, "3 3"], x: Float[Array, "3"]) -> Float[Arra
 
 
 class Frame(NamedTuple):
-    """Pose of a body: centre of mass [m] in the inertial frame, and orientation R (body to inertial)."""
+    """Pose of a body: centre of mass [m] in the inertial frame, and orientation R (body to inertial).
+
+    The frame of a body with a pivot has its origin there, and its velocity [ẋ, Ω] is that of the pivot: ẋ = 0.
+    """
 
     position: Float[Array, "3"]
     orientation: Float[Array, "3 3"]

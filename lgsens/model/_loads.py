@@ -1,7 +1,7 @@
 """Force elements as stacked numbers, with closed-form tangents.
 
 Each returns the generalized force Q = [F_a, M_a, F_b, M_b] that it applies: forces in the inertial frame [N],
-moments about the centre of mass in the body frame [N m]. The system subtracts it from the residual, so
+moments about the origin of the body frame, in that frame [N m]. The system subtracts it from the residual, so
 f(q, v, t) of eq. (16) is −Q, and K_t, C_t receive −∂Q/∂q, −∂Q/∂v.
 """
 

@@ -15,7 +15,9 @@ from lgsens.model._body import RigidBody
 from lgsens.model._forces import AbstractForce
 from lgsens.model._frames import Frame, ground_frame
 from lgsens.model._joints import AbstractJoint
+from lgsens.model._needed import needed
 from lgsens.model._stack import Placed, stack
+from lgsens.model._summary import Summary, summarize
 from lgsens.model._system import MultibodySystem
 
 
@@ -30,8 +32,8 @@ class Model(eqx.Module):
     The constructors can be traced, so a function that builds a model from design parameters is the
     general parametrization; the gradient with respect to a model is again a model.
 
-    Raises `ValueError` for a scene without bodies, unknown body names, a joint or force between a body
-    and itself, and two joints that are the same connection.
+    Raises `ValueError` for a scene without bodies or without degrees of freedom, unknown body names, a joint or
+    force between a body and itself, and two joints that are the same connection.
     """
 
     bodies: dict[str, RigidBody]
@@ -55,6 +57,8 @@ class Model(eqx.Module):
             for name, member in members.items():
                 if not isinstance(member, kind):
                     raise ValueError(f"{what} {name!r} must be a {kind.__name__}, got {type(member).__name__}.")
+        if not any(body.free for body in self.bodies.values()):
+            raise ValueError("Model: no body has a degree of freedom; let at least one of them have a `free` one.")
         for name, joint in self.joints.items():
             self._check_connection(f"Joint {name!r}", (joint.a, joint.b))
         for name, force in self.forces.items():
@@ -101,29 +105,43 @@ class Model(eqx.Module):
         def frame(name: str | None) -> Frame:
             return ground if name is None else bodies[name].frame
 
-        constraints = [
-            Placed(constraint, number[joint.a], number[joint.b], name)
-            for name, joint in sorted(self.joints.items())
-            for constraint in joint.constraints(frame(joint.a), frame(joint.b))
-        ]
+        constraints = []
+        for name, joint in sorted(self.joints.items()):
+            elements = joint.constraints(frame(joint.a), frame(joint.b))
+            free = [() if end is None else bodies[end].free for end in (joint.a, joint.b)]
+            for element, kept in zip(elements, needed(name, joint, elements, *free)):
+                if any(kept):
+                    constraints.append(Placed(element, number[joint.a], number[joint.b], name, kept))
         loads = [
             Placed(attached.load, number[attached.a], number[attached.b], name)
             for name, force in sorted(self.forces.items())
             for attached in force.loads(bodies)
         ]
+        pivoted = any(body.pivot is not None for body in ordered)
         return MultibodySystem(
             mass=jnp.stack([body.mass for body in ordered]),
-            inertia=jnp.stack([body.inertia_matrix for body in ordered]),
+            inertia=jnp.stack([body.frame_inertia for body in ordered]),
             pose=Pose(
-                jnp.stack([body.position for body in ordered]),
+                jnp.stack([body.frame.position for body in ordered]),
                 rotations,
             ),
-            velocity=jnp.concatenate([part for body in ordered for part in (body.velocity, body.angular_velocity)]),
+            velocity=jnp.concatenate([part for body in ordered for part in body.free_velocity]),
+            centre=jnp.stack([body.centre for body in ordered]) if pivoted else None,
             constraints=stack(constraints),
             loads=stack(loads),
             body_names=names,
+            free=tuple(body.coordinates for body in ordered),
             assembled=all(joint.assembled for joint in self.joints.values()),
         )
+
+    def summary(self) -> Summary:
+        """Bodies with their free coordinates, joints with their equations, force elements, and the totals.
+
+        `print(model.summary())` shows a table: unknown coordinates, constraint equations, and their difference,
+        the degrees of freedom of a mechanism without redundant equations.
+        """
+        system = eqx.filter_eval_shape(Model.system, self)
+        return summarize(self.bodies, self.joints, self.forces, system.constraint_names)
 
 
 def _is_same_connection(one: AbstractJoint, other: AbstractJoint) -> bool:

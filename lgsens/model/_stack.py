@@ -22,12 +22,14 @@ Element = TypeVar("Element", AbstractConstraint, AbstractLoad)
 
 
 class Placed(NamedTuple, Generic[Element]):
-    """An element, the numbers of its two bodies (None: the ground), and the name of its owner."""
+    """An element, the numbers of its two bodies (None: the ground), the name of its owner; of a constraint, which of
+    its equations are kept."""
 
     element: Element
     a: int | None
     b: int | None
     owner: str
+    kept: tuple[bool, ...] = ()
 
 
 class Stack(eqx.Module, Generic[Element]):
@@ -37,17 +39,19 @@ class Stack(eqx.Module, Generic[Element]):
     a: tuple[int, ...] | None = eqx.field(static=True)
     b: tuple[int, ...] | None = eqx.field(static=True)
     owners: tuple[str, ...] = eqx.field(static=True)
+    kept: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
 
     @property
     def part(self) -> slice:
         """The element coordinates that belong to bodies; the ground has none."""
         return BODY_B if self.a is None else BODY_A if self.b is None else slice(BODY_A.start, BODY_B.stop)
 
-    @property
-    def coordinates(self) -> np.ndarray:
-        """The system coordinates of each element's `part`, shape (elements, 6 or 12)."""
-        sides = [np.asarray(side)[:, None] * BODY_DIM + np.arange(BODY_DIM) for side in (self.a, self.b) if side]
-        return np.concatenate(sides, axis=1)
+    def coordinates(self, index: np.ndarray) -> np.ndarray:
+        """The system coordinates of each element's `part`, shape (elements, 6 or 12).
+
+        `index`: those of each body, shape (bodies, 6), −1 where it does not have the coordinate.
+        """
+        return np.concatenate([index[np.asarray(side)] for side in (self.a, self.b) if side], axis=1)
 
     def map(self, function, q, *per_side, extra: Sequence[Any] = ()):
         """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra)` for every element.
@@ -90,6 +94,7 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
                 a=None if first.a is None else tuple(m.a for m in members if m.a is not None),
                 b=None if first.b is None else tuple(m.b for m in members if m.b is not None),
                 owners=tuple(m.owner for m in members),
+                kept=tuple(m.kept for m in members),
             )
         )
     return tuple(stacks)

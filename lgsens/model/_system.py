@@ -1,4 +1,4 @@
-"""The multibody system: an `AbstractSystem` on (R³ × SO(3))^N, assembled by element type."""
+"""The multibody system: an `AbstractSystem` on (R³ × SO(3))^N or a subgroup of it, assembled by element type."""
 
 from functools import partial
 
@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import suggestion
 from lgsens.dynamics import AbstractSystem, Tangents
-from lgsens.liegroups import Pose, Power, R3xSO3, cross, skew
+from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew
 from lgsens.model._constraints import AbstractConstraint
 from lgsens.model._frames import ROTATION, turn
 from lgsens.model._loads import AbstractLoad
@@ -36,31 +36,69 @@ class MultibodySystem(AbstractSystem):
         r_i = [m ẍ; J Ω̇ + Ω × J Ω] − Q_i + (Bᵀλ)_i
         M_i = diag(m I, J),     C_t,i = diag(0, Ω̃ J − (J Ω)~)
 
-    and what the loads and joints add. Built by `Model.system()`; the order of bodies is that of
-    `body_names`, of multipliers that of the stacks.
+    and what the loads and joints add, of which the rows and columns of the coordinates that bodies have (`free`) are
+    assembled, and of joints the equations that these can violate. Built by `Model.system()`; the order of bodies is
+    that of `body_names`, of multipliers that of the stacks. x_i is the origin of the body frame and J the
+    inertia about it: where that is not the centre of mass (`centre`), the body does not translate.
     """
 
     mass: Float[Array, " N"]
     inertia: Float[Array, "N 3 3"]
     pose: Pose  # reference configuration, leading axis N
     velocity: Float[Array, " k"]  # reference velocity
+    centre: Float[Array, "N 3"] | None  # centre of mass in the body frame; None: its origin, for all bodies
     constraints: tuple[Stack[AbstractConstraint], ...]
     loads: tuple[Stack[AbstractLoad], ...]
     body_names: tuple[str, ...] = eqx.field(static=True)
+    free: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # the coordinates, 0 to 5, of each body
     assembled: bool = eqx.field(static=True)
 
     @property
-    def group(self) -> Power:
-        return Power(R3xSO3(), len(self.body_names))
+    def group(self) -> Power | Poses:
+        all_free = all(len(own) == BODY_DIM for own in self.free)
+        return Power(R3xSO3(), len(self.body_names)) if all_free else Poses(self.free)
+
+    @property
+    def index(self) -> np.ndarray:
+        """The place of each body's coordinates among those of the system, shape (N, 6); −1 where it has none."""
+        group = self.group
+        if isinstance(group, Poses):
+            return group.index
+        return np.arange(len(self.body_names) * BODY_DIM).reshape(-1, BODY_DIM)
+
+    def twists(self, v: Float[Array, "*batch k"]) -> Float[Array, "*batch N 6"]:
+        """[ẋ, Ω] of each body, or their rates of change, from v or v̇: zero where a body is not free."""
+        group = self.group
+        if isinstance(group, Poses):
+            return group.rows(v)
+        return v.reshape(*v.shape[:-1], -1, BODY_DIM)
+
+    def motion(self, body: int, q, v, vdot):
+        """Position, orientation, velocity, Ω, acceleration, Ω̇ of a body's centre of mass, along leading axes.
+
+        With the origin of the body frame at rest and the centre of mass at c in it: x = x_o + R c, ẋ = R (Ω × c) and
+        ẍ = R (Ω̇ × c + Ω × (Ω × c)).
+        """
+        position, orientation = q.position[..., body, :], q.orientation[..., body, :, :]
+        twist, rate = (self.twists(x)[..., body, :] for x in (v, vdot))
+        velocity, spin = twist[..., : ROTATION.start], twist[..., ROTATION]
+        acceleration, change = rate[..., : ROTATION.start], rate[..., ROTATION]
+        if self.centre is not None:
+            to_inertial = lambda local: jnp.einsum("...ij,...j->...i", orientation, local)
+            arm = jnp.broadcast_to(self.centre[body], spin.shape)
+            swing = jnp.cross(spin, arm)
+            position, velocity = position + to_inertial(arm), velocity + to_inertial(swing)
+            acceleration = acceleration + to_inertial(jnp.cross(change, arm) + jnp.cross(spin, swing))
+        return position, orientation, velocity, spin, acceleration, change
 
     @property
     def _rows(self) -> list[np.ndarray]:
-        """The multipliers of each stack, shape (elements, rows of one)."""
+        """The multipliers of each stack, shape (elements, rows of one); −1 for an equation that is not kept."""
         rows, start = [], 0
         for stack in self.constraints:
-            shape = (len(stack.owners), stack.elements.num_rows)
-            rows.append(start + np.arange(shape[0] * shape[1]).reshape(shape))
-            start += shape[0] * shape[1]
+            kept = np.asarray(stack.kept)
+            rows.append(np.where(kept, start + np.cumsum(kept).reshape(kept.shape) - 1, -1))
+            start += int(kept.sum())
         return rows
 
     @property
@@ -68,8 +106,8 @@ class MultibodySystem(AbstractSystem):
         return tuple(
             owner
             for stack, rows in zip(self.constraints, self._rows)
-            for owner in stack.owners
-            for _ in range(rows.shape[1])
+            for owner, own in zip(stack.owners, rows)
+            for _ in range((own >= 0).sum())
         )
 
     def multiplier_rows(self, joint: str) -> np.ndarray:
@@ -88,6 +126,8 @@ class MultibodySystem(AbstractSystem):
         length = jnp.max(jnp.stack(extents))
         body = jnp.ones(BODY_DIM, length.dtype)
         scale = body.at[: ROTATION.start].set(jnp.where(length > 0, length, 1.0))
+        if isinstance(self.group, Poses):
+            return scale[np.concatenate([np.asarray(own, int) for own in self.free])]
         return jnp.tile(scale, len(self.body_names))
 
     def mass_matrix(self):
@@ -95,73 +135,82 @@ class MultibodySystem(AbstractSystem):
         translation = self.mass[:, None, None] * jnp.eye(ROTATION.start, dtype=self.mass.dtype)[None]
         blocks = blocks.at[:, : ROTATION.start, : ROTATION.start].set(translation)
         blocks = blocks.at[:, ROTATION, ROTATION].set(self.inertia)
-        return self._matrix([(blocks, self._body_coordinates)])
-
-    @property
-    def _body_coordinates(self) -> np.ndarray:
-        return np.arange(len(self.body_names) * BODY_DIM).reshape(-1, BODY_DIM)
+        return self._matrix([(blocks, self.index)])
 
     def _matrix(self, blocks) -> Float[Array, "k k"]:
         """The sum of square blocks at their coordinates, in one scatter."""
         k = self.group.dim
-        where = [c[:, :, None] * k + c[:, None, :] for _, c in blocks]
-        index = np.concatenate([w.ravel() for w in where])
-        values = jnp.concatenate([block.ravel() for block, _ in blocks])
-        return jnp.zeros(k * k, self.mass.dtype).at[index].add(values).reshape(k, k)
+        if not blocks:
+            return jnp.zeros((k, k), self.mass.dtype)
+        entries = [_entries(block, _flat(c[:, :, None], c[:, None, :], k)) for block, c in blocks]
+        values, places = _joined(entries)
+        return jnp.zeros(k * k, self.mass.dtype).at[places].add(values).reshape(k, k)
+
+    def _multipliers(self, lam, rows: np.ndarray):
+        """The multipliers of a stack's equations, zero for those that are not kept."""
+        if (rows >= 0).all():
+            return lam[rows]
+        return jnp.concatenate([lam, jnp.zeros(1, lam.dtype)])[np.where(rows < 0, len(lam), rows)]
+
+    @property
+    def _gyroscopic(self) -> bool:
+        """Whether a body has three rotations: Ω × J Ω of one about a body axis has no component along it."""
+        return bool((self.index[:, ROTATION] >= 0).all(axis=1).any())
 
     @_traced_once
     def residual(self, q, v, vdot, lam, t):
-        twist = v.reshape(-1, BODY_DIM)
+        twist = self.twists(v)
         spin = twist[:, ROTATION]
-        acceleration = vdot.reshape(-1, BODY_DIM)
+        acceleration = self.twists(vdot)
         turned = jax.vmap(turn)
-        gyroscopic = jax.vmap(cross)(spin, turned(self.inertia, spin))
-        inertial = jnp.concatenate(
-            [
-                self.mass[:, None] * acceleration[:, : ROTATION.start],
-                turned(self.inertia, acceleration[:, ROTATION]) + gyroscopic,
-            ],
-            axis=1,
-        )
-        index, values = [self._body_coordinates.ravel()], [inertial.ravel()]
+        force = self.mass[:, None] * acceleration[:, : ROTATION.start]
+        moment = turned(self.inertia, acceleration[:, ROTATION])
+        if self._gyroscopic:
+            moment = moment + jax.vmap(cross)(spin, turned(self.inertia, spin))
+        entries = [_entries(jnp.concatenate([force, moment], axis=1), self.index)]
         for stack in self.loads:
             force = stack.map(lambda e, a, b, va, vb, t: e.force(a, b, va, vb, t), q, twist, extra=(t,))
-            index.append(stack.coordinates.ravel())
-            values.append(-force[:, stack.part].ravel())
+            values, places = _entries(force[:, stack.part], stack.coordinates(self.index))
+            entries.append((-values, places))
         for stack, rows in zip(self.constraints, self._rows):
-            force = stack.map(constraint_force, q, extra=(lam[rows],))
-            index.append(stack.coordinates.ravel())
-            values.append(force[:, stack.part].ravel())
-        return jnp.zeros_like(v).at[np.concatenate(index)].add(jnp.concatenate(values))
+            force = stack.map(constraint_force, q, extra=(self._multipliers(lam, rows),))
+            entries.append(_entries(force[:, stack.part], stack.coordinates(self.index)))
+        zero = jnp.zeros_like(v)
+        values, places = _joined(entries)
+        return zero.at[places].add(values)
 
     @_traced_once
     def constraint(self, q):
-        values = [stack.map(lambda e, a, b: e.value(a, b), q).ravel() for stack in self.constraints]
-        return jnp.concatenate(values) if values else jnp.zeros(0, self.mass.dtype)
+        entries = [
+            _entries(stack.map(lambda e, a, b: e.value(a, b), q), rows)
+            for stack, rows in zip(self.constraints, self._rows)
+        ]
+        return _joined(entries)[0] if entries else jnp.zeros(0, self.mass.dtype)
 
     @_traced_once
     def constraint_jacobian(self, q):
         k, m = self.group.dim, len(self.constraint_names)
         if m == 0:
             return jnp.zeros((0, k), self.mass.dtype)
-        index, values = [], []
+        entries = []
         for stack, rows in zip(self.constraints, self._rows):
             block = stack.map(constraint_jacobian, q)[:, :, stack.part]
-            index.append((rows[:, :, None] * k + stack.coordinates[:, None, :]).ravel())
-            values.append(block.ravel())
-        flat = jnp.zeros(m * k, self.mass.dtype).at[np.concatenate(index)].add(jnp.concatenate(values))
-        return flat.reshape(m, k)
+            entries.append(_entries(block, _flat(rows[:, :, None], stack.coordinates(self.index)[:, None, :], k)))
+        zero = jnp.zeros(m * k, self.mass.dtype)
+        values, places = _joined(entries)
+        return zero.at[places].add(values).reshape(m, k)
 
     @_traced_once
     def tangents(self, q, v, vdot, lam, t):
-        twist = v.reshape(-1, BODY_DIM)
-        spin = twist[:, ROTATION]
-        momentum = jnp.einsum("nij,nj->ni", self.inertia, spin)
-        gyroscopic = jax.vmap(skew)(spin) @ self.inertia - jax.vmap(skew)(momentum)
-        damping = [(gyroscopic, self._body_coordinates[:, ROTATION])]
-        stiffness = []
+        twist = self.twists(v)
+        damping, stiffness = [], []
+        if self._gyroscopic:
+            spin = twist[:, ROTATION]
+            momentum = jnp.einsum("nij,nj->ni", self.inertia, spin)
+            gyroscopic = jax.vmap(skew)(spin) @ self.inertia - jax.vmap(skew)(momentum)
+            damping.append((gyroscopic, self.index[:, ROTATION]))
         for stack in self.loads:
-            part, coordinates = stack.part, stack.coordinates
+            part, coordinates = stack.part, stack.coordinates(self.index)
             position, velocity = stack.map(load_tangents, q, twist, extra=(t,))
             if position is not None:
                 stiffness.append((-position[:, part, part], coordinates))
@@ -169,11 +218,9 @@ class MultibodySystem(AbstractSystem):
                 damping.append((-velocity[:, part, part], coordinates))
         for stack, rows in zip(self.constraints, self._rows):
             part = stack.part
-            block = stack.map(constraint_stiffness, q, extra=(lam[rows],))
-            stiffness.append((block[:, part, part], stack.coordinates))
-        k = self.group.dim
-        stiffness_matrix = self._matrix(stiffness) if stiffness else jnp.zeros((k, k), self.mass.dtype)
-        return Tangents(stiffness_matrix, self._matrix(damping), self.constraint_jacobian(q))
+            block = stack.map(constraint_stiffness, q, extra=(self._multipliers(lam, rows),))
+            stiffness.append((block[:, part, part], stack.coordinates(self.index)))
+        return Tangents(self._matrix(stiffness), self._matrix(damping), self.constraint_jacobian(q))
 
     def measure(self, force: str, q, v, t):
         """What the force element `force` measures at each of the stacked poses, velocities and times.
@@ -193,10 +240,31 @@ class MultibodySystem(AbstractSystem):
             a=None if stack.a is None else (stack.a[i],),
             b=None if stack.b is None else (stack.b[i],),
             owners=(force,),
+            kept=((),),
         )
 
         def at_time(q, v, t):
             evaluate = lambda e, *args: getattr(e, "measure", e.force)(*args)
-            return single.map(evaluate, q, v.reshape(-1, BODY_DIM), extra=(t,))
+            return single.map(evaluate, q, self.twists(v), extra=(t,))
 
         return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(at_time)(q, v, t))
+
+
+# Where entries of a system's arrays go: static arrays of integers, −1 for an entry that the system does not have.
+
+
+def _flat(row: np.ndarray, column: np.ndarray, width: int) -> np.ndarray:
+    """The places of the entries (row, column) of a matrix in its flattened array."""
+    return np.where((row < 0) | (column < 0), -1, row * width + column)
+
+
+def _entries(array, places: np.ndarray):
+    """The entries of an array that have a place, and their places, both flat."""
+    values, places = array.ravel(), places.ravel()
+    chosen = np.flatnonzero(places >= 0)
+    return (values, places) if len(chosen) == len(places) else (values[chosen], places[chosen])
+
+
+def _joined(entries):
+    """The entries of several arrays in one, and their places."""
+    return jnp.concatenate([values for values, _ in entries]), np.concatenate([places for _, places in entries])

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.linalg import expm
 
-from lgsens.liegroups import SO3, AbstractLieGroup, Pose, Power, Product, R3xSO3, Rn
+from lgsens.liegroups import SO3, AbstractLieGroup, Pose, Poses, Power, Product, R3xSO3, Rn
 
 GROUPS = {
     "Rn": Rn(3),
@@ -15,6 +15,8 @@ GROUPS = {
     "R3xSO3": R3xSO3(),
     "Product": Product((Rn(2), SO3(), Rn(1))),
     "Power": Power(R3xSO3(), 3),
+    # in turn: rotation, heave only, planar motion, all, nothing
+    "Poses": Poses(((3, 4, 5), (2,), (0, 2, 4), (0, 1, 2, 3, 4, 5), ())),
 }
 DTYPES = [np.float32, np.float64]
 METHODS = ["exp", "log", "wedge", "vee", "matrix", "ad", "compose", "inverse", "retract"]
@@ -300,6 +302,38 @@ def test_shapes_and_order_of_coordinates():
     np.testing.assert_array_equal(powers.position[1], -x[:3])
 
 
+def test_poses_are_the_power_with_coordinates_left_out():
+    """Eᵀ A E for every operator, with the E of the free coordinates; poses outside the subgroup move alike."""
+    group, power = JITTED["Poses"], Jitted(Power(R3xSO3(), 5))
+    E = np.eye(30)[:, [3, 4, 5, 8, 12, 14, 16, *range(18, 24)]]
+    np.testing.assert_array_equal(group.group.rows(jnp.arange(13.0)).ravel(), E @ np.arange(13.0))
+    x, y = coordinates(group, 2)
+    q = group.exp(x)
+    close(q, power.exp(E @ x), ulps=2)  # the same formulas, compiled for other shapes
+    for method, point, full in (
+        ("ad", x, E @ x),
+        ("Ad_inv", q, q),
+        ("tangent", x, E @ x),
+        ("tangent_inv", x, E @ x),
+    ):
+        close(getattr(group, method)(point), E.T @ getattr(power, method)(full) @ E, ulps=4)
+    elsewhere = power.exp(coordinates(power))
+    close(group.retract(elsewhere, x), power.retract(elsewhere, E @ x), ulps=4)
+    close(group.to_ambient(elsewhere, y), power.to_ambient(elsewhere, E @ y), ulps=4)
+
+
+def test_poses_compute_no_rotation_that_no_body_has():
+    """Translations and one rotation commute: nothing is left of T and D; without rotations nothing of exp."""
+    planar, sliding = Poses(((0, 1, 5), (2,))), Poses(((0,), (1, 2)))
+    x = jnp.arange(1.0, 5.0)
+    for method in (planar.tangent_mv, planar.tangent_rmv, planar.tangent_inv_mv):
+        assert not jax.make_jaxpr(method)(x, x).eqns
+    assert not jax.make_jaxpr(planar.Ad_inv_mv)(planar.exp(x), x).eqns
+    np.testing.assert_array_equal(planar.ad(x), np.zeros((4, 4)))
+    assert "sin" in str(jax.make_jaxpr(planar.exp)(x))
+    assert "sin" not in str(jax.make_jaxpr(sliding.exp)(x[:3]))
+
+
 @pytest.mark.parametrize(
     ("build", "message"),
     [
@@ -310,6 +344,10 @@ def test_shapes_and_order_of_coordinates():
         (lambda: Product((SO3(), 3)), r"`groups\[1\]` is not a Lie group"),
         (lambda: Power(SO3, 2), "`group` is not a Lie group"),
         (lambda: Power(SO3(), 0), "`n` is the number of copies"),
+        (lambda: Poses(((3, 4),)), r"`free\[0\]` = \(3, 4\) has two rotations"),
+        (lambda: Poses(((0,), (2, 1))), r"`free\[1\]` must be increasing"),
+        (lambda: Poses(((0, 6),)), r"`free\[0\]` must be increasing integers from 0 to 5"),
+        (lambda: Poses(((), ())), "leaves no coordinate"),
         (lambda: Product((SO3(), Rn(1))).exp(jnp.zeros(5)), r"expected \(4,\)"),
     ],
 )

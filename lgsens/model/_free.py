@@ -1,0 +1,47 @@
+"""The degrees of freedom that a body has, by name."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from lgsens._validate import suggestion
+
+Free = tuple[str, ...]
+TRANSLATIONS: Free = ("x", "y", "z")
+ROTATIONS: Free = ("rx", "ry", "rz")
+ALL_FREE: Free = TRANSLATIONS + ROTATIONS  # in the order of the coordinates [x, θ]
+
+
+def as_free(value: str | Iterable[str], what: str) -> Free:
+    """The names of the degrees of freedom, in the order of the coordinates; a string is read word by word."""
+    names = tuple(value.split()) if isinstance(value, str) else tuple(value)
+    for name in names:
+        if name not in ALL_FREE:
+            raise ValueError(
+                f"{what}: {suggestion(name, ALL_FREE)}: x, y, z are translations along the inertial axes, rx, ry, rz "
+                "rotations about the body axes."
+            )
+    if sum(name in ROTATIONS for name in set(names)) == 2:
+        raise ValueError(
+            f"{what} = {names!r} has two rotations, which are no motion by themselves: turning about two axes in turn "
+            "is turning about the third. Free one rotation or all three, and add a joint (UniversalJoint)."
+        )
+    return tuple(name for name in ALL_FREE if name in names)
+
+
+def places(free: Free) -> tuple[int, ...]:
+    """The coordinates of a body, 0 to 5, that are free."""
+    return tuple(ALL_FREE.index(name) for name in free)
+
+
+def single_rotation(free: Iterable[str]) -> int | None:
+    """The axis (0, 1, 2) of the one rotation among `free`; None for none or three."""
+    axes = sorted({ROTATIONS.index(name) for name in free if name in ROTATIONS})
+    return axes[0] if len(axes) == 1 else None
+
+
+def is_along(direction, axis: int) -> bool:
+    """Whether a direction is that of a coordinate axis, to the accuracy of data given with eight digits."""
+    direction = np.asarray(direction)
+    across = np.delete(direction, axis)
+    return bool(np.abs(across).max() <= np.sqrt(np.finfo(direction.dtype).eps) * np.abs(direction).max())

@@ -1,0 +1,54 @@
+"""What the degrees of freedom of two bodies leave of the equations of a joint between them."""
+
+from collections.abc import Sequence
+
+from lgsens._validate import require
+from lgsens.model._constraints import AbstractConstraint, Coincidence, Orthogonality
+from lgsens.model._free import ROTATIONS, TRANSLATIONS, Free, is_along, single_rotation
+from lgsens.model._joints import AbstractJoint, FixedJoint, RevoluteJoint
+
+
+def needed(
+    name: str, joint: AbstractJoint, constraints: Sequence[AbstractConstraint], free_a: Free, free_b: Free
+) -> list[tuple[bool, ...]]:
+    """Which equations of each of a joint's basic constraints its bodies could violate; the ground has `free` = ().
+
+    The others hold in every configuration as they do in the reference, so their rows of B are zero on the free
+    coordinates: with them the constraints would be redundant, and without them nothing is lost. Let the rotations
+    of the two bodies be about one inertial axis e at most.
+
+      - A component of x_b + R_b X_b − x_a − R_a X_a along e changes by translation along e only; another
+        one by any rotation too.
+      - R_a e_a · R_b e_b is constant without rotations. With the one about e it is constant in a hinge about e; of
+        the three orthogonalities of a triad x·y, y·z, z·x only that of the two axes other than e changes.
+
+    A joint that the reference configuration need not satisfy keeps all its equations.
+
+    Raises `ValueError` for a hinge about another axis than the one rotation that its bodies have.
+    """
+    free = {*free_a, *free_b}
+    rotations = free & set(ROTATIONS)
+    axis = single_rotation(free)
+    keep_all = [(True,) * constraint.num_rows for constraint in constraints]
+    if not joint.assembled or (rotations and axis is None):
+        return keep_all
+    if axis is not None and isinstance(joint, RevoluteJoint):
+        require(
+            lambda direction: is_along(direction, axis),
+            f"Joint {name!r}: `axis` {joint.axis} must be that of {ROTATIONS[axis]!r}, the only rotation that "
+            f"{joint.a!r} and {joint.b!r} have; turn the axis, or free all rotations of one of them.",
+            joint.axis,
+        )
+    kept = []
+    for constraint, default in zip(constraints, keep_all):
+        if isinstance(constraint, Coincidence):
+            kept.append(tuple(TRANSLATIONS[i] in free or bool(rotations - {ROTATIONS[i]}) for i in range(3)))
+        elif isinstance(constraint, Orthogonality) and (not rotations or isinstance(joint, RevoluteJoint)):
+            kept.append((False,))
+        elif isinstance(constraint, Orthogonality) and isinstance(joint, FixedJoint):
+            # the i-th of the triad is between axes i and i + 1
+            orthogonality = sum(isinstance(before, Orthogonality) for before in constraints[: len(kept)])
+            kept.append((axis == (orthogonality + 2) % 3,))
+        else:
+            kept.append(default)
+    return kept

@@ -1,0 +1,85 @@
+"""What a scene consists of, and what it solves for."""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+from lgsens._validate import is_concrete
+from lgsens.model._body import RigidBody
+from lgsens.model._forces import AbstractForce
+from lgsens.model._joints import AbstractJoint
+
+
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """A scene in numbers; `print` shows it as a table.
+
+    Attributes:
+        bodies: for each body its degrees of freedom, names as in `RigidBody.free`.
+        equations: for each joint the number of its equations; those that its bodies cannot violate do not count.
+        coordinates: number of unknown coordinates k.
+        constraints: number of constraint equations m, and of multipliers.
+        table: what `print` shows.
+    """
+
+    bodies: dict[str, tuple[str, ...]]
+    equations: dict[str, int]
+    coordinates: int
+    constraints: int
+    table: str = dataclasses.field(repr=False)
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """k − m: those of the mechanism, if no equation repeats another."""
+        return self.coordinates - self.constraints
+
+    def __str__(self) -> str:
+        return self.table
+
+
+def summarize(
+    bodies: Mapping[str, RigidBody],
+    joints: Mapping[str, AbstractJoint],
+    forces: Mapping[str, AbstractForce],
+    constraint_names: Sequence[str],
+) -> Summary:
+    """The summary of a scene whose constraint equations have the given names."""
+    count = Counter(constraint_names)
+    equations = {name: count[name] for name in joints}
+    coordinates = sum(len(body.free) for body in bodies.values())
+    lines = [f"Bodies ({len(bodies)}): mass [kg], free coordinates"]
+    lines += _columns([(name, _mass(body), _free(body)) for name, body in bodies.items()])
+    lines += [f"Joints ({len(joints)}): type, bodies, equations"]
+    lines += _columns(
+        [(name, type(joint).__name__, _ends((joint.a, joint.b)), equations[name]) for name, joint in joints.items()]
+    )
+    lines += [f"Force elements ({len(forces)}): type, bodies"]
+    lines += _columns([(name, type(force).__name__, _ends(force.bodies)) for name, force in forces.items()])
+    totals = [
+        ("Unknown coordinates", coordinates),
+        ("Constraint equations", len(constraint_names)),
+        ("Degrees of freedom", coordinates - len(constraint_names)),
+    ]
+    lines += [f"{what:<24}{number:>5}" for what, number in totals]
+    free = {name: body.free for name, body in bodies.items()}
+    return Summary(free, equations, coordinates, len(constraint_names), "\n".join(lines))
+
+
+def _mass(body: RigidBody) -> str:
+    return f"{float(body.mass):.6g}" if is_concrete(body.mass) else "traced"
+
+
+def _free(body: RigidBody) -> str:
+    return " ".join(body.free) + (" about its pivot" if body.pivot is not None else "") if body.free else "held"
+
+
+def _ends(names: Sequence[str | None]) -> str:
+    """The bodies of an element; an element that names none acts on all."""
+    return " – ".join("ground" if name is None else name for name in names) if names else "all bodies"
+
+
+def _columns(rows: Sequence[Sequence[object]]) -> list[str]:
+    """Rows of a table, indented, columns aligned."""
+    texts = [[str(cell) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*texts)]
+    return ["  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in texts]
