@@ -63,7 +63,7 @@ def test_default_is_all_six_and_static():
         ({"free": "x y rz", "angular_velocity": X}, ("`angular_velocity` [1. 0. 0.]", "('x', 'y', 'rz')")),
         (
             {"free": "ry", "pivot": X, "velocity": Y},
-            ("RigidBody: `velocity`", "follows from the rotation about `pivot`"),
+            ("RigidBody: `velocity`", "follows from the rotation"),
         ),
     ],
 )
