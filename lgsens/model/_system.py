@@ -73,12 +73,26 @@ class MultibodySystem(AbstractSystem):
             return group.rows(v)
         return v.reshape(*v.shape[:-1], -1, BODY_DIM)
 
+    def _placed(self, q: Pose) -> Pose:
+        """q with what no body can change taken from the reference configuration.
+
+        A state has tangents along the free coordinates only: what else the poses depend on (the place of a pivot, say)
+        is a number of the system, and derivatives by it pass through here.
+        """
+        if isinstance(self.group, Power):
+            return q
+        free = self.index >= 0
+        moves, turns = free[:, : ROTATION.start], free[:, ROTATION].any(axis=1)[:, None, None]
+        pick = lambda own, new, old: jnp.where(np.broadcast_to(own, new.shape), new, jnp.broadcast_to(old, new.shape))
+        return Pose(pick(moves, q.position, self.pose.position), pick(turns, q.orientation, self.pose.orientation))
+
     def motion(self, body: int, q, v, vdot):
         """Position, orientation, velocity, Ω, acceleration, Ω̇ of a body's centre of mass, along leading axes.
 
         With the origin of the body frame at rest and the centre of mass at c in it: x = x_o + R c, ẋ = R (Ω × c) and
         ẍ = R (Ω̇ × c + Ω × (Ω × c)).
         """
+        q = self._placed(q)
         position, orientation = q.position[..., body, :], q.orientation[..., body, :, :]
         twist, rate = (self.twists(x)[..., body, :] for x in (v, vdot))
         velocity, spin = twist[..., : ROTATION.start], twist[..., ROTATION]
@@ -159,7 +173,7 @@ class MultibodySystem(AbstractSystem):
 
     @_traced_once
     def residual(self, q, v, vdot, lam, t):
-        twist = self.twists(v)
+        q, twist = self._placed(q), self.twists(v)
         spin = twist[:, ROTATION]
         acceleration = self.twists(vdot)
         turned = jax.vmap(turn)
@@ -181,6 +195,7 @@ class MultibodySystem(AbstractSystem):
 
     @_traced_once
     def constraint(self, q):
+        q = self._placed(q)
         entries = [
             _entries(stack.map(lambda e, a, b: e.value(a, b), q), rows)
             for stack, rows in zip(self.constraints, self._rows)
@@ -192,6 +207,7 @@ class MultibodySystem(AbstractSystem):
         k, m = self.group.dim, len(self.constraint_names)
         if m == 0:
             return jnp.zeros((0, k), self.mass.dtype)
+        q = self._placed(q)
         entries = []
         for stack, rows in zip(self.constraints, self._rows):
             block = stack.map(constraint_jacobian, q)[:, :, stack.part]
@@ -202,7 +218,7 @@ class MultibodySystem(AbstractSystem):
 
     @_traced_once
     def tangents(self, q, v, vdot, lam, t):
-        twist = self.twists(v)
+        q, twist = self._placed(q), self.twists(v)
         damping, stiffness = [], []
         if self._gyroscopic:
             spin = twist[:, ROTATION]
@@ -245,7 +261,7 @@ class MultibodySystem(AbstractSystem):
 
         def at_time(q, v, t):
             evaluate = lambda e, *args: getattr(e, "measure", e.force)(*args)
-            return single.map(evaluate, q, self.twists(v), extra=(t,))
+            return single.map(evaluate, self._placed(q), self.twists(v), extra=(t,))
 
         return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(at_time)(q, v, t))
 
