@@ -7,7 +7,7 @@ import importlib.util
 import json
 import os
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,22 +18,48 @@ from rival_scenes import SCENES, Scene
 from rival_timing import measure
 
 PACKAGES = ("lgsens", "jax", "jaxlib", "numpy", "diffrax", "exudyn", "casadi", "mujoco")
-LARGEST_REFERENCE = 8  # bodies
 NEEDS = {"exudyn": "exudyn", "casadi": "casadi", "mujoco": "mujoco"}
 
 
-def run(scenes: Iterable[str], rivals: Iterable[str], repeats: int, path: Path, settings: Mapping[str, str]) -> None:
-    """Measure the scenes and write them to `path`, each as soon as it is done."""
+def _read(path: Path) -> dict[str, Any]:
+    what = "lgsens beside its rivals: one run of each scene, programs in turns, medians in seconds"
+    empty = {"what": what, "references": {}, "scenes": {}}
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else empty
+
+
+def _write(path: Path, document: dict[str, Any]) -> None:
+    path.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def find_references(scenes: Iterable[str], path: Path) -> None:
+    """Compute the references of the scenes."""
     jax.config.update("jax_enable_x64", True)
-    document = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"scenes": {}}
-    document["what"] = "lgsens beside its rivals: one run of each scene, programs in turns, medians in seconds"
+    for name in scenes:
+        scene = SCENES[name]()
+        value, gradient = rival_lgsens.reference(scene)
+        document = _read(path)
+        document["references"][name] = {"p": scene.start.tolist(), "value": value, "gradient": gradient}
+        _write(path, document)
+
+
+def run(
+    scenes: Iterable[str],
+    rivals: Iterable[str],
+    kinds: Sequence[str] | None,
+    repeats: int,
+    path: Path,
+    settings: Mapping[str, str],
+) -> None:
+    """Measure the scenes and write them to `path`, each as soon as it is done. `kinds`: None for all."""
+    jax.config.update("jax_enable_x64", True)
     present = [name for name in rivals if importlib.util.find_spec(NEEDS.get(name, "jax")) is not None]
     for name in scenes:
         scene = SCENES[name]()
-        found = _scene(scene, present, repeats)
+        found = _scene(scene, present, kinds, repeats)
         found["environment"] = _environment(settings)
+        document = _read(path)
         document["scenes"][name] = found
-        path.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        _write(path, document)
         jax.clear_caches()
 
 
@@ -53,54 +79,73 @@ def _environment(settings: Mapping[str, str]) -> dict[str, Any]:
     }
 
 
-def _scene(scene: Scene, rivals: Iterable[str], repeats: int) -> dict[str, Any]:
-    print(f"{scene.name}: reference", flush=True)
-    # of a long chain the reference would take longer than all the rest
-    value, gradient = rival_lgsens.reference(scene) if len(scene.bodies) <= LARGEST_REFERENCE else (None, None)
-    jax.clear_caches()
-    programs = []
+def _scene(scene: Scene, rivals: Iterable[str], kinds: Sequence[str] | None, repeats: int) -> dict[str, Any]:
+    programs, failed = [], {}
     for name in ("lgsens", *rivals):
-        print(f"{scene.name}: {name} is built", flush=True)
-        programs += importlib.import_module(f"rival_{name}").programs(scene)
+        try:
+            mine = importlib.import_module(f"rival_{name}").programs(scene)
+            mine = [program for program in mine if kinds is None or program.kind in kinds]
+            for program in mine:
+                print(f"{scene.name}: {name}, {program.kind}, {program.program}", flush=True)
+                if program.prepare is not None:
+                    program.prepare(program)
+            programs += mine
+        except Exception as error:  # a rival that fails does not cost the others their numbers
+            failed[name] = type(error).__name__
+            print(f"{scene.name}: {name} failed: {error}", flush=True)
     print(f"{scene.name}: {len(programs)} programs, {repeats} rounds", flush=True)
     records = measure(programs, repeats)
-    _compare(scene, records, value, gradient)
     return {
         "t1": scene.t1,
         "bodies": len(scene.bodies),
         "parameters": list(scene.names),
         "criterion": "integral of the square of " + " ".join(map(str, scene.observed)),
         "repeats": repeats,
-        "reference": {"value": value, "gradient": gradient},
+        "failed": failed,
         "programs": records,
     }
 
 
-def _compare(scene: Scene, records: list[dict[str, Any]], value: float | None, gradient: list[float] | None) -> None:
+def _compare(scene: Scene, records: list[dict[str, Any]], reference: dict[str, Any] | None) -> None:
     """Errors against the reference and ratios to lgsens's program of the same kind.
 
-    Where there is no reference (gradients with respect to all numbers, long chains) the comparison is with lgsens.
+    Where there is no reference, and for gradients with respect to all numbers, the comparison is with lgsens.
     Errors of a gradient are relative to the largest effect of a relative change of a parameter.
     """
+    if reference is not None and not np.array_equal(reference["p"], scene.start):
+        reference = None  # one of other parameters
     own = {record["kind"]: record for record in records if record["rival"] == "lgsens"}
     parts = {"gradient, p": slice(None), f"gradient, p, batch of {scene.batch}": slice(None)}
     parts |= {f"gradient, {name}": list(where) for name, where in scene.subsets}
     for record in records:
-        kind = record["kind"]
+        kind, where = record["kind"], parts.get(record["kind"])
         lgsens = own.get(kind)
-        if record["value"] is not None and value is not None:
-            record["value_error"] = abs(record["value"] / value - 1)
+        for key in ("value_error", "value_difference_from_lgsens", "gradient_error", "gradient_difference_from_lgsens"):
+            record.pop(key, None)
+        if record["value"] is not None and reference is not None:
+            record["value_error"] = abs(record["value"] / reference["value"] - 1)
         elif record["value"] is not None and lgsens is not None:
             record["value_difference_from_lgsens"] = abs(record["value"] / lgsens["value"] - 1)
-        if record["gradient"] is not None:
-            found = np.array(record["gradient"])
-            if kind in parts and gradient is not None:
-                wanted, scale = np.asarray(gradient)[parts[kind]], scene.scale[parts[kind]]
-                worst = np.max(np.abs((found - wanted) * scale))
-                record["gradient_error"] = float(worst / np.max(np.abs(wanted * scale)))
-            elif lgsens is not None:
-                wanted = np.array(lgsens["gradient"])
-                record["gradient_difference_from_lgsens"] = float(np.max(np.abs(found / wanted - 1)))
+        if record["gradient"] is not None and where is not None and reference is not None:
+            wanted = np.asarray(reference["gradient"])[where]
+            record["gradient_error"] = _difference(record["gradient"], wanted, scene.scale[where])
+        elif record["gradient"] is not None and lgsens is not None:
+            wanted = np.asarray(lgsens["gradient"])
+            scale = 1 / wanted if where is None else scene.scale[where]
+            record["gradient_difference_from_lgsens"] = _difference(record["gradient"], wanted, scale)
         if lgsens is not None:
             record["ratio_to_lgsens"] = record["seconds"] / lgsens["seconds"]
             record["cpu_ratio_to_lgsens"] = record["cpu_seconds"] / lgsens["cpu_seconds"]
+
+
+def _difference(found: list[float], wanted: np.ndarray, scale: np.ndarray) -> float:
+    return float(np.max(np.abs((np.asarray(found) - wanted) * scale)) / np.max(np.abs(wanted * scale)))
+
+
+def compare_again(path: Path) -> dict[str, Any]:
+    """The numbers of the file, compared with the references that it has by now."""
+    document = _read(path)
+    for name, found in document["scenes"].items():
+        _compare(SCENES[name](), found["programs"], document["references"].get(name))
+    _write(path, document)
+    return document

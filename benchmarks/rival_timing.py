@@ -13,8 +13,9 @@ import numpy as np
 class Program:
     """One program of one rival on one scene.
 
-    `call` runs it and returns Ψ and the gradient (None: it has none), complete; Ψ may be NaN where only the gradient is
-    computed. `basis`: "equal step" or "equal accuracy". `details`: what else the table should say.
+    `call` runs it to the end; `show` makes Ψ and the gradient of what it returns (None: it has none; Ψ may be NaN where
+    only the gradient is computed). `prepare` compiles it first, if that is not done. `basis`: "equal step" or "equal
+    accuracy". `details`: what else the JSON should say.
     """
 
     rival: str
@@ -22,7 +23,9 @@ class Program:
     kind: str  # "forward" or "gradient, …"; programs of one kind do the same work
     num_steps: int
     basis: str
-    call: Callable[[], tuple[Any, Any]]
+    call: Callable[[], Any] | None = None
+    show: Callable[[Any], tuple[Any, Any]] = lambda found: found
+    prepare: Callable[["Program"], None] | None = None
     build_seconds: float | None = None
     temporary_bytes: int | None = None
     details: dict[str, Any] = dataclasses.field(default_factory=dict)
@@ -42,22 +45,20 @@ def compiled(
     """
     import jax
 
-    started = time.perf_counter()
-    executable = jax.jit(lambda *given: function(*given)).lower(*arguments).compile()
-    build = time.perf_counter() - started
-    memory = executable.memory_analysis()
+    def prepare(program: Program) -> None:
+        started = time.perf_counter()
+        executable = jax.jit(lambda *given: function(*given)).lower(*arguments).compile()
+        program.build_seconds = time.perf_counter() - started
+        program.temporary_bytes = int(executable.memory_analysis().temp_size_in_bytes)
+        program.call = lambda: jax.block_until_ready(executable(*arguments))
 
-    def call():
-        found = jax.block_until_ready(executable(*arguments))
-        return found if isinstance(found, tuple) else (found, None)
-
-    def shown(found):
+    def show(found):
+        if not isinstance(found, tuple):
+            return float(found), None
         value, gradient = (leaf[0] for leaf in found) if first else found
-        return float(value), None if gradient is None else np.ravel(np.asarray(select(gradient)))
+        return float(value), np.ravel(np.asarray(select(gradient)))
 
-    program = Program(call=call, build_seconds=build, temporary_bytes=int(memory.temp_size_in_bytes), **members)
-    program.details["shown"] = shown
-    return program
+    return Program(prepare=prepare, show=show, **members)
 
 
 def measure(programs: Sequence[Program], repeats: int) -> list[dict[str, Any]]:
@@ -67,8 +68,7 @@ def measure(programs: Sequence[Program], repeats: int) -> list[dict[str, Any]]:
     """
     shown, taken, busy = [], [[] for _ in programs], [[] for _ in programs]
     for program in programs:
-        show = program.details.pop("shown", lambda found: found)
-        shown.append(show(program.call()))
+        shown.append(program.show(program.call()))
     for _ in range(repeats):
         for program, times, cpu_times in zip(programs, taken, busy):
             started, cpu_started = time.perf_counter(), time.process_time()
