@@ -142,10 +142,9 @@ def _difference(found: list[float], wanted: np.ndarray, scale: np.ndarray) -> fl
     return float(np.max(np.abs((np.asarray(found) - wanted) * scale)) / np.max(np.abs(wanted * scale)))
 
 
-def compare_again(path: Path) -> dict[str, Any]:
-    """The numbers of the file, compared with the references that it has by now."""
+def compare_again(path: Path) -> None:
+    """Compare the numbers of the file with the references that it has by now."""
     document = _read(path)
     for name, found in document["scenes"].items():
         _compare(SCENES[name](), found["programs"], document["references"].get(name))
     _write(path, document)
-    return document

@@ -15,6 +15,7 @@ numbers there) and prints the tables.
 
 import argparse
 import importlib
+import json
 import os
 from pathlib import Path
 
@@ -44,13 +45,15 @@ def main() -> None:
     path = arguments.out / "rivals.json"
     os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
     tables = importlib.import_module("rival_tables")
-    run = importlib.import_module("rival_run")
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    if arguments.references:
-        run.find_references(arguments.scenes, path)
-    elif not (arguments.table or arguments.readme):
-        run.run(arguments.scenes, arguments.rivals, arguments.kinds, arguments.repeats, path, SINGLE_THREAD)
-    text = tables.markdown(run.compare_again(path))
+    if not (arguments.table or arguments.readme):
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        run = importlib.import_module("rival_run")
+        if arguments.references:
+            run.find_references(arguments.scenes, path)
+        else:
+            run.run(arguments.scenes, arguments.rivals, arguments.kinds, arguments.repeats, path, SINGLE_THREAD)
+        run.compare_again(path)
+    text = tables.markdown(json.loads(path.read_text(encoding="utf-8")))
     if arguments.readme:
         tables.put_into(Path(__file__).parent / "README.md", text)
     print(text)
