@@ -1,0 +1,96 @@
+"""lgsens's own programs, by its public interface alone."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from rival_scenes import Scene
+from rival_timing import Program, compiled
+
+import lgsens as lg
+
+
+def criterion(scene: Scene, model: lg.Model):
+    """Ψ."""
+    trajectory = lg.simulate(model, t1=scene.t1, num_steps=scene.num_steps, throw=False)
+    body, quantity, axis = scene.observed
+    observed = getattr(trajectory.body(body), quantity)[:, axis]
+    return lg.time_integral(trajectory.t, observed**2)
+
+
+def common_entries(scene: Scene, gradient: lg.Model):
+    """Entries of a gradient with respect to all numbers that every program has: masses and rates."""
+    rates = []
+    if "spring" in gradient.forces:
+        forces = gradient.forces
+        rates = [forces["spring"].stiffness, forces["damper"].damping, forces["tyre"].stiffness]
+    return jnp.stack([*(gradient.bodies[name].mass for name in scene.bodies), *rates])
+
+
+def reference(scene: Scene) -> tuple[float, list[float]]:
+    """Ψ and dΨ/dp of the motion itself: the index-reduced equations, by diffrax's Dopri8 at a tolerance of 1e-12."""
+    body, quantity, axis = scene.observed
+    found = lg.differentiate(
+        lg.Criterion(integrand=lambda s, p: getattr(s.body(body), quantity)[axis] ** 2),
+        scene.model,
+        jnp.asarray(scene.start),
+        t1=scene.t1,
+        num_steps=scene.num_steps,
+        method=lg.IndexReduced(breaks=scene.breaks),
+    )
+    return float(found.value), [float(g) for g in found.gradient]
+
+
+def programs(scene: Scene) -> list[Program]:
+    """Ψ; its gradient by reverse mode for all numbers and for p; by forward mode for parts of p."""
+    p = jnp.asarray(scene.start)
+    model = eqx.filter_jit(scene.model)(p)
+    psi = partial(criterion, scene)
+    psi_of_p = lambda p: psi(scene.model(p))
+    basis = {"rival": "lgsens", "num_steps": scene.num_steps, "basis": "equal step"}
+
+    def part(indices):
+        index = jnp.asarray(indices)
+        return lambda chosen: psi_of_p(p.at[index].set(chosen))
+
+    of_p = jax.value_and_grad(psi_of_p)
+    found = [
+        compiled(psi_of_p, (p,), kind="forward", program="simulate", **basis),
+        compiled(of_p, (p,), kind="gradient, p", program="jax.value_and_grad", **basis),
+    ]
+    if scene.all_numbers:
+        found.append(
+            compiled(
+                eqx.filter_value_and_grad(psi),
+                (model,),
+                kind="gradient, all numbers",
+                program="eqx.filter_value_and_grad",
+                select=partial(common_entries, scene),
+                **basis,
+            )
+        )
+    for name, indices in scene.subsets:
+        function = jax.jacfwd(part(indices))
+        found.append(
+            compiled(
+                lambda chosen, function=function: (jnp.nan, function(chosen)),
+                (p[jnp.asarray(indices)],),
+                kind=f"gradient, {name}",
+                program="jax.jacfwd",
+                **basis,
+            )
+        )
+    if scene.batch:
+        designs = p * jnp.linspace(1.0, 1.001, scene.batch)[:, None]
+        found.append(
+            compiled(
+                jax.vmap(of_p),
+                (designs,),
+                kind=f"gradient, p, batch of {scene.batch}",
+                program="jax.vmap(jax.value_and_grad)",
+                first=True,
+                **basis,
+            )
+        )
+    return found

@@ -1,0 +1,63 @@
+"""lgsens beside its rivals: the same scenes and criteria, in one process, round by round.
+
+    python benchmarks/rivals.py [--scenes top quarter_car …] [--rivals plain_jax exudyn …] [--out benchmarks/results]
+    python benchmarks/rivals.py --references       # Ψ and its gradient of the motion itself, once for each scene
+    python benchmarks/rivals.py --table            # the last run's tables as Markdown; measures nothing
+
+The rivals are in benchmarks/requirements.txt; one that is not installed is left out. Every program is compiled or built
+and called once; then the programs take turns, `--repeats` rounds, and medians count. All of them run on one thread. Ψ
+and its gradients are compared with the index-reduced equations at a tolerance of 1e-12 where `--references` has been
+run, else with lgsens, so that nobody measures other work. Writes rivals.json (scenes that are not run keep their
+numbers there) and prints the tables.
+
+"equal step": the step of lgsens. "equal accuracy": steps that reach at least lgsens's accuracy in Ψ.
+"""
+
+import argparse
+import importlib
+import json
+import os
+from pathlib import Path
+
+SCENES = ("top", "quarter_car", *(f"chain_{n}" for n in (2, 8, 32, 128, 512)))
+RIVALS = ("plain_jax", "exudyn", "casadi", "diffrax", "mujoco")
+SINGLE_THREAD = {
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder (default: %(default)s)")
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=["top", "quarter_car"])
+    parser.add_argument("--rivals", nargs="*", choices=RIVALS, default=list(RIVALS))
+    parser.add_argument("--kinds", nargs="+", help="only this work, e.g. forward 'gradient, p' (default: all)")
+    parser.add_argument("--repeats", type=int, default=5, help="rounds, at least 5 (default: %(default)s)")
+    parser.add_argument("--references", action="store_true", help="compute the references of the scenes and compare")
+    parser.add_argument("--table", action="store_true", help="print the tables of rivals.json, measure nothing")
+    parser.add_argument("--readme", action="store_true", help="as --table, and put them into benchmarks/README.md")
+    arguments = parser.parse_args()
+    if arguments.repeats < 5:
+        parser.error("--repeats must be at least 5")
+    path = arguments.out / "rivals.json"
+    os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
+    tables = importlib.import_module("rival_tables")
+    if not (arguments.table or arguments.readme):
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        run = importlib.import_module("rival_run")
+        if arguments.references:
+            run.find_references(arguments.scenes, path)
+        else:
+            run.run(arguments.scenes, arguments.rivals, arguments.kinds, arguments.repeats, path, SINGLE_THREAD)
+        run.compare_again(path)
+    text = tables.markdown(json.loads(path.read_text(encoding="utf-8")))
+    if arguments.readme:
+        tables.put_into(Path(__file__).parent / "README.md", text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
