@@ -107,10 +107,11 @@ def test_forward_mode_and_vmap():
 
 
 def test_error_estimate():
-    """`error` is the error of the finer run, in all quantities, and extrapolation leaves a quarter of it at most.
+    """`error` is the error of the finer run, in all quantities, and extrapolation leaves a small part of it.
 
     Against the extrapolation of 100 and 200 steps, whose own error is a sixteenth of what is left. Accelerations and
-    multipliers have transients (−ρ)ⁿ h², which differ in both runs: from the 40th step, where 0.9⁴⁰ = 0.015.
+    multipliers have transients (−ρ)ⁿ h², which differ in both runs: from the 25th step, where 0.9²⁵ = 0.07, and of
+    nutation at 20 rad/s (ω h)² = 0.16 is left.
     """
     rough, best = top_run(50, RICHARDSON)[2], extrapolate_runs(top_run(100)[2], top_run(200)[2])
     states = jax.tree.map(lambda leaf: leaf[::2], best.states)
@@ -118,8 +119,8 @@ def test_error_estimate():
     w = jax.vmap(lambda q, exact: group.log(group.compose(group.inverse(q), exact)))(rough.states.q, states.q)
     left = {"w": w} | {name: getattr(states, name) - getattr(rough.states, name) for name in ("v", "vdot", "lam")}
     for name, remaining in left.items():
-        estimate, start = getattr(rough.error, name), (40 if name in ("vdot", "lam") else 0)
-        assert np.abs(remaining[start:]).max() < 0.25 * np.abs(estimate[start:]).max(), name
+        start, part = (25, 0.3) if name in ("vdot", "lam") else (0, 0.1)
+        assert np.abs(remaining[start:]).max() < part * np.abs(getattr(rough.error, name)[start:]).max(), name
 
 
 def test_configurations_stay_on_the_group_and_near_the_constraints():
