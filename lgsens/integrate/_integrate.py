@@ -3,8 +3,9 @@
 An iteration with the matrix of an earlier step (modified Newton) evaluates the residual only, and contracts by 1e-3 to
 1e-2 on the quarter-car when the matrix is up to 20 steps old. Started from extrapolated accelerations and multipliers
 it takes three or four to round-off, each a tenth of a full one. Its increment d_i leaves an error of about κ d_i, with
-κ = d_i/d_{i−1}. Where that is the square of the tolerance, or round-off, one more iteration ends it: to ask for less
-would be to ask for increments that the round-off of the constraints does not allow.
+κ = d_i/d_{i−1}, and the next iteration κ² d_i. Where that is the square of the tolerance, or a fraction of round-off
+(the errors of a thousand steps add up), the next iteration is the last: to ask for smaller increments instead would be
+to ask for what the round-off of the constraints does not allow.
 """
 
 from collections.abc import Callable
@@ -21,7 +22,7 @@ from lgsens.integrate._linear import Factors, Inverse
 from lgsens.integrate._scheme import GeneralizedAlpha, advance, factorize_iteration_matrix, increment
 
 _MODIFIED_LIMIT = 12  # iterations; more cost as much as a full one
-_SLOW = 0.2  # the contraction from which on two full iterations cost less
+_SLOW = 0.1  # the contraction from which on two full iterations cost less
 _FASTEST = 0.02  # contractions measured close to round-off are no better than this
 
 
@@ -100,7 +101,7 @@ def take_step(
     mass, scale = constants
     eps = float(jnp.finfo(mass.dtype).eps)
     tolerance = max(scheme.tolerance, 64 * eps)
-    target = max(tolerance**2, 4 * eps)
+    target = max(tolerance**2, 0.04 * eps)
 
     def corrected(factors: Factors | Inverse | None, iterate: _Iterate) -> _Iterate:
         motion = advance(scheme, system, previous, iterate.u, h)
@@ -115,7 +116,7 @@ def take_step(
         size = jnp.max(jnp.abs(du) * (scheme.beta * h**2) / scale)
         measured = (iterate.iterations > 0) & (iterate.increment > 64 * eps)  # increments below are round-off
         contraction = jnp.where(measured, jnp.maximum(size / iterate.increment, _FASTEST), iterate.contraction)
-        settled = iterate.increment * iterate.contraction <= target
+        settled = iterate.increment * iterate.contraction**2 <= target
         largest, count = jnp.max(jnp.abs(residual)), iterate.iterations + 1
         return _Iterate(iterate.u - du, iterate.lam - dlam, size, contraction, largest, count, settled)
 

@@ -81,8 +81,8 @@ class MultibodySystem(AbstractSystem):
         """
         if isinstance(self.group, Power):
             return q
-        free = self.index >= 0
-        moves, turns = free[:, : ROTATION.start], free[:, ROTATION].any(axis=1)[:, None, None]
+        moves = self.index[:, : ROTATION.start] >= 0
+        turns = np.any(self.index[:, ROTATION] >= 0, axis=1)[:, None, None]
         pick = lambda own, new, old: jnp.where(np.broadcast_to(own, new.shape), new, jnp.broadcast_to(old, new.shape))
         return Pose(pick(moves, q.position, self.pose.position), pick(turns, q.orientation, self.pose.orientation))
 

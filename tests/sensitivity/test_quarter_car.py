@@ -127,7 +127,8 @@ def difference_step(name, leaf):
 def test_gradient_of_every_leaf():
     """Ψ₀ with respect to every number of the model: masses, inertias, hardpoints, axes, rates, road, initial state.
 
-    The scene is in motion from the start, so that everything matters.
+    The scene is in motion from the start, so that everything matters. The differences are those of full Newton, which
+    leaves less than the 1e-12 of Ψ that modified Newton does.
     """
     car = eqx.tree_at(lambda c: (c.bump_height, c.bump_duration), CAR, (jnp.asarray(0.08), jnp.asarray(0.1225)))
     model = car.model(**FREE)
@@ -141,10 +142,11 @@ def test_gradient_of_every_leaf():
         (jnp.array([3.0, 20.0, -5.0]), jnp.asarray(0.0113)),
     )
 
-    def value(model):
-        return comfort(lg.simulate(model, t1=0.15, num_steps=60))
+    def value(model, factor_every=20):
+        integrator = lg.GeneralizedAlpha(factor_every=factor_every)
+        return comfort(lg.simulate(model, t1=0.15, num_steps=60, integrator=integrator))
 
-    compiled = jax.jit(value)
+    compiled = jax.jit(lambda model: value(model, factor_every=0))
     gradient = jax.jit(jax.grad(value))(model)
     psi = float(compiled(model))
     found = every_leaf(compiled, model, gradient, difference_step)
