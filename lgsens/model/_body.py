@@ -39,7 +39,8 @@ class RigidBody(eqx.Module):
     The initial velocities are projected on those that the joints allow (`initial_state`).
 
     The rotation of a body that has only one is about an inertial axis too: its body axis of that name lies along the
-    inertial axis of that name. So which equations of a joint are needed does not depend on numbers.
+    inertial axis of that name. So which equations of a joint are needed does not depend on numbers. Derivatives by its
+    `orientation` are those of a turn about that axis.
 
     Raises `ValueError` for wrong shapes, a mass that is not positive, an inertia that no body can
     have, an orientation that is not a rotation; an unknown degree of freedom, two rotations (which are no group), one
