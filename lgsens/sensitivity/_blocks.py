@@ -52,6 +52,8 @@ def sweep_blocks(blocks: Blocks, sweep: Callable, carry: Any, inputs: Any, *, re
 
     The leading axis of `inputs` is a multiple of the length of a block; that of the outputs is the same.
     """
-    split = jax.tree.map(lambda leaf: leaf.reshape(-1, blocks.length, *leaf.shape[1:]), inputs)
+    # No −1 among the sizes: without constraints there are arrays of size 0.
+    length = blocks.length
+    split = jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] // length, length, *leaf.shape[1:]), inputs)
     carry, outputs = lax.scan(sweep, carry, split, reverse=reverse)
-    return carry, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), outputs)
+    return carry, jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * length, *leaf.shape[2:]), outputs)
