@@ -135,6 +135,7 @@ def test_configurations_stay_on_the_group_and_near_the_constraints():
     assert violation < 3.0 * np.abs(trajectory.error.w).max() ** 2
 
 
+@pytest.mark.slow  # two runs, two compilations
 def test_closed_loop():
     """The four-bar's ∫ v̇² dt against the independent reference: a tenth and less of the error of 400 steps is left."""
     wanted = load("four_bar_spring")["value"]["Psi2"]

@@ -9,7 +9,9 @@ from reference_runs import check_criteria, check_invariants, check_states, docum
 from lgsens.examples import PROBLEMS, four_bar, slider_crank
 
 
-@pytest.mark.parametrize("name", ["simple_pendulum_A01", "slider_crank_sundials", "four_bar_spring"])
+@pytest.mark.parametrize(
+    "name", ["simple_pendulum_A01", pytest.param("slider_crank_sundials", marks=pytest.mark.slow), "four_bar_spring"]
+)
 def test_criteria_and_gradients(name):
     check_criteria(name)
 

@@ -60,6 +60,7 @@ def limits():
     return of
 
 
+@pytest.mark.slow  # the paper's top, below, is not
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("method", [lg.ContinuousDirect(), lg.ContinuousAdjoint()], ids=["direct", "adjoint"])
 def test_continuous_methods_converge_to_the_motions_derivative(name, method, limits):

@@ -44,7 +44,7 @@ def test_static_preload_is_the_reference():
     np.testing.assert_allclose(forces["tyre"].preload, REFERENCE["states"][0]["tire_normal_force"], rtol=1e-10)
 
 
-@pytest.fixture(scope="module", params=["hinged", "locked"])
+@pytest.fixture(scope="module", params=["hinged", pytest.param("locked", marks=pytest.mark.slow)])
 def runs(request):
     """Trajectories and gradients of Ψ₀ at 500 and 1000 steps over 2 s, one wheel kind."""
     wheel = request.param

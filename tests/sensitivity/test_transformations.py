@@ -78,8 +78,9 @@ class Scene:
         return np.stack(columns, axis=-1)
 
 
-# the top and the quarter-car bracket the four-bar in size
-@pytest.fixture(scope="module", params=["top", pytest.param("four_bar", marks=pytest.mark.slow), "quarter_car"])
+@pytest.fixture(
+    scope="module", params=["top", *(pytest.param(name, marks=pytest.mark.slow) for name in SCENES if name != "top")]
+)
 def scene(request):
     return Scene(request.param)
 
