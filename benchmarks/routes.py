@@ -1,6 +1,6 @@
 """Accuracy and cost of the integrators, and of scenes with fewer unknowns.
 
-    python benchmarks/routes.py [--out benchmarks/results]
+    python benchmarks/routes.py [--out benchmarks/results] [--problems spinning_top_brulls.l_1.0_alpha0_0.785398 …]
 
 First the quarter-car in its options: unknowns, equations, Ψ₀ over 1 s in 500 steps, time. Then, for the paper's top and
 the quarter-car over 2 s, generalized-α, Richardson extrapolation and the index-reduced equations side by side: relative
@@ -128,10 +128,12 @@ def route(name: str, integrator, num_steps: int) -> dict:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder (default: %(default)s)")
-    out = parser.parse_args().out
+    parser.add_argument("--problems", nargs="*", choices=PROBLEM_NAMES, default=PROBLEM_NAMES)
+    arguments = parser.parse_args()
+    out, problems = arguments.out, arguments.problems
     jax.config.update("jax_enable_x64", True)
     record = {"versions": {"python": platform.python_version(), "jax": jax.__version__}, "cores": os.cpu_count()}
-    jobs = [(name, *case) for name in PROBLEM_NAMES for case in ROUTES[name]]
+    jobs = [(name, *case) for name in problems for case in ROUTES[name]]
     with tqdm(total=len(FIDELITIES) + len(jobs), desc="programs", disable=None) as progress:
 
         def done(result):
@@ -140,7 +142,7 @@ def main() -> None:
             return result
 
         record["fidelity"] = {name: done(fidelity(options)) for name, options in FIDELITIES.items()}
-        record["routes"] = {name: [] for name in PROBLEM_NAMES}
+        record["routes"] = {name: [] for name in problems}
         for name, label, integrator, num_steps in jobs:
             record["routes"][name].append({"route": label} | done(route(name, integrator, num_steps)))
     out.mkdir(parents=True, exist_ok=True)
