@@ -17,7 +17,17 @@ FREE = document("free_rigid_body.json")
 FILES = ("spinning_top_brulls.", "heavy_top_bruls2012.", "lagrange_top_analytic.", "free_rigid_body.")
 
 
-@pytest.mark.parametrize("name", [name for name in PROBLEMS if name.startswith(FILES)])
+LONG = ("spinning_top_brulls.as_printed_l_0.5", "heavy_top_bruls2012.to_1s")  # as others, at other numbers
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name in LONG else name
+        for name in PROBLEMS
+        if name.startswith(FILES)
+    ],
+)
 def test_criteria_and_gradients(name):
     check_criteria(name)
 
