@@ -209,6 +209,13 @@ CONSTRUCTORS = {
         )
         for value in (0, -3, 2.5, "ten")
     },
+    **{
+        f"factor_every = {value!r}": (
+            lambda value=value: lg.GeneralizedAlpha(factor_every=value),
+            ("GeneralizedAlpha: `factor_every` must be", "at least 0", "full Newton always", f"got {value!r}"),
+        )
+        for value in (-1, 2.5, "ten")
+    },
     # the examples and the measurement of costs
     **{
         f"num_links = {value!r}": (
