@@ -53,11 +53,8 @@ def _decoded(run: SavedRun) -> SavedRun:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
 def _saved(output, scheme, num_steps, state0, parameters):
-    def of_state(state: State, t):
-        return output(parameters.system, state, t)
-
     system, t0, h = parameters
-    outputs, final, stats = integrate_outputs(scheme, num_steps, system, state0, t0, h, of_state)
+    outputs, final, stats = integrate_outputs(scheme, num_steps, system, state0, t0, h, partial(output, system))
     return SavedRun(outputs, final, encoded(stats, h.dtype))
 
 
