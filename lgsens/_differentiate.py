@@ -227,7 +227,7 @@ def _differentiate_jit(criteria, names, build, start, p, t0, t1, num_steps, inte
     of_multipliers = [name for name, use in zip(names, uses) if use.multipliers]
     if of_multipliers and found.details is not None:
         note = f"{' and '.join(of_multipliers)}: multipliers are used."
-        redundant = is_redundant(found.details["jacobian"])  # a given state0 has not been asked
+        redundant = is_redundant(system, found.details["jacobian"])  # a given state0 has not been asked
         result = jnp.where(redundant, RESULTS.redundant_constraints, result).astype(jnp.int32)
     gradient = tuple(unravel(row) for row in found.gradient)
     return tuple(found.value), gradient, result, found.details, system.constraint_names, note

@@ -9,6 +9,7 @@ from jax import lax
 from jax.core import Tracer
 
 from lgsens.dynamics import RESULTS
+from lgsens.linear import Matrix, SparseMatrix
 
 # Which of several runs: `details["run"]`.
 _RUNS = ("", " of the coarser of two runs", " of the finer of two runs")
@@ -18,8 +19,10 @@ class SimulationError(RuntimeError):
     """A simulation or an equilibrium that failed; the message says at which step, when, and what to try."""
 
 
-def redundant_names(jacobian: np.ndarray, names: tuple[str, ...]) -> list[str]:
+def redundant_names(jacobian: Matrix, names: tuple[str, ...]) -> list[str]:
     """The joints whose rows of B are linearly dependent: those with weight in the left null space of B."""
+    if isinstance(jacobian, SparseMatrix):
+        jacobian = jacobian.to_numpy()
     rows = jacobian / np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), np.finfo(jacobian.dtype).tiny)
     left, singular, _ = np.linalg.svd(rows)
     threshold = np.sqrt(np.finfo(jacobian.dtype).eps)
@@ -76,14 +79,14 @@ def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tupl
         failed = np.argwhere(codes != RESULTS.successful)
         if len(failed):  # not its size: a scalar that has failed has an index of no entries
             lane = tuple(failed[0])
-            message_details = {key: np.asarray(value)[lane] for key, value in details.items()}
+            message_details = jax.tree.map(lambda value: np.asarray(value)[lane], details)
             raise _exception(int(codes[lane]), message_details, names, note)
         return np.ones(codes.shape, bool)
 
     if not isinstance(result, Tracer):
         # Details may be traced (by grad) where the result is not; their values are all that is needed.
         if int(result) != RESULTS.successful:
-            values = {key: np.asarray(_value(value)) for key, value in details.items()}
+            values = jax.tree.map(lambda value: np.asarray(_value(value)), details)
             raise _exception(int(result), values, names, note)
         return tree
 

@@ -6,8 +6,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from lgsens.dynamics import RESULTS, AbstractSystem, Initial, State, initial_state, split_velocity
+from lgsens.dynamics import (
+    RESULTS,
+    AbstractSystem,
+    Initial,
+    State,
+    constraint_jacobian,
+    initial_state,
+    split_velocity,
+)
 from lgsens.integrate import GeneralizedAlpha
+from lgsens.linear import Matrix
 
 
 class Begin(NamedTuple):
@@ -17,7 +26,7 @@ class Begin(NamedTuple):
     consistent_v: Float[Array, " k"]  # v_0 without the scheme's O(h²)
     result: Int[Array, ""]
     violation: Float[Array, " m"]
-    jacobian: Float[Array, "m k"]
+    jacobian: Matrix  # B there, (m, k)
 
 
 def begin(
@@ -25,12 +34,12 @@ def begin(
 ) -> Begin:
     """The state at t0: `state0` as it is, or the consistent one of the reference configuration, `initial` if known."""
     if state0 is not None:
-        jacobian = system.constraint_jacobian(state0.q)
+        jacobian = constraint_jacobian(system, state0.q)
         return Begin(state0, state0.v, jnp.zeros((), jnp.int32), system.constraint(state0.q), jacobian)
     initial = initial_state(system, t0) if initial is None else initial
     usable = initial.result == RESULTS.successful
     state = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), _started(integrator, system, initial, h))
-    jacobian = system.constraint_jacobian(initial.state.q)
+    jacobian = constraint_jacobian(system, initial.state.q)
     return Begin(state, initial.state.v, initial.result, initial.violation, jacobian)
 
 
@@ -51,7 +60,7 @@ def _started(integrator: GeneralizedAlpha, system: AbstractSystem, initial: Init
     state = initial.state
     delta = integrator.alpha_m - integrator.alpha_f
     missed = (1.0 / 6.0 - integrator.beta - delta / 2.0) * initial.jerk
-    missed = missed + system.group.ad(state.v) @ state.vdot / 12.0
+    missed = missed + system.group.ad_mv(state.v, state.vdot) / 12.0
     _, normal = split_velocity(system, state.q, missed)
     return State(
         q=state.q,

@@ -14,12 +14,21 @@ from lgsens.dynamics._initial import (
     initial_state as initial_state,
     is_redundant as is_redundant,
     kkt_solve as kkt_solve,
-    mass_scale as mass_scale,
     split_velocity as split_velocity,
+)
+from lgsens.dynamics._matrices import (
+    constraint_jacobian as constraint_jacobian,
+    factor_size as factor_size,
+    factorized as factorized,
+    mass_matrix as mass_matrix,
+    mass_scale as mass_scale,
+    tangents as tangents,
+    times_tangent_operator as times_tangent_operator,
 )
 from lgsens.dynamics._results import RESULTS as RESULTS
 from lgsens.dynamics._state import State as State, Tangents as Tangents
 from lgsens.dynamics._system import (
+    AbstractSparseSystem as AbstractSparseSystem,
     AbstractSystem as AbstractSystem,
     autodiff_constraint_jacobian as autodiff_constraint_jacobian,
     autodiff_tangents as autodiff_tangents,

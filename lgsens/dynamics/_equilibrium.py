@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from lgsens.dynamics._initial import Initial, mass_scale
+from lgsens.dynamics._initial import Initial
+from lgsens.dynamics._matrices import mass_scale
 from lgsens.dynamics._results import RESULTS
 from lgsens.dynamics._state import State
 from lgsens.dynamics._system import AbstractSystem

@@ -8,9 +8,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from lgsens.dynamics._matrices import ConstrainedMass, constraint_jacobian, factorized, mass_scale
 from lgsens.dynamics._results import RESULTS
 from lgsens.dynamics._state import State
 from lgsens.dynamics._system import AbstractSystem
+from lgsens.linear import Inverse, Matrix, SparseMatrix, diagonal
 
 _MAX_ITERATIONS = 30
 
@@ -22,11 +24,6 @@ class Initial(NamedTuple):
     jerk: Float[Array, " k"]  # v̈ at the initial time
     result: Int[Array, ""]  # a value of RESULTS
     violation: Float[Array, " m"]  # Φ after assembly
-
-
-def mass_scale(mass: Float[Array, "k k"]) -> Float[Array, ""]:
-    """The size of M, by which the rows of B and the multipliers are scaled to it (DESIGN: Bottasso et al. 2007)."""
-    return lax.stop_gradient(jnp.trace(mass) / mass.shape[0])
 
 
 def kkt_solve(mass, jacobian, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
@@ -44,8 +41,8 @@ def split_velocity(system: AbstractSystem, q, v) -> tuple[Float[Array, " k"], Fl
 
     [[M, Bᵀ], [B, 0]] [v_tangential; μ] = [M v; 0]
     """
-    mass, jacobian = system.mass_matrix(), system.constraint_jacobian(q)
-    tangential, _ = kkt_solve(mass, jacobian, mass @ v, jnp.zeros(jacobian.shape[0], v.dtype))
+    kkt = ConstrainedMass.of(system, q)
+    tangential, _ = kkt.solve(kkt.mass @ v, jnp.zeros(kkt.jacobian.shape[0], v.dtype))
     return tangential, v - tangential
 
 
@@ -54,13 +51,13 @@ def accelerations(system: AbstractSystem, q, v, t):
 
     M v̇ + Bᵀλ = ad(v)ᵀ M v − f(q, v, t),     B v̇ = −Ḃ v = −D(B v)·(q ṽ)|_v
     """
-    jacobian = system.constraint_jacobian(q)
-    zero, lam_zero = jnp.zeros_like(v), jnp.zeros(jacobian.shape[0], v.dtype)
+    kkt = ConstrainedMass.of(system, q)
+    zero, lam_zero = jnp.zeros_like(v), jnp.zeros(kkt.jacobian.shape[0], v.dtype)
     # The derivative along q ṽ is taken in the arrays of q: differentiating retract(q, s v) at s = 0 gives the same
     # numbers, and compiles the derivatives of exp, which took half of the compile time.
-    _, rate = jax.jvp(lambda q: system.constraint_jacobian(q) @ v, (q,), (system.group.to_ambient(q, v),))
+    _, rate = jax.jvp(lambda q: constraint_jacobian(system, q) @ v, (q,), (system.group.to_ambient(q, v),))
     force = -system.residual(q, v, zero, lam_zero, t)
-    return kkt_solve(system.mass_matrix(), jacobian, force, -rate)
+    return kkt.solve(force, -rate)
 
 
 def acceleration_and_jerk(system: AbstractSystem, q, v, t):
@@ -131,12 +128,20 @@ def independence(jacobian: Float[Array, "m k"]) -> Float[Array, ""]:
     return jnp.min(jnp.abs(jnp.diagonal(jnp.linalg.qr(unit.T, mode="r"))))
 
 
-def is_redundant(jacobian: Float[Array, "m k"]) -> Bool[Array, ""]:
-    """Whether rows of B are linearly dependent.
+def is_redundant(system: AbstractSystem, jacobian: Matrix) -> Bool[Array, ""]:
+    """Whether rows of B are linearly dependent; B from `constraint_jacobian`.
 
-    Redundant rows leave |R_ii| at round-off, independent ones near a singular configuration well above it.
+    Redundant rows leave |R_ii| of `independence` at round-off, independent ones near a singular configuration well
+    above it. Sparse: the complements of [[I, B̂ᵀ], [B̂, 0]], B̂ with unit rows, are −R_ii² or combinations of them;
+    round-off leaves nothing of those below eps^0.8.
     """
-    return independence(lax.stop_gradient(jacobian)) < jnp.finfo(jacobian.dtype).eps ** 0.6
+    jacobian = lax.stop_gradient(jacobian)
+    if not isinstance(jacobian, SparseMatrix):
+        return independence(jacobian) < jnp.finfo(jacobian.dtype).eps ** 0.6
+    dtype, ones = jacobian.dtype, jnp.ones(jacobian.shape[1], jacobian.dtype)
+    unit = jacobian.with_unit_rows()
+    factors = factorized(system, diagonal(ones), unit.T, unit, jnp.ones((), dtype), Inverse)
+    return ~(factors.largest_inverse() < jnp.finfo(dtype).eps ** -0.8)  # NaN is redundant
 
 
 def initial_state(system: AbstractSystem, t) -> Initial:
@@ -151,7 +156,7 @@ def initial_state(system: AbstractSystem, t) -> Initial:
     vdot, lam, vddot = acceleration_and_jerk(system, q, v, t)
     state = State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
     dtype = v.dtype
-    redundant = is_redundant(system.constraint_jacobian(q))
+    redundant = is_redundant(system, constraint_jacobian(system, q))
     length = jnp.max(system.coordinate_scale())
     largest = jnp.max(jnp.abs(violation), initial=0.0)
     assembled = largest <= 1e3 * jnp.finfo(dtype).eps * jnp.maximum(length, 1.0)  # NaN is not assembled

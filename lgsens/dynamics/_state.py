@@ -5,6 +5,8 @@ from typing import Any, NamedTuple
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from lgsens.linear import Matrix
+
 
 class State(eqx.Module):
     """Position, velocity, acceleration, multipliers and auxiliary acceleration at one instant.
@@ -34,6 +36,6 @@ class Tangents(NamedTuple):
     δr = K_t δq + C_t δv + M δv̇ + Bᵀ δλ  and  δΦ = B δq, at one state.
     """
 
-    stiffness: Float[Array, "k k"]  # K_t
-    damping: Float[Array, "k k"]  # C_t
-    constraint_jacobian: Float[Array, "m k"]  # B
+    stiffness: Matrix  # K_t, (k, k)
+    damping: Matrix  # C_t, (k, k)
+    constraint_jacobian: Matrix  # B, (m, k)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from lgsens.dynamics._state import Tangents
 from lgsens.liegroups import AbstractLieGroup
+from lgsens.linear import Elimination, SparseMatrix
 
 
 class AbstractSystem(eqx.Module):
@@ -68,6 +69,35 @@ class AbstractSystem(eqx.Module):
     @abc.abstractmethod
     def tangents(self, q, v, vdot, lam, t) -> Tangents:
         """The exact tangents K_t, C_t and B. `autodiff_tangents` is a ready implementation."""
+
+
+class AbstractSparseSystem(AbstractSystem):
+    """A system whose matrices are sums of small blocks, one for each element between two bodies.
+
+    Where `elimination` is a plan, the time of a step follows the number of bodies; None: all is dense, as it is for
+    every other system.
+    """
+
+    @property
+    @abc.abstractmethod
+    def elimination(self) -> Elimination | None:
+        """The order in which coordinates and multipliers are eliminated."""
+
+    @abc.abstractmethod
+    def sparse_mass_matrix(self) -> SparseMatrix:
+        """M, shape (k, k)."""
+
+    @abc.abstractmethod
+    def sparse_constraint_jacobian(self, q) -> SparseMatrix:
+        """B, shape (m, k), columns by bodies."""
+
+    @abc.abstractmethod
+    def sparse_tangents(self, q, v, vdot, lam, t) -> Tangents:
+        """K_t, C_t and B; the columns of K_t and B by bodies."""
+
+    @abc.abstractmethod
+    def tangent_operators(self, x) -> Float[Array, "N 6 6"]:
+        """T(x) body by body, zero in the rows and columns of coordinates that a body does not have."""
 
 
 def autodiff_tangents(system: AbstractSystem, q, v, vdot, lam, t) -> Tangents:

@@ -8,7 +8,6 @@ from lgsens.integrate._integrate import (
     integrate_outputs as integrate_outputs,
     take_step as take_step,
 )
-from lgsens.integrate._linear import Factors as Factors
 from lgsens.integrate._scheme import (
     GeneralizedAlpha as GeneralizedAlpha,
     advance as advance,

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from lgsens.dynamics import AbstractSystem, State
-from lgsens.integrate._linear import Factors, Inverse
+from lgsens.dynamics import AbstractSystem, State, mass_matrix, tangents
 from lgsens.integrate._scheme import GeneralizedAlpha, advance, factorize_iteration_matrix, increment
+from lgsens.linear import Factors, Inverse, Matrix
 
 _MODIFIED_LIMIT = 12  # iterations; more cost as much as a full one
 _SLOW = 0.1  # the contraction from which on two full iterations cost less
@@ -45,12 +45,12 @@ class Stats(NamedTuple):
 class Constants(NamedTuple):
     """What all steps share."""
 
-    mass: Float[Array, "k k"]
+    mass: Matrix  # M, (k, k)
     scale: Float[Array, " k"]
 
     @classmethod
     def of(cls, system: AbstractSystem) -> "Constants":
-        return cls(system.mass_matrix(), system.coordinate_scale())
+        return cls(mass_matrix(system), system.coordinate_scale())
 
 
 class Guess(NamedTuple):
@@ -89,7 +89,7 @@ def take_step(
     constants: Constants,
     previous: State,
     guess: Guess,
-    earlier: Factors | Inverse | None,
+    earlier: Factors | None,
     running,
     t,
     h,
@@ -99,17 +99,17 @@ def take_step(
     `earlier` solves with the iteration matrix of an earlier step, for modified Newton; None: full Newton only.
     """
     mass, scale = constants
-    eps = float(jnp.finfo(mass.dtype).eps)
+    eps = float(jnp.finfo(scale.dtype).eps)
     tolerance = max(scheme.tolerance, 64 * eps)
     target = max(tolerance**2, 0.04 * eps)
 
-    def corrected(factors: Factors | Inverse | None, iterate: _Iterate) -> _Iterate:
+    def corrected(factors: Factors | None, iterate: _Iterate) -> _Iterate:
         motion = advance(scheme, system, previous, iterate.u, h)
         point = (motion.q, motion.v, motion.vdot, iterate.lam, t)
         residual = system.residual(*point)
         violation = system.constraint(motion.q) / (scheme.beta * h**2)
         if factors is None:
-            solver = factorize_iteration_matrix(scheme, system, system.tangents(*point), mass, motion.x, h)
+            solver = factorize_iteration_matrix(scheme, system, tangents(system, *point), mass, motion.x, h)
         else:
             solver = factors
         du, dlam = solver.solve(residual, violation)
@@ -129,7 +129,7 @@ def take_step(
     def unfinished(iterate: _Iterate):
         return running & (iterate.increment > tolerance) & (iterate.iterations < scheme.max_iterations)
 
-    infinite, none, no = jnp.full((), jnp.inf, mass.dtype), jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    infinite, none, no = jnp.full((), jnp.inf, scale.dtype), jnp.zeros((), jnp.int32), jnp.zeros((), bool)
     u, lam = guess.extrapolated(previous)
     iterate = _Iterate(u, lam, infinite, guess.contraction, infinite, none, no)
     contraction = guess.contraction
@@ -182,10 +182,10 @@ def integrate_outputs(
     """`output(state, t)` stacked instead of the states, the final state, and what Newton did."""
     constants = Constants.of(system)
 
-    def inverse(state: State, n) -> Inverse:
-        tangents = system.tangents(state.q, state.v, state.vdot, state.lam, t0 + n * h)
+    def inverse(state: State, n) -> Factors:
+        at_state = tangents(system, state.q, state.v, state.vdot, state.lam, t0 + n * h)
         x = increment(scheme, state, state.a, h)
-        return factorize_iteration_matrix(scheme, system, tangents, constants.mass, x, h, Inverse)
+        return factorize_iteration_matrix(scheme, system, at_state, constants.mass, x, h, Inverse)
 
     def step(carry, n):
         previous, guess, earlier, running = carry
@@ -199,7 +199,7 @@ def integrate_outputs(
         state, guess, stats = take_step(scheme, system, constants, previous, guess, earlier, running, t, h)
         return (state, guess, earlier, stats.converged), (output(state, t), stats)
 
-    count = jnp.arange(num_steps, dtype=constants.mass.dtype)
+    count = jnp.arange(num_steps, dtype=constants.scale.dtype)
     earlier = None
     if scheme.factor_every:
         shape = jax.eval_shape(inverse, state0, count[0])

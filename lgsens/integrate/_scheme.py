@@ -22,12 +22,11 @@ import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import AbstractSystem, State, Tangents, mass_scale
-from lgsens.integrate._linear import Factors
+from lgsens.dynamics import AbstractSystem, State, Tangents, factorized, mass_scale, times_tangent_operator
+from lgsens.linear import LU, Factors
 
 
 class GeneralizedAlpha(eqx.Module):
@@ -129,13 +128,10 @@ def advance(scheme: GeneralizedAlpha, system: AbstractSystem, previous: State, u
 
 
 def factorize_iteration_matrix(
-    scheme: GeneralizedAlpha, system: AbstractSystem, tangents: Tangents, mass, x, h, kind: Any = Factors
-):
+    scheme: GeneralizedAlpha, system: AbstractSystem, tangents: Tangents, mass, x, h, kind: Any = LU
+) -> Factors:
     """The factors of S above: one LU, which serves Newton, the DDM, and transposed, the AVM. Or its `Inverse`."""
-    group = system.group
-    k = mass.shape[0]
-    # A T(x) for the rows of K_t and B together
-    rows = jnp.concatenate([tangents.stiffness, tangents.constraint_jacobian])
-    rows = jax.vmap(lambda row: group.tangent_rmv(x, row))(rows)
-    dynamic = scheme.inertia_factor * mass + (scheme.gamma * h) * tangents.damping + (scheme.beta * h**2) * rows[:k]
-    return kind.of(dynamic, tangents.constraint_jacobian.T, rows[k:], mass_scale(mass))
+    jacobian = tangents.constraint_jacobian
+    stiffness, lower = times_tangent_operator(system, x, (tangents.stiffness, jacobian))
+    dynamic = scheme.inertia_factor * mass + (scheme.gamma * h) * tangents.damping + (scheme.beta * h**2) * stiffness
+    return factorized(system, dynamic, jacobian.T, lower, mass_scale(mass), kind)

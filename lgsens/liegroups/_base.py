@@ -61,8 +61,8 @@ class AbstractLieGroup(eqx.Module):
         """The matrix that represents `q` faithfully (eq. 20): `matrix(p∘q) = matrix(p) matrix(q)`."""
 
     @abc.abstractmethod
-    def ad(self, x: Float[Array, " k"]) -> Float[Array, "k k"]:
-        """The matrix of the Lie bracket, `(ad(x) y)~ = [x~, y~] = x~ y~ - y~ x~` (eqs. 5-6), shape (k, k)."""
+    def ad_mv(self, x: Float[Array, " k"], y: Float[Array, " k"]) -> Float[Array, " k"]:
+        """The Lie bracket, `(ad(x) y)~ = [x~, y~] = x~ y~ - y~ x~` (eqs. 5-6). `x, y`: shape (k,)."""
 
     @abc.abstractmethod
     def Ad_inv_mv(self, q: Element, w: Float[Array, " k"]) -> Float[Array, " k"]:
@@ -99,6 +99,11 @@ class AbstractLieGroup(eqx.Module):
     def retract(self, q: Element, x: Float[Array, " k"]) -> Element:
         """The element `q exp(x~)` (eqs. 7 and 24). `x`: coordinates of the increment, shape (k,)."""
         return self.compose(q, self.exp(x))
+
+    @final
+    def ad(self, x: Float[Array, " k"]) -> Float[Array, "k k"]:
+        """The matrix of `ad_mv` (eqs. 5-6), shape (k, k)."""
+        return _dense(lambda y: self.ad_mv(x, y), self.dim, x.dtype)
 
     @final
     def Ad_inv(self, q: Element) -> Float[Array, "k k"]:

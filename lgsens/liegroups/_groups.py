@@ -53,8 +53,8 @@ class Rn(AbstractLieGroup):
     def matrix(self, q):
         return jnp.eye(self.n + 1, dtype=q.dtype).at[: self.n, self.n].set(q)
 
-    def ad(self, x):
-        return jnp.zeros((self.n, self.n), x.dtype)
+    def ad_mv(self, x, y):
+        return jnp.zeros_like(y)
 
     def Ad_inv_mv(self, q, w):
         return w
@@ -143,9 +143,9 @@ class R3xSO3(AbstractLieGroup):
         """The 7×7 matrix of eq. (20), the rotation block first."""
         return block_diag(_ORIENTATION.matrix(q.orientation), _POSITION.matrix(q.position))
 
-    def ad(self, x):
-        u, r = _split(x)
-        return block_diag(_POSITION.ad(u), _ORIENTATION.ad(r))
+    def ad_mv(self, x, y):
+        (u, r), (w, s) = _split(x), _split(y)
+        return jnp.concatenate([_POSITION.ad_mv(u, w), _ORIENTATION.ad_mv(r, s)])
 
     def Ad_inv_mv(self, q, w):
         u, r = _split(w)

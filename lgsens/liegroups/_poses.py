@@ -144,11 +144,11 @@ class Poses(AbstractLieGroup):
     def matrix(self, q):
         return self._all.matrix(q)
 
-    def ad(self, x):
-        where, zero = self._turns, jnp.zeros((self.dim, self.dim), x.dtype)
-        if not len(where):
+    def ad_mv(self, x, y):
+        zero = jnp.zeros_like(y)
+        if not len(self._turning):
             return zero
-        return zero.at[where[:, :, None], where[:, None, :]].set(jax.vmap(_ORIENTATION.ad)(x[where]))
+        return self._rotated(zero, jax.vmap(_ORIENTATION.ad_mv)(x[self._turns], y[self._turns]))
 
     def Ad_inv_mv(self, q, w):
         return self._at_orientation(_ORIENTATION.Ad_inv_mv, q, w)

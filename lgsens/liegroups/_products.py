@@ -82,8 +82,8 @@ class Product(AbstractLieGroup):
     def matrix(self, q):
         return block_diag(*self._each("matrix", q))
 
-    def ad(self, x):
-        return block_diag(*self._each("ad", _pieces(x, self._dims)))
+    def ad_mv(self, x, y):
+        return self._joined("ad_mv", _pieces(x, self._dims), _pieces(y, self._dims))
 
     def Ad_inv_mv(self, q, w):
         return self._joined("Ad_inv_mv", q, _pieces(w, self._dims))
@@ -161,8 +161,8 @@ class Power(AbstractLieGroup):
     def matrix(self, q):
         return self._blocks(self.group.matrix, q)
 
-    def ad(self, x):
-        return self._blocks(self.group.ad, self._rows(x))
+    def ad_mv(self, x, y):
+        return jax.vmap(self.group.ad_mv)(self._rows(x), self._rows(y)).reshape(-1)
 
     def Ad_inv_mv(self, q, w):
         return jax.vmap(self.group.Ad_inv_mv)(q, self._rows(w)).reshape(-1)

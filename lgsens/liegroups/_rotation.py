@@ -146,8 +146,8 @@ class SO3(AbstractLieGroup):
     def matrix(self, q):
         return q
 
-    def ad(self, x):
-        return skew(x)
+    def ad_mv(self, x, y):
+        return cross(x, y)
 
     def Ad_inv_mv(self, q, w):
         """`D(R) w = R^T w`: inertial-frame components to body-frame components."""

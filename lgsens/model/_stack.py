@@ -16,6 +16,7 @@ from lgsens.liegroups import Pose, R3xSO3
 from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint
 from lgsens.model._frames import BODY_A, BODY_B, Frame, ground_frame
 from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, LoadTangents
+from lgsens.model._topology import Ends
 
 BODY_DIM = 6
 Element = TypeVar("Element", AbstractConstraint, AbstractLoad)
@@ -46,12 +47,9 @@ class Stack(eqx.Module, Generic[Element]):
         """The element coordinates that belong to bodies; the ground has none."""
         return BODY_B if self.a is None else BODY_A if self.b is None else slice(BODY_A.start, BODY_B.stop)
 
-    def coordinates(self, index: np.ndarray) -> np.ndarray:
-        """The system coordinates of each element's `part`, shape (elements, 6 or 12).
-
-        `index`: those of each body, shape (bodies, 6), −1 where it does not have the coordinate.
-        """
-        return np.concatenate([index[np.asarray(side)] for side in (self.a, self.b) if side], axis=1)
+    @property
+    def ends(self) -> Ends:
+        return Ends(self.a, self.b, self.owners, self.kept)
 
     def map(self, function, q, *per_side, extra: Sequence[Any] = ()):
         """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra)` for every element.

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import suggestion
-from lgsens.dynamics import AbstractSystem, Tangents
+from lgsens.dynamics import AbstractSparseSystem, Tangents
 from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew
+from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, chosen
 from lgsens.model._constraints import AbstractConstraint
 from lgsens.model._frames import ROTATION, turn
 from lgsens.model._loads import AbstractLoad
@@ -22,13 +23,14 @@ from lgsens.model._stack import (
     constraint_stiffness,
     load_tangents,
 )
+from lgsens.model._topology import Topology, topology
 
 # A gradient evaluates these five times in its program. `inline` leaves no call behind; what it saves is tracing,
 # a third of it on the quarter-car.
 _traced_once = partial(jax.jit, inline=True)
 
 
-class MultibodySystem(AbstractSystem):
+class MultibodySystem(AbstractSparseSystem):
     """Rigid bodies, joints and forces as stacked numbers.
 
     For body i with coordinates [x_i, θ_i] (paper §3.2, signs as in ERRATA):
@@ -52,6 +54,15 @@ class MultibodySystem(AbstractSystem):
     body_names: tuple[str, ...] = eqx.field(static=True)
     free: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # the coordinates, 0 to 5, of each body
     assembled: bool = eqx.field(static=True)
+    linear_solver: AbstractLinearSolver | None = eqx.field(static=True, default=None)  # None: the cheaper one
+
+    @property
+    def topology(self) -> Topology:
+        return topology(self.free, *(tuple(stack.ends for stack in some) for some in (self.constraints, self.loads)))
+
+    @property
+    def elimination(self):
+        return self.topology.elimination(self.linear_solver)
 
     @property
     def group(self) -> Power | Poses:
@@ -61,10 +72,7 @@ class MultibodySystem(AbstractSystem):
     @property
     def index(self) -> np.ndarray:
         """The place of each body's coordinates among those of the system, shape (N, 6); −1 where it has none."""
-        group = self.group
-        if isinstance(group, Poses):
-            return group.index
-        return np.arange(len(self.body_names) * BODY_DIM).reshape(-1, BODY_DIM)
+        return self.topology.index
 
     def twists(self, v: Float[Array, "*batch k"]) -> Float[Array, "*batch N 6"]:
         """[ẋ, Ω] of each body, or their rates of change, from v or v̇: zero where a body is not free."""
@@ -106,20 +114,10 @@ class MultibodySystem(AbstractSystem):
         return position, orientation, velocity, spin, acceleration, change
 
     @property
-    def _rows(self) -> list[np.ndarray]:
-        """The multipliers of each stack, shape (elements, rows of one); −1 for an equation that is not kept."""
-        rows, start = [], 0
-        for stack in self.constraints:
-            kept = np.asarray(stack.kept)
-            rows.append(np.where(kept, start + np.cumsum(kept).reshape(kept.shape) - 1, -1))
-            start += int(kept.sum())
-        return rows
-
-    @property
     def constraint_names(self) -> tuple[str, ...]:
         return tuple(
             owner
-            for stack, rows in zip(self.constraints, self._rows)
+            for stack, rows in zip(self.constraints, self.topology.rows)
             for owner, own in zip(stack.owners, rows)
             for _ in range((own >= 0).sum())
         )
@@ -145,26 +143,24 @@ class MultibodySystem(AbstractSystem):
         return jnp.tile(scale, len(self.body_names))
 
     def mass_matrix(self):
+        return self.sparse_mass_matrix().dense()
+
+    def sparse_mass_matrix(self):
         blocks = jnp.zeros((len(self.body_names), BODY_DIM, BODY_DIM), self.mass.dtype)
         translation = self.mass[:, None, None] * jnp.eye(ROTATION.start, dtype=self.mass.dtype)[None]
         blocks = blocks.at[:, : ROTATION.start, : ROTATION.start].set(translation)
         blocks = blocks.at[:, ROTATION, ROTATION].set(self.inertia)
-        return self._matrix([(blocks, self.index)])
+        return self._square([Blocks(blocks, self.topology.mass)])
 
-    def _matrix(self, blocks) -> Float[Array, "k k"]:
-        """The sum of square blocks at their coordinates, in one scatter."""
+    def _square(self, parts) -> SparseMatrix:
         k = self.group.dim
-        if not blocks:
-            return jnp.zeros((k, k), self.mass.dtype)
-        entries = [_entries(block, _flat(c[:, :, None], c[:, None, :], k)) for block, c in blocks]
-        values, places = _joined(entries)
-        return jnp.zeros(k * k, self.mass.dtype).at[places].add(values).reshape(k, k)
+        return SparseMatrix(tuple(parts), (k, k), self.mass.dtype)
 
-    def _multipliers(self, lam, rows: np.ndarray):
-        """The multipliers of a stack's equations, zero for those that are not kept."""
-        if (rows >= 0).all():
-            return lam[rows]
-        return jnp.concatenate([lam, jnp.zeros(1, lam.dtype)])[np.where(rows < 0, len(lam), rows)]
+    def tangent_operators(self, x):
+        # T is block diagonal: a unit vector for each of the six coordinates, in all bodies at once, gives its columns.
+        columns = self.index.T[:, :, None] == np.arange(self.group.dim)
+        units = jnp.asarray(columns.any(axis=1), x.dtype)
+        return jnp.moveaxis(self.twists(jax.vmap(partial(self.group.tangent_mv, x))(units)), 0, 2)
 
     @property
     def _gyroscopic(self) -> bool:
@@ -181,62 +177,61 @@ class MultibodySystem(AbstractSystem):
         moment = turned(self.inertia, acceleration[:, ROTATION])
         if self._gyroscopic:
             moment = moment + jax.vmap(cross)(spin, turned(self.inertia, spin))
-        entries = [_entries(jnp.concatenate([force, moment], axis=1), self.index)]
-        for stack in self.loads:
+        topology = self.topology
+        forces = [(jnp.concatenate([force, moment], axis=1), topology.mass.rows)]
+        for stack, pattern in zip(self.loads, topology.loads):
             force = stack.map(lambda e, a, b, va, vb, t: e.force(a, b, va, vb, t), q, twist, extra=(t,))
-            values, places = _entries(force[:, stack.part], stack.coordinates(self.index))
-            entries.append((-values, places))
-        for stack, rows in zip(self.constraints, self._rows):
-            force = stack.map(constraint_force, q, extra=(self._multipliers(lam, rows),))
-            entries.append(_entries(force[:, stack.part], stack.coordinates(self.index)))
-        zero = jnp.zeros_like(v)
-        values, places = _joined(entries)
-        return zero.at[places].add(values)
+            forces.append((-force[:, stack.part], pattern.rows))
+        for stack, pattern in zip(self.constraints, topology.jacobian):
+            force = stack.map(constraint_force, q, extra=(chosen(lam, pattern.rows),))
+            forces.append((force[:, stack.part], pattern.columns))
+        return added(forces, self.group.dim, v.dtype)
 
     @_traced_once
     def constraint(self, q):
         q = self._placed(q)
-        entries = [
-            _entries(stack.map(lambda e, a, b: e.value(a, b), q), rows)
-            for stack, rows in zip(self.constraints, self._rows)
+        values = [
+            (stack.map(lambda e, a, b: e.value(a, b), q), rows)
+            for stack, rows in zip(self.constraints, self.topology.rows)
         ]
-        return _joined(entries)[0] if entries else jnp.zeros(0, self.mass.dtype)
+        return added(values, self.topology.num_constraints, self.mass.dtype)
 
-    @_traced_once
     def constraint_jacobian(self, q):
-        k, m = self.group.dim, len(self.constraint_names)
-        if m == 0:
-            return jnp.zeros((0, k), self.mass.dtype)
-        q = self._placed(q)
-        entries = []
-        for stack, rows in zip(self.constraints, self._rows):
-            block = stack.map(constraint_jacobian, q)[:, :, stack.part]
-            entries.append(_entries(block, _flat(rows[:, :, None], stack.coordinates(self.index)[:, None, :], k)))
-        zero = jnp.zeros(m * k, self.mass.dtype)
-        values, places = _joined(entries)
-        return zero.at[places].add(values).reshape(m, k)
+        return self.sparse_constraint_jacobian(q).dense()
 
     @_traced_once
+    def sparse_constraint_jacobian(self, q):
+        q = self._placed(q)
+        parts = [
+            Blocks(stack.map(constraint_jacobian, q)[:, :, stack.part], pattern)
+            for stack, pattern in zip(self.constraints, self.topology.jacobian)
+        ]
+        return SparseMatrix(tuple(parts), (self.topology.num_constraints, self.group.dim), self.mass.dtype)
+
     def tangents(self, q, v, vdot, lam, t):
-        q, twist = self._placed(q), self.twists(v)
+        return Tangents(*(matrix.dense() for matrix in self.sparse_tangents(q, v, vdot, lam, t)))
+
+    @_traced_once
+    def sparse_tangents(self, q, v, vdot, lam, t):
+        q, twist, topology = self._placed(q), self.twists(v), self.topology
         damping, stiffness = [], []
         if self._gyroscopic:
             spin = twist[:, ROTATION]
             momentum = jnp.einsum("nij,nj->ni", self.inertia, spin)
             gyroscopic = jax.vmap(skew)(spin) @ self.inertia - jax.vmap(skew)(momentum)
-            damping.append((gyroscopic, self.index[:, ROTATION]))
-        for stack in self.loads:
-            part, coordinates = stack.part, stack.coordinates(self.index)
+            damping.append(Blocks(gyroscopic, topology.gyroscopic))
+        for stack, pattern in zip(self.loads, topology.loads):
+            part = stack.part
             position, velocity = stack.map(load_tangents, q, twist, extra=(t,))
             if position is not None:
-                stiffness.append((-position[:, part, part], coordinates))
+                stiffness.append(Blocks(-position[:, part, part], pattern))
             if velocity is not None:
-                damping.append((-velocity[:, part, part], coordinates))
-        for stack, rows in zip(self.constraints, self._rows):
+                damping.append(Blocks(-velocity[:, part, part], pattern))
+        for stack, rows, pattern in zip(self.constraints, topology.rows, topology.stiffness):
             part = stack.part
-            block = stack.map(constraint_stiffness, q, extra=(self._multipliers(lam, rows),))
-            stiffness.append((block[:, part, part], stack.coordinates(self.index)))
-        return Tangents(self._matrix(stiffness), self._matrix(damping), self.constraint_jacobian(q))
+            block = stack.map(constraint_stiffness, q, extra=(chosen(lam, rows),))
+            stiffness.append(Blocks(block[:, part, part], pattern))
+        return Tangents(self._square(stiffness), self._square(damping), self.sparse_constraint_jacobian(q))
 
     def measure(self, force: str, q, v, t):
         """What the force element `force` measures at each of the stacked poses, velocities and times.
@@ -265,22 +260,3 @@ class MultibodySystem(AbstractSystem):
 
         return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(at_time)(q, v, t))
 
-
-# Where entries of a system's arrays go: static arrays of integers, −1 for an entry that the system does not have.
-
-
-def _flat(row: np.ndarray, column: np.ndarray, width: int) -> np.ndarray:
-    """The places of the entries (row, column) of a matrix in its flattened array."""
-    return np.where((row < 0) | (column < 0), -1, row * width + column)
-
-
-def _entries(array, places: np.ndarray):
-    """The entries of an array that have a place, and their places, both flat."""
-    values, places = array.ravel(), places.ravel()
-    chosen = np.flatnonzero(places >= 0)
-    return (values, places) if len(chosen) == len(places) else (values[chosen], places[chosen])
-
-
-def _joined(entries):
-    """The entries of several arrays in one, and their places."""
-    return jnp.concatenate([values for values, _ in entries]), np.concatenate([places for _, places in entries])

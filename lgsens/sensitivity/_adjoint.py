@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from lgsens.dynamics import State
+from lgsens.dynamics import State, factor_size, mass_matrix
 from lgsens.integrate import GeneralizedAlpha
 from lgsens.sensitivity._blocks import Blocks, padded, sweep_blocks
 from lgsens.sensitivity._linearization import (
@@ -45,10 +45,10 @@ from lgsens.sensitivity._linearization import (
 def adjoint_sweep(scheme: GeneralizedAlpha, states: State, parameters: Parameters, c: Variation, c_p: Parameters):
     """Solve Lᵀ (μ, p̄) = (c, c_p) backwards in time; returns μ stacked (row 0: the cotangent of δ_0), and p̄."""
     system, h = parameters.system, parameters.h
-    group, mass = system.group, parameters.system.mass_matrix()
+    group, mass = system.group, mass_matrix(system)
     alpha_m, alpha_f = scheme.alpha_m, scheme.alpha_f
     num_steps = states.v.shape[0] - 1
-    blocks = Blocks.of(num_steps, states.v.shape[1] + states.lam.shape[1])
+    blocks = Blocks.of(num_steps, factor_size(system))
 
     def one(c: Variation, inputs):
         (x, _, (k_t, c_t, jacobian), factors), earlier = inputs

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-_NUMBERS = 2**17  # of the iteration matrices of a block: 1 MB in double precision, what stays in a core's cache
+_NUMBERS = 2**17  # of the factors of a block: 1 MB in double precision, what stays in a core's cache
 _LONGEST = 64
 
 
@@ -23,9 +23,9 @@ class Blocks(NamedTuple):
     padding: int
 
     @classmethod
-    def of(cls, num_steps: int, unknowns: int) -> "Blocks":
-        """Blocks for an iteration matrix of `unknowns` rows; without padding where a divisor is near."""
-        longest = max(1, min(num_steps, _LONGEST, _NUMBERS // unknowns**2))
+    def of(cls, num_steps: int, numbers: int) -> "Blocks":
+        """Blocks for factors of `numbers` numbers; without padding where a divisor is near."""
+        longest = max(1, min(num_steps, _LONGEST, _NUMBERS // numbers))
         divisors = [n for n in range((longest + 1) // 2, longest + 1) if num_steps % n == 0]
         length = divisors[-1] if divisors else longest
         return cls(length, -num_steps % length)

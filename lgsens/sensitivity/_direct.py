@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from lgsens.dynamics import State
+from lgsens.dynamics import State, factor_size, mass_matrix
 from lgsens.integrate import GeneralizedAlpha
 from lgsens.sensitivity._blocks import Blocks, padded, sweep_blocks
 from lgsens.sensitivity._linearization import (
@@ -64,8 +64,8 @@ def direct_step(
 
 def direct_sweep(scheme: GeneralizedAlpha, states: State, parameters: Parameters, b: Variation, d: Parameters):
     """Solve L (δ, p') = (b, d) forwards in time; returns δ stacked, and p' = d."""
-    mass = parameters.system.mass_matrix()
-    blocks = Blocks.of(states.v.shape[0] - 1, states.v.shape[1] + states.lam.shape[1])
+    mass = mass_matrix(parameters.system)
+    blocks = Blocks.of(states.v.shape[0] - 1, factor_size(parameters.system))
 
     def one(previous: Variation, inputs):
         step, loads, row = inputs

@@ -31,7 +31,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk, mass_scale
-from lgsens.integrate import Factors
+from lgsens.linear import Factors
 from lgsens.sensitivity._continuous_adjoint import (
     Cotangents,
     accumulated,

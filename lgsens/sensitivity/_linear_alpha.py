@@ -19,7 +19,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import kkt_solve, mass_scale
-from lgsens.integrate import Factors, GeneralizedAlpha
+from lgsens.integrate import GeneralizedAlpha
+from lgsens.linear import Factors
 
 
 class Node(NamedTuple):

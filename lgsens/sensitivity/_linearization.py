@@ -23,8 +23,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import AbstractSystem, State, Tangents
-from lgsens.integrate import Factors, GeneralizedAlpha, factorize_iteration_matrix, increment
+from lgsens.dynamics import AbstractSystem, State, Tangents, mass_matrix, tangents
+from lgsens.integrate import GeneralizedAlpha, factorize_iteration_matrix, increment
+from lgsens.linear import Factors
 
 
 class Parameters(NamedTuple):
@@ -86,7 +87,7 @@ def step_increment(scheme: GeneralizedAlpha, step: Step, h) -> tuple[Float[Array
 def step_tangents(system: AbstractSystem, step: Step) -> Tangents:
     """K_t, C_t and B at the converged state."""
     state = step.state
-    return system.tangents(state.q, state.v, state.vdot, state.lam, step.t)
+    return tangents(system, state.q, state.v, state.vdot, state.lam, step.t)
 
 
 class Linearized(NamedTuple):
@@ -102,8 +103,8 @@ def linearized(scheme: GeneralizedAlpha, parameters: Parameters, mass, step: Ste
     """The tangents and the factors of the exact iteration matrix at the converged state."""
     system, h = parameters.system, parameters.h
     x, rates = step_increment(scheme, step, h)
-    tangents = step_tangents(system, step)
-    return Linearized(x, rates, tangents, factorize_iteration_matrix(scheme, system, tangents, mass, x, h))
+    at_state = step_tangents(system, step)
+    return Linearized(x, rates, at_state, factorize_iteration_matrix(scheme, system, at_state, mass, x, h))
 
 
 def kinematics(scheme: GeneralizedAlpha, group, x, rates: Rates, h, previous: Variation, u, dh):
@@ -135,7 +136,7 @@ def pseudo_loads(step: Step, parameters: Parameters, d: Parameters):
 
 def matvec(scheme: GeneralizedAlpha, states: State, parameters: Parameters, delta: Variation, d: Parameters):
     """L (δ, p'), all steps at once: the equations above, written out. What JAX differentiates a second time."""
-    mass = parameters.system.mass_matrix()
+    mass = mass_matrix(parameters.system)
     group, h = parameters.system.group, parameters.h
 
     def rows(step: Step, previous: Variation, current: Variation) -> Variation:

@@ -1,0 +1,19 @@
+"""Linear algebra of a step: dense, and sparse along the graph of bodies and joints."""
+
+from lgsens.linear._dense import LU as LU, Inverse as Inverse
+from lgsens.linear._elimination import Elimination as Elimination
+from lgsens.linear._factors import Factors as Factors, Matrix as Matrix
+from lgsens.linear._solvers import (
+    AbstractLinearSolver as AbstractLinearSolver,
+    BlockSparse as BlockSparse,
+    DenseLU as DenseLU,
+    elimination as elimination,
+)
+from lgsens.linear._sparse import (
+    Blocks as Blocks,
+    Pattern as Pattern,
+    SparseMatrix as SparseMatrix,
+    added as added,
+    chosen as chosen,
+    diagonal as diagonal,
+)

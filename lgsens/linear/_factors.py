@@ -1,0 +1,51 @@
+"""The matrix of a step, bordered by its constraints, in factors."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lgsens.linear._dense import LU
+from lgsens.linear._elimination import BlockFactors, Elimination
+from lgsens.linear._sparse import SparseMatrix
+
+Matrix = Any  # a SparseMatrix or an array
+
+
+class Factors(eqx.Module):
+    """The factors of S = [[A, U], [L, 0]], its border scaled by σ to the size of A; U = Bᵀ and L = B T in a step."""
+
+    factors: Any  # LU, Inverse or BlockFactors
+    scale: Float[Array, ""]  # σ
+
+    @classmethod
+    def of(
+        cls, dynamic: Matrix, upper: Matrix, lower: Matrix, scale, *, plan: Elimination | None = None, kind: Any = LU
+    ) -> "Factors":
+        """`plan`: None for arrays. `kind`: LU or `Inverse` of what is dense."""
+        if not isinstance(dynamic, SparseMatrix):
+            m = lower.shape[0]
+            above = jnp.concatenate([dynamic, scale * upper], axis=1)
+            below = jnp.concatenate([scale * lower, jnp.zeros((m, m), dynamic.dtype)], axis=1)
+            return cls(kind.of(jnp.concatenate([above, below])), scale)
+        assert plan is not None
+        k = dynamic.shape[0]
+        (a, *at), (u, rows_u, columns_u), (b, rows_b, columns_b) = (x.entries() for x in (dynamic, upper, lower))
+        values = jnp.concatenate([a, scale * u, scale * b])
+        rows = np.concatenate([at[0], rows_u, k + rows_b])
+        columns = np.concatenate([at[1], k + columns_u, columns_b])
+        return cls(BlockFactors.of(plan, values, rows, columns, kind), scale)
+
+    def largest_inverse(self) -> Float[Array, ""]:
+        """The largest number in the inverses of a sparse matrix with `Inverse`: of blocks, and of what is left."""
+        assert isinstance(self.factors, BlockFactors)
+        inverses = [level.inverse for level in self.factors.eliminated] + [self.factors.rest.transpose]
+        return jnp.max(jnp.stack([jnp.max(jnp.abs(inverse), initial=0.0) for inverse in inverses]))
+
+    def solve(self, force, rate, *, transposed: bool = False):
+        """S⁻¹ (or S⁻ᵀ) [force; rate], as its two parts. Both scalings are the same, so S and Sᵀ unscale alike."""
+        k = force.shape[0]
+        solution = self.factors.solve(jnp.concatenate([force, self.scale * rate]), transposed=transposed)
+        return solution[:k], self.scale * solution[k:]

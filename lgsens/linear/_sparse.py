@@ -1,0 +1,159 @@
+"""Sparse matrices as sums of small blocks, one stack of blocks for each type of element.
+
+    A = Σ_e P_eᵀ A_e Q_e
+
+with A_e the block of element e and P_e, Q_e the selections of its rows and columns. Nothing is assembled: a product takes
+the columns' entries of x, multiplies the stacked blocks, and adds up by rows, three operations for each type of element,
+whatever the number of elements.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+
+class Pattern:
+    """Where the blocks of one stack are; static, and equal only to itself: make it once for each topology.
+
+    rows: (E, r) integers, columns: (E, c) integers, −1 for a row or column that the matrix does not have.
+    slots: (E, c/6) the bodies of the columns, six for each, where they belong to bodies.
+    """
+
+    def __init__(self, rows: np.ndarray, columns: np.ndarray, slots: np.ndarray | None = None):
+        self.rows, self.columns, self.slots = rows, columns, slots
+
+    def transposed(self) -> "Pattern":
+        return Pattern(self.columns, self.rows)
+
+
+class Blocks(eqx.Module):
+    """The blocks of one type of element."""
+
+    values: Float[Array, "E r c"]
+    pattern: Pattern = eqx.field(static=True)
+
+
+class SparseMatrix(eqx.Module):
+    """A matrix as a sum of blocks; `@` with vectors and with matrices of columns, from both sides; `+`, and `*` by numbers.
+
+    Entries may lie in several blocks; they add up.
+    """
+
+    parts: tuple[Blocks, ...]
+    shape: tuple[int, int] = eqx.field(static=True)
+    dtype: Any = eqx.field(static=True)
+
+    def _with(self, parts) -> "SparseMatrix":
+        return SparseMatrix(tuple(parts), self.shape, self.dtype)
+
+    @property
+    def T(self) -> "SparseMatrix":
+        turned = tuple(Blocks(jnp.swapaxes(p.values, 1, 2), p.pattern.transposed()) for p in self.parts)
+        return SparseMatrix(turned, self.shape[::-1], self.dtype)
+
+    def __add__(self, other: "SparseMatrix") -> "SparseMatrix":
+        return self._with(self.parts + other.parts)
+
+    def __rmul__(self, factor) -> "SparseMatrix":
+        return self._with(Blocks(factor * part.values, part.pattern) for part in self.parts)
+
+    def __matmul__(self, x):
+        if x.ndim == 2:
+            return jax.vmap(self.__matmul__, in_axes=1, out_axes=1)(x)
+        products = [
+            (jnp.einsum("erc,ec->er", p.values, chosen(x, p.pattern.columns)), p.pattern.rows) for p in self.parts
+        ]
+        return added(products, self.shape[0], x.dtype)
+
+    def __rmatmul__(self, x):
+        products = [
+            (jnp.einsum("erc,er->ec", p.values, chosen(x, p.pattern.rows)), p.pattern.columns) for p in self.parts
+        ]
+        return added(products, self.shape[1], x.dtype)
+
+    def entries(self) -> tuple[Any, np.ndarray, np.ndarray]:
+        """The entries of all blocks, flat, and their rows and columns."""
+        found = []
+        for part in self.parts:
+            rows = np.broadcast_to(part.pattern.rows[:, :, None], part.values.shape).ravel()
+            columns = np.broadcast_to(part.pattern.columns[:, None, :], part.values.shape).ravel()
+            there = (rows >= 0) & (columns >= 0)
+            values = part.values.ravel()
+            if not there.all():
+                values, rows, columns = values[np.flatnonzero(there)], rows[there], columns[there]
+            found.append((values, rows, columns))
+        if not found:
+            return jnp.zeros(0, self.dtype), np.zeros(0, int), np.zeros(0, int)
+        values, rows, columns = zip(*found)
+        return jnp.concatenate(values), np.concatenate(rows), np.concatenate(columns)
+
+    def trace(self) -> Float[Array, ""]:
+        values, rows, columns = self.entries()
+        return jnp.sum(values[np.flatnonzero(rows == columns)])
+
+    def dense(self) -> Float[Array, "r c"]:
+        """The matrix as an array, in one scatter."""
+        values, rows, columns = self.entries()
+        height, width = self.shape
+        return jnp.zeros(height * width, self.dtype).at[rows * width + columns].add(values).reshape(self.shape)
+
+    def to_numpy(self) -> np.ndarray:
+        """The matrix as an array, without JAX, for messages."""
+        full = np.zeros((self.shape[0] + 1, self.shape[1] + 1), self.dtype)  # the last ones are nowhere
+        for part in self.parts:
+            rows, columns = part.pattern.rows[:, :, None], part.pattern.columns[:, None, :]
+            np.add.at(full, (rows, columns), np.asarray(part.values))
+        return full[:-1, :-1]
+
+    def with_unit_rows(self) -> "SparseMatrix":
+        """Each row divided by its norm; no row lies in two blocks."""
+        norms = [(jnp.sum(p.values**2, axis=2), p.pattern.rows) for p in self.parts]
+        squares = added(norms, self.shape[0], self.dtype)
+        scale = lax.rsqrt(jnp.maximum(squares, jnp.finfo(self.dtype).tiny))
+        scaled = [Blocks(chosen(scale, p.pattern.rows)[:, :, None] * p.values, p.pattern) for p in self.parts]
+        return self._with(scaled)
+
+    def times_bodies(self, operators: Float[Array, "N 6 6"]) -> "SparseMatrix":
+        """A diag(operators), an operator for the columns of each body."""
+        parts = []
+        for part in self.parts:
+            slots = part.pattern.slots
+            assert slots is not None, "the columns of this matrix do not belong to bodies"
+            split = part.values.reshape(*part.values.shape[:2], slots.shape[1], 6)
+            turned = jnp.einsum("ersl,eslj->ersj", split, operators[slots])
+            parts.append(Blocks(turned.reshape(part.values.shape), part.pattern))
+        return self._with(parts)
+
+
+def diagonal(values: Float[Array, " k"]) -> SparseMatrix:
+    places = np.arange(values.shape[0])[:, None]
+    return SparseMatrix(
+        (Blocks(values[:, None, None], Pattern(places, places)),), (len(places), len(places)), values.dtype
+    )
+
+
+def chosen(x: Float[Array, " k"], places: np.ndarray) -> Float[Array, "..."]:
+    """The entries of x at `places`, zero where a place is −1."""
+    if (places >= 0).all():
+        return x[places]
+    return jnp.concatenate([x, jnp.zeros(1, x.dtype)])[np.where(places < 0, x.shape[0], places)]
+
+
+def added(arrays: Sequence[tuple[Any, np.ndarray]], size: int, dtype=None) -> Float[Array, " size"]:
+    """The vector whose entries are the sums of those of the arrays with the same place, in one scatter; −1: nowhere."""
+    zero = jnp.zeros(size, dtype)
+    if not arrays:
+        return zero
+    flat = []
+    for values, places in arrays:
+        values, places = values.ravel(), places.ravel()
+        there = np.flatnonzero(places >= 0)
+        flat.append((values, places) if len(there) == len(places) else (values[there], places[there]))
+    values = jnp.concatenate([values for values, _ in flat])
+    return zero.at[np.concatenate([places for _, places in flat])].add(values)

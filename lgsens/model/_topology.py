@@ -1,0 +1,95 @@
+"""What a system's arrays look like whatever its numbers: who is coupled to whom, and where the entries go."""
+
+from functools import cached_property, lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from lgsens.linear import AbstractLinearSolver, Elimination, Pattern, elimination
+from lgsens.model._frames import ROTATION
+
+
+class Ends(NamedTuple):
+    """What is static of a stack of elements; hashable."""
+
+    a: tuple[int, ...] | None
+    b: tuple[int, ...] | None
+    owners: tuple[str, ...]
+    kept: tuple[tuple[bool, ...], ...]
+
+    @property
+    def slots(self) -> np.ndarray:
+        """The bodies of each element, shape (elements, 1 or 2)."""
+        return np.stack([np.asarray(side, int) for side in (self.a, self.b) if side is not None], axis=1)
+
+
+class Topology:
+    """Where the entries of a system are; static, and equal only to itself."""
+
+    def __init__(self, index: np.ndarray, constraints: tuple[Ends, ...], loads: tuple[Ends, ...]):
+        self.index, self._constraints, self._loads = index, constraints, loads
+        self._plans: dict[AbstractLinearSolver | None, Elimination | None] = {}
+        self.rows: list[np.ndarray] = []
+        start = 0
+        for ends in constraints:
+            kept = np.asarray(ends.kept)
+            self.rows.append(np.where(kept, start + np.cumsum(kept).reshape(kept.shape) - 1, -1))
+            start += int(kept.sum())
+        self.num_constraints = start
+        self.mass = Pattern(index, index)
+        self.gyroscopic = Pattern(index[:, ROTATION], index[:, ROTATION])
+        self.loads, self.stiffness = ([self._square(ends) for ends in some] for some in (loads, constraints))
+        self.jacobian = [
+            Pattern(rows, self.coordinates(ends), ends.slots) for rows, ends in zip(self.rows, constraints)
+        ]
+
+    def coordinates(self, ends: Ends) -> np.ndarray:
+        """The coordinates of each element's bodies, shape (elements, 6 or 12); −1 where a body has none."""
+        return self.index[ends.slots].reshape(len(ends.owners), -1)
+
+    def _square(self, ends: Ends) -> Pattern:
+        coordinates = self.coordinates(ends)
+        return Pattern(coordinates, coordinates, ends.slots)
+
+    @cached_property
+    def _graph(self):
+        """Nodes, neighbours and prerequisites for the elimination: bodies first, joints after the bodies they join."""
+        k = int((self.index >= 0).sum())
+        count = len(self.index)
+        joints = sorted({owner for ends in self._constraints for owner in ends.owners})
+        number = {name: count + i for i, name in enumerate(joints)}
+        nodes = [list(own[own >= 0]) for own in self.index] + [[] for _ in joints]
+        near: list[set[int]] = [set() for _ in nodes]
+        after: dict[int, set[int]] = {node: set() for node in number.values()}
+        for ends, rows in zip(self._constraints, self.rows):
+            for owner, bodies, own in zip(ends.owners, ends.slots.tolist(), rows):
+                nodes[number[owner]].extend(k + own[own >= 0])
+                after[number[owner]].update(bodies)
+                _join(near, {number[owner], *bodies})
+        for ends in self._loads:
+            for bodies in ends.slots.tolist():
+                _join(near, set(bodies))
+        return nodes, near, after
+
+    def elimination(self, solver: AbstractLinearSolver | None) -> Elimination | None:
+        """The plan of the linear solver, made once; None: a dense one. `solver` None: the cheaper one."""
+        if solver not in self._plans:
+            self._plans[solver] = elimination(solver, *self._graph)
+        return self._plans[solver]
+
+
+def _join(near: list[set[int]], group: set[int]) -> None:
+    for one in group:
+        near[one] |= group - {one}
+
+
+@lru_cache(maxsize=64)
+def topology(
+    free: tuple[tuple[int, ...], ...], constraints: tuple[Ends, ...], loads: tuple[Ends, ...]
+) -> Topology:
+    index = np.full((len(free), 6), -1)
+    start = 0
+    for row, own in zip(index, free):
+        row[list(own)] = start + np.arange(len(own))
+        start += len(own)
+    return Topology(index, constraints, loads)
