@@ -30,6 +30,7 @@ from lgsens._trajectory import (
 from lgsens.criteria import Criterion as Criterion, time_integral as time_integral
 from lgsens.dynamics import RESULTS as RESULTS, AbstractSystem as AbstractSystem, State as State
 from lgsens.integrate import GeneralizedAlpha as GeneralizedAlpha
+from lgsens.linear import BlockSparse as BlockSparse, DenseLU as DenseLU
 from lgsens.model import (
     AppliedForce as AppliedForce,
     BumpRoad as BumpRoad,

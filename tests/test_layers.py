@@ -13,10 +13,11 @@ ROOT = Path(lgsens.__file__).parent
 # What each package may import besides itself. `_validate` is the one module below all of them.
 BELOW = {
     "liegroups": set(),
-    "dynamics": {"liegroups"},
-    "model": {"liegroups", "dynamics"},
-    "integrate": {"liegroups", "dynamics"},
-    "sensitivity": {"liegroups", "dynamics", "integrate"},
+    "linear": set(),
+    "dynamics": {"liegroups", "linear"},
+    "model": {"liegroups", "linear", "dynamics"},
+    "integrate": {"liegroups", "linear", "dynamics"},
+    "sensitivity": {"liegroups", "linear", "dynamics", "integrate"},
 }
 FOUNDATION = "lgsens._validate"
 MAX_LINES = 350

@@ -13,13 +13,13 @@ from lgsens.dynamics._initial import (
     accelerations as accelerations,
     initial_state as initial_state,
     is_redundant as is_redundant,
-    kkt_solve as kkt_solve,
     split_velocity as split_velocity,
 )
 from lgsens.dynamics._matrices import (
     constraint_jacobian as constraint_jacobian,
     factor_size as factor_size,
     factorized as factorized,
+    kkt_solve as kkt_solve,
     mass_matrix as mass_matrix,
     mass_scale as mass_scale,
     tangents as tangents,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from lgsens.dynamics._matrices import ConstrainedMass, constraint_jacobian, factorized, mass_scale
+from lgsens.dynamics._matrices import ConstrainedMass, constraint_jacobian, factorized
 from lgsens.dynamics._results import RESULTS
 from lgsens.dynamics._state import State
 from lgsens.dynamics._system import AbstractSystem
@@ -24,16 +24,6 @@ class Initial(NamedTuple):
     jerk: Float[Array, " k"]  # v̈ at the initial time
     result: Int[Array, ""]  # a value of RESULTS
     violation: Float[Array, " m"]  # Φ after assembly
-
-
-def kkt_solve(mass, jacobian, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
-    """Solve [[M, Bᵀ], [B, 0]] [x; λ] = [force; rate], constraint rows and multipliers scaled to M."""
-    k, m = mass.shape[0], jacobian.shape[0]
-    scale = mass_scale(mass)
-    scaled = scale * jacobian
-    matrix = jnp.block([[mass, scaled.T], [scaled, jnp.zeros((m, m), mass.dtype)]])
-    solution = jnp.linalg.solve(matrix, jnp.concatenate([force, scale * rate]))
-    return solution[:k], scale * solution[k:]
 
 
 def split_velocity(system: AbstractSystem, q, v) -> tuple[Float[Array, " k"], Float[Array, " k"]]:

@@ -13,33 +13,33 @@ from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem
 from lgsens.linear import LU, Factors, Matrix, SparseMatrix
 
 
-def is_sparse(system: AbstractSystem) -> bool:
-    return isinstance(system, AbstractSparseSystem) and system.elimination is not None
+def _sparse(system: AbstractSystem) -> AbstractSparseSystem | None:
+    """The system, if its linear solver is sparse."""
+    return system if isinstance(system, AbstractSparseSystem) and system.elimination is not None else None
 
 
 def mass_matrix(system: AbstractSystem) -> Matrix:
     """M."""
-    sparse = isinstance(system, AbstractSparseSystem) and is_sparse(system)
-    return system.sparse_mass_matrix() if sparse else system.mass_matrix()
+    sparse = _sparse(system)
+    return system.mass_matrix() if sparse is None else sparse.sparse_mass_matrix()
 
 
 def constraint_jacobian(system: AbstractSystem, q) -> Matrix:
     """B."""
-    sparse = isinstance(system, AbstractSparseSystem) and is_sparse(system)
-    return system.sparse_constraint_jacobian(q) if sparse else system.constraint_jacobian(q)
+    sparse = _sparse(system)
+    return system.constraint_jacobian(q) if sparse is None else sparse.sparse_constraint_jacobian(q)
 
 
 def tangents(system: AbstractSystem, q, v, vdot, lam, t) -> Tangents:
     """K_t, C_t and B."""
-    sparse = isinstance(system, AbstractSparseSystem) and is_sparse(system)
-    return (system.sparse_tangents if sparse else system.tangents)(q, v, vdot, lam, t)
+    sparse = _sparse(system)
+    return (system.tangents if sparse is None else sparse.sparse_tangents)(q, v, vdot, lam, t)
 
 
 def factor_size(system: AbstractSystem) -> int:
     """How many numbers the factors of an iteration matrix are."""
-    if isinstance(system, AbstractSparseSystem) and system.elimination is not None:
-        return system.elimination.numbers
-    return (system.group.dim + len(system.constraint_names)) ** 2
+    plan = system.elimination if isinstance(system, AbstractSparseSystem) else None
+    return plan.numbers if plan is not None else (system.group.dim + len(system.constraint_names)) ** 2
 
 
 def mass_scale(mass: Matrix) -> Float[Array, ""]:
@@ -50,9 +50,10 @@ def mass_scale(mass: Matrix) -> Float[Array, ""]:
 
 def times_tangent_operator(system: AbstractSystem, x, matrices: tuple[Matrix, ...]) -> tuple[Matrix, ...]:
     """A T(x) for each of the matrices A."""
-    if isinstance(system, AbstractSparseSystem) and is_sparse(system):
-        operators = system.tangent_operators(x)
-        return tuple(matrix.times_bodies(operators) for matrix in matrices)
+    sparse = _sparse(system)
+    if sparse is not None:
+        operators = sparse.tangent_operators(x)
+        return tuple(matrix.times_rotations(operators) for matrix in matrices)
     turned = jax.vmap(lambda row: system.group.tangent_rmv(x, row))(jnp.concatenate(matrices))
     heights = [matrix.shape[0] for matrix in matrices]
     return tuple(jnp.split(turned, [sum(heights[:i]) for i in range(1, len(heights))]))
@@ -64,27 +65,41 @@ def factorized(system: AbstractSystem, dynamic: Matrix, upper: Matrix, lower: Ma
     return Factors.of(dynamic, upper, lower, scale, plan=plan, kind=kind)
 
 
+def kkt_solve(mass, jacobian, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
+    """Solve [[M, Bᵀ], [B, 0]] [x; λ] = [force; rate], constraint rows and multipliers scaled to M."""
+    k, m = mass.shape[0], jacobian.shape[0]
+    scale = mass_scale(mass)
+    scaled = scale * jacobian
+    matrix = jnp.block([[mass, scaled.T], [scaled, jnp.zeros((m, m), mass.dtype)]])
+    solution = jnp.linalg.solve(matrix, jnp.concatenate([force, scale * rate]))
+    return solution[:k], scale * solution[k:]
+
+
 class ConstrainedMass(eqx.Module):
-    """[[M, Bᵀ], [B, 0]] in factors, which serve any number of right-hand sides."""
+    """[[M, Bᵀ], [B, 0]]."""
 
     mass: Matrix
     jacobian: Matrix
-    factors: Factors
+    factors: Factors | None  # None: dense, where `kkt_solve` makes them
 
     @classmethod
     def of(cls, system: AbstractSystem, q) -> "ConstrainedMass":
         mass, jacobian = mass_matrix(system), constraint_jacobian(system, q)
+        if _sparse(system) is None:
+            return cls(mass, jacobian, None)
         fixed, border = lax.stop_gradient((mass, jacobian))
         return cls(mass, jacobian, factorized(system, fixed, border.T, border, mass_scale(mass)))
 
     def solve(self, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
         """x and μ of M x + Bᵀμ = force, B x = rate; differentiable through M and B, by one more solve."""
-        k = force.shape[0]
+        factors, k = self.factors, force.shape[0]
+        if factors is None:
+            return kkt_solve(self.mass, self.jacobian, force, rate)
 
         def product(unknown):
             x, mu = unknown[:k], unknown[k:]
             return jnp.concatenate([self.mass @ x + mu @ self.jacobian, self.jacobian @ x])
 
-        solve = lambda _, rhs: jnp.concatenate(self.factors.solve(rhs[:k], rhs[k:]))
+        solve = lambda _, rhs: jnp.concatenate(factors.solve(rhs[:k], rhs[k:]))
         solution = lax.custom_linear_solve(product, jnp.concatenate([force, rate]), solve, symmetric=True)
         return solution[:k], solution[k:]

@@ -96,8 +96,9 @@ class AbstractSparseSystem(AbstractSystem):
         """K_t, C_t and B; the columns of K_t and B by bodies."""
 
     @abc.abstractmethod
-    def tangent_operators(self, x) -> Float[Array, "N 6 6"]:
-        """T(x) body by body, zero in the rows and columns of coordinates that a body does not have."""
+    def tangent_operators(self, x) -> Float[Array, "N 3 3"]:
+        """T(x) on the rotations of each body, zero in the rows and columns of those that it does not have; T = I on
+        translations."""
 
 
 def autodiff_tangents(system: AbstractSystem, q, v, vdot, lam, t) -> Tangents:

@@ -2,8 +2,9 @@
 
 An iteration with the matrix of an earlier step (modified Newton) evaluates the residual only, and contracts by 1e-3 to
 1e-2 on the quarter-car when the matrix is up to 20 steps old. Started from extrapolated accelerations and multipliers
-it takes three or four to round-off, each a tenth of a full one. Its increment d_i leaves an error of about κ d_i, with
-κ = d_i/d_{i−1}, and the next iteration κ² d_i. Where that is the square of the tolerance, or a fraction of round-off
+it takes three or four to round-off, each a tenth of a full one. Motion and multipliers converge in turns, so a long
+chain contracts by 0.3 and by 1e-4 alternately: what counts is κ² = d_i/d_{i−2}, with d_i the increments. The next
+iteration leaves an error of about κ² d_i. Where that is the square of the tolerance, or a fraction of round-off
 (the errors of a thousand steps add up), the next iteration is the last: to ask for smaller increments instead would be
 to ask for what the round-off of the constraints does not allow.
 """
@@ -22,7 +23,8 @@ from lgsens.integrate._scheme import GeneralizedAlpha, advance, factorize_iterat
 from lgsens.linear import Factors, Inverse, Matrix
 
 _MODIFIED_LIMIT = 12  # iterations; more cost as much as a full one
-_SLOW = 0.1  # the contraction from which on two full iterations cost less
+_SLOW = 0.1  # the contraction from which on a new matrix pays, in the next step
+_STALLED = 0.3  # that from which on two full iterations cost less
 _FASTEST = 0.02  # contractions measured close to round-off are no better than this
 
 
@@ -77,6 +79,7 @@ class _Iterate(NamedTuple):
     u: Float[Array, " k"]
     lam: Float[Array, " m"]
     increment: Float[Array, ""]
+    before: Float[Array, ""]  # the increment before
     contraction: Float[Array, ""]
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
@@ -114,16 +117,19 @@ def take_step(
             solver = factors
         du, dlam = solver.solve(residual, violation)
         size = jnp.max(jnp.abs(du) * (scheme.beta * h**2) / scale)
-        measured = (iterate.iterations > 0) & (iterate.increment > 64 * eps)  # increments below are round-off
-        contraction = jnp.where(measured, jnp.maximum(size / iterate.increment, _FASTEST), iterate.contraction)
+        measured = (iterate.iterations > 1) & (iterate.before > 64 * eps)  # increments below are round-off
+        ratio = jnp.sqrt(size / jnp.where(measured, iterate.before, 1.0))
+        contraction = jnp.where(measured, jnp.maximum(ratio, _FASTEST), iterate.contraction)
         settled = iterate.increment * iterate.contraction**2 <= target
         largest, count = jnp.max(jnp.abs(residual)), iterate.iterations + 1
-        return _Iterate(iterate.u - du, iterate.lam - dlam, size, contraction, largest, count, settled)
+        return _Iterate(
+            iterate.u - du, iterate.lam - dlam, size, iterate.increment, contraction, largest, count, settled
+        )
 
     # NaN compares false, and ends the iterations
 
     def contracting(iterate: _Iterate):
-        fast = (iterate.iterations < 2) | (iterate.contraction < _SLOW)
+        fast = (iterate.iterations < 4) | (iterate.contraction < _STALLED)  # by then the second pair is measured
         return running & ~iterate.settled & fast & (iterate.iterations < _MODIFIED_LIMIT)
 
     def unfinished(iterate: _Iterate):
@@ -131,7 +137,7 @@ def take_step(
 
     infinite, none, no = jnp.full((), jnp.inf, scale.dtype), jnp.zeros((), jnp.int32), jnp.zeros((), bool)
     u, lam = guess.extrapolated(previous)
-    iterate = _Iterate(u, lam, infinite, guess.contraction, infinite, none, no)
+    iterate = _Iterate(u, lam, infinite, infinite, guess.contraction, infinite, none, no)
     contraction = guess.contraction
     before = none
     if earlier is not None:
@@ -144,6 +150,7 @@ def take_step(
             lam=jnp.where(closer, iterate.lam, lam),
             # an increment that ends full Newton before its first iteration
             increment=jnp.where(iterate.settled, jnp.minimum(iterate.increment, tolerance), infinite),
+            before=infinite,
             contraction=contraction,
             residual=iterate.residual,
             iterations=none,
@@ -187,24 +194,32 @@ def integrate_outputs(
         x = increment(scheme, state, state.a, h)
         return factorize_iteration_matrix(scheme, system, at_state, constants.mass, x, h, Inverse)
 
+    def renewed(previous, n, carry):
+        # The barrier ties what is computed to the turn of the loop: XLA moves what does not depend on it out of the
+        # loop, and would compute it in every step.
+        due, previous, n = lax.optimization_barrier((carry[0], previous, n))
+        return ~due, inverse(previous, n)
+
     def step(carry, n):
-        previous, guess, earlier, running = carry
+        previous, guess, earlier, age, running = carry
         if earlier is not None:
-            # Counted, not judged by the contraction: in a batch every lane would pay for the judgement of one. A loop
-            # of no or one turn, because `cond` would copy the inverse.
-            due = jnp.mod(n, scheme.factor_every) == 0
-            renewed = lambda carry: (jnp.zeros((), bool), inverse(previous, n))
-            _, earlier = lax.while_loop(lambda carry: carry[0], renewed, (due, earlier))
+            # A matrix that contracts slowly is renewed, unless it was new: then full Newton takes over. In a batch
+            # every lane pays for the slowest; for its full iterations it would pay more. A loop of no or one turn,
+            # because `cond` would copy the inverse.
+            due = (age >= scheme.factor_every) | ((guess.contraction >= _SLOW) & (age > 1))
+            age = jnp.where(due, 0, age) + 1
+            _, earlier = lax.while_loop(lambda carry: carry[0], partial(renewed, previous, n), (due, earlier))
         t = t0 + (n + 1) * h
         state, guess, stats = take_step(scheme, system, constants, previous, guess, earlier, running, t, h)
-        return (state, guess, earlier, stats.converged), (output(state, t), stats)
+        return (state, guess, earlier, age, stats.converged), (output(state, t), stats)
 
     count = jnp.arange(num_steps, dtype=constants.scale.dtype)
     earlier = None
     if scheme.factor_every:
         shape = jax.eval_shape(inverse, state0, count[0])
         earlier = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
-    start = (state0, Guess.first(state0), earlier, jnp.ones((), bool))
+    age = jnp.full((), scheme.factor_every, jnp.int32)
+    start = (state0, Guess.first(state0), earlier, age, jnp.ones((), bool))
     (final, *_), (outputs, stats) = lax.scan(step, start, count)
     first = jax.tree.map(jnp.asarray, output(state0, t0))
     outputs = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), first, outputs)

@@ -22,7 +22,6 @@ import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import AbstractSystem, State, Tangents, factorized, mass_scale, times_tangent_operator

@@ -54,7 +54,7 @@ class Elimination:
         for i, (own, boundary) in enumerate(self.levels):
             numbers = first + np.arange(len(own))
             level[own], cluster[own], place[own] = i, numbers[:, None], np.arange(own.shape[1])
-            keys.append((numbers[:, None] * (self.size + 1) + boundary).ravel())
+            keys.append((numbers[:, None] * (self.size + 1) + boundary.astype(int)).ravel())
             slots.append(np.broadcast_to(np.arange(boundary.shape[1]), boundary.shape).ravel())
             first += len(own)
         keys, slots = (np.concatenate([*some, np.zeros(0, int)]) for some in (keys, slots))
@@ -85,7 +85,8 @@ class Elimination:
             found[of_rows] = self._starts[2 * i] + ((cluster[r] - first) * p + place[r]) * (p + q) + across
             of_columns = real & (level[columns] == i) & (level[rows] > i)
             r, c = rows[of_columns], columns[of_columns]
-            found[of_columns] = self._starts[2 * i + 1] + ((cluster[c] - first) * q + slot(cluster[c], r)) * p + place[c]
+            down = (cluster[c] - first) * q + slot(cluster[c], r)
+            found[of_columns] = self._starts[2 * i + 1] + down * p + place[c]
             first += count
         last = real & (level[rows] == len(self.levels)) & (level[columns] == len(self.levels))
         found[last] = self._starts[-1] + place[rows[last]] * len(self.rest) + place[columns[last]]

@@ -105,7 +105,7 @@ def _level(chosen: Sequence[Cluster], nodes, fill: int) -> Level:
 
 
 def _filled(rows: Sequence[Sequence[int]], fill: int) -> np.ndarray:
-    full = np.full((len(rows), max(map(len, rows))), fill)
+    full = np.full((len(rows), max(map(len, rows))), fill, np.int32)
     for row, values in zip(full, rows):
         row[: len(values)] = values
     return full

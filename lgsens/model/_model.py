@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
+from itertools import combinations
 from typing import Any
 
 import equinox as eqx
@@ -11,12 +12,13 @@ import numpy as np
 
 from lgsens._validate import is_concrete
 from lgsens.liegroups import Pose, nearest_rotation
+from lgsens.linear import AbstractLinearSolver
 from lgsens.model._body import RigidBody
 from lgsens.model._forces import AbstractForce
 from lgsens.model._frames import Frame, ground_frame
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._needed import needed
-from lgsens.model._stack import Placed, stack
+from lgsens.model._stack import Placed, stack, stacked
 from lgsens.model._summary import Summary, summarize
 from lgsens.model._system import MultibodySystem
 
@@ -28,6 +30,8 @@ class Model(eqx.Module):
         bodies: `RigidBody` by name.
         joints: joints by name; each names its two bodies, None for the ground.
         forces: force elements by name.
+        linear_solver: how the equations of a step are solved, `DenseLU()` or `BlockSparse()`; None: the one that is
+            estimated to take less time for this scene.
 
     The constructors can be traced, so a function that builds a model from design parameters is the
     general parametrization; the gradient with respect to a model is again a model.
@@ -39,13 +43,19 @@ class Model(eqx.Module):
     bodies: dict[str, RigidBody]
     joints: dict[str, AbstractJoint]
     forces: dict[str, AbstractForce]
+    linear_solver: AbstractLinearSolver | None = eqx.field(static=True)
 
     def __init__(
         self,
         bodies: Mapping[str, RigidBody],
         joints: Mapping[str, AbstractJoint] | None = None,
         forces: Mapping[str, AbstractForce] | None = None,
+        *,
+        linear_solver: AbstractLinearSolver | None = None,
     ):
+        if not isinstance(linear_solver, AbstractLinearSolver | None):
+            raise ValueError(f"Model: `linear_solver` must be DenseLU(), BlockSparse() or None, got {linear_solver!r}.")
+        self.linear_solver = linear_solver
         self.bodies, self.joints, self.forces = dict(bodies), dict(joints or {}), dict(forces or {})
         if not self.bodies:
             raise ValueError("Model: `bodies` is empty; a scene needs at least one RigidBody.")
@@ -74,9 +84,11 @@ class Model(eqx.Module):
             raise ValueError(f"{what} connects {where} to itself; name two different bodies.")
 
     def _check_duplicates(self) -> None:
-        names = list(self.joints)
-        for i, first in enumerate(names):
-            for second in names[i + 1 :]:
+        alike: dict[Any, list[str]] = {}
+        for name, joint in self.joints.items():
+            alike.setdefault((type(joint), frozenset((joint.a, joint.b))), []).append(name)
+        for names in alike.values():
+            for first, second in combinations(names, 2):
                 one, other = self.joints[first], self.joints[second]
                 if is_concrete(one, other) and _is_same_connection(one, other):
                     raise ValueError(
@@ -93,10 +105,10 @@ class Model(eqx.Module):
         names = tuple(sorted(self.bodies))
         number = {None: None} | {name: i for i, name in enumerate(names)}
         # An optimizer that updates a whole model leaves SO(3) by the square of its step.
-        rotations = nearest_rotation(jnp.stack([self.bodies[name].orientation for name in names]))
+        rotations = nearest_rotation(stacked([self.bodies[name].orientation for name in names]))
         bodies = {
-            name: eqx.tree_at(lambda body: body.orientation, self.bodies[name], rotation)
-            for name, rotation in zip(names, rotations)
+            name: eqx.tree_at(lambda body: body.orientation, self.bodies[name], rotations[i])
+            for i, name in enumerate(names)
         }
         ordered = list(bodies.values())
         dtype = ordered[0].mass.dtype
@@ -119,19 +131,20 @@ class Model(eqx.Module):
         ]
         pivoted = any(body.pivot is not None for body in ordered)
         return MultibodySystem(
-            mass=jnp.stack([body.mass for body in ordered]),
-            inertia=jnp.stack([body.frame_inertia for body in ordered]),
+            mass=stacked([body.mass for body in ordered]),
+            inertia=stacked([body.frame_inertia for body in ordered]),
             pose=Pose(
-                jnp.stack([body.frame.position for body in ordered]),
+                stacked([body.frame.position for body in ordered]),
                 rotations,
             ),
             velocity=jnp.concatenate([part for body in ordered for part in body.free_velocity]),
-            centre=jnp.stack([body.centre for body in ordered]) if pivoted else None,
+            centre=stacked([body.centre for body in ordered]) if pivoted else None,
             constraints=stack(constraints),
             loads=stack(loads),
             body_names=names,
             free=tuple(body.coordinates for body in ordered),
             assembled=all(joint.assembled for joint in self.joints.values()),
+            linear_solver=self.linear_solver,
         )
 
     def summary(self) -> Summary:
@@ -145,9 +158,7 @@ class Model(eqx.Module):
 
 
 def _is_same_connection(one: AbstractJoint, other: AbstractJoint) -> bool:
-    """Whether two joints have one type, the same two bodies (in either order) and the same numbers."""
-    if type(one) is not type(other) or {one.a, one.b} != {other.a, other.b}:
-        return False
+    """Whether two joints of one type between the same two bodies, in either order, have the same numbers."""
     numbers, others = _numbers(one, exchanged=False), _numbers(other, exchanged=one.a != other.a)
     same_structure = jax.tree.structure(numbers) == jax.tree.structure(others)
     return same_structure and jax.tree.all(jax.tree.map(np.array_equal, numbers, others))

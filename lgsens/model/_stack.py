@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lgsens._validate import is_concrete
 from lgsens.liegroups import Pose, R3xSO3
 from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint
 from lgsens.model._frames import BODY_A, BODY_B, Frame, ground_frame
@@ -76,6 +77,11 @@ class Stack(eqx.Module, Generic[Element]):
         )
 
 
+def stacked(leaves: Sequence[Any]):
+    """`jnp.stack`, which would compile a program for each number of leaves: numbers that are known go through NumPy."""
+    return jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves])) if is_concrete(*leaves) else jnp.stack(leaves)
+
+
 def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
     """Group elements by type and ground side, keeping their order within a group."""
     groups: dict[Any, list[Placed[Element]]] = {}
@@ -88,7 +94,7 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
         first = members[0]
         stacks.append(
             Stack(
-                elements=jax.tree.map(lambda *leaves: jnp.stack(leaves), *[m.element for m in members]),
+                elements=jax.tree.map(lambda *leaves: stacked(leaves), *[m.element for m in members]),
                 a=None if first.a is None else tuple(m.a for m in members if m.a is not None),
                 b=None if first.b is None else tuple(m.b for m in members if m.b is not None),
                 owners=tuple(m.owner for m in members),

@@ -54,7 +54,7 @@ class MultibodySystem(AbstractSparseSystem):
     body_names: tuple[str, ...] = eqx.field(static=True)
     free: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # the coordinates, 0 to 5, of each body
     assembled: bool = eqx.field(static=True)
-    linear_solver: AbstractLinearSolver | None = eqx.field(static=True, default=None)  # None: the cheaper one
+    linear_solver: AbstractLinearSolver | None = eqx.field(static=True)  # None: the cheaper one
 
     @property
     def topology(self) -> Topology:
@@ -157,10 +157,12 @@ class MultibodySystem(AbstractSparseSystem):
         return SparseMatrix(tuple(parts), (k, k), self.mass.dtype)
 
     def tangent_operators(self, x):
-        # T is block diagonal: a unit vector for each of the six coordinates, in all bodies at once, gives its columns.
-        columns = self.index.T[:, :, None] == np.arange(self.group.dim)
-        units = jnp.asarray(columns.any(axis=1), x.dtype)
-        return jnp.moveaxis(self.twists(jax.vmap(partial(self.group.tangent_mv, x))(units)), 0, 2)
+        # T is block diagonal: a unit vector for each of the three rotations, in all bodies at once, gives its columns.
+        axes = self.index.T[ROTATION]
+        units = np.zeros((len(axes), self.group.dim + 1))
+        np.put_along_axis(units, axes, 1.0, axis=1)  # −1, where a body does not have it, is the last place
+        columns = jax.vmap(partial(self.group.tangent_mv, x))(jnp.asarray(units[:, :-1], x.dtype))
+        return jnp.moveaxis(self.twists(columns)[..., ROTATION], 0, 2)
 
     @property
     def _gyroscopic(self) -> bool:
@@ -259,4 +261,3 @@ class MultibodySystem(AbstractSparseSystem):
             return single.map(evaluate, self._placed(q), self.twists(v), extra=(t,))
 
         return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(at_time)(q, v, t))
-

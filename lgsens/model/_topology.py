@@ -84,10 +84,8 @@ def _join(near: list[set[int]], group: set[int]) -> None:
 
 
 @lru_cache(maxsize=64)
-def topology(
-    free: tuple[tuple[int, ...], ...], constraints: tuple[Ends, ...], loads: tuple[Ends, ...]
-) -> Topology:
-    index = np.full((len(free), 6), -1)
+def topology(free: tuple[tuple[int, ...], ...], constraints: tuple[Ends, ...], loads: tuple[Ends, ...]) -> Topology:
+    index = np.full((len(free), 6), -1, np.int32)
     start = 0
     for row, own in zip(index, free):
         row[list(own)] = start + np.arange(len(own))
