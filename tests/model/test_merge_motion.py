@@ -57,7 +57,7 @@ def top(count=3):
     )
 
     def held(first, last):
-        bump = lg.BumpRoad(height=1.0, duration=0.6)
+        bump = lg.BumpRoad(height=1.0, duration=0.6, start=-0.1)
         ends = {"at_a": (0.0, 1.0, 1.0), "at_b": LAST}
         return {
             "gravity": lg.Gravity(GRAVITY),
