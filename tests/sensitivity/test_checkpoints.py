@@ -145,7 +145,7 @@ def test_memory_grows_as_the_root(kind):
 
 
 def test_what_has_no_checkpoints():
-    """A trajectory keeps its states; so does `differentiate`, which uses one, but for direct differentiation."""
+    """A trajectory keeps its states; other values are refused."""
     for method in (DIRECT(checkpoints=3), ADJOINT(checkpoints="sqrt")):
         with pytest.raises(ValueError, match=says(type(method).__name__, "`simulate(…, save=…)`", "Ask")):
             lg.simulate(spinning_top(0.7), t1=0.2, num_steps=10, sensitivity=method)
