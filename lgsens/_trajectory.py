@@ -77,20 +77,20 @@ class AbstractMotion(eqx.Module):
 
     def body(self, name: str) -> BodyMotion:
         """The motion of the body `name`. Raises `ValueError` for an unknown name."""
-        system, (states, _) = self._multibody(), self._kinematics()
+        states, _ = self._kinematics()
+        system, *motion = self._multibody().of_parts(states.q, states.v, states.vdot)
         if name not in system.body_names:
             raise ValueError(f"`body`: {suggestion(name, system.body_names)}.")
-        return BodyMotion(*system.motion(system.body_names.index(name), states.q, states.v, states.vdot))
+        return BodyMotion(*system.motion(system.body_names.index(name), *motion))
 
     def multiplier(self, joint: str) -> Float[Array, "*n rows"]:
         """The Lagrange multipliers of a joint, shape (n+1, its equations); the joint says what they mean.
 
+        Those of a merged `FixedJoint` (`Model.merge_fixed`) are what its bodies need to move as they do.
         Raises `ValueError` for an unknown name.
         """
-        system, (states, _) = self._multibody(), self._kinematics()
-        if joint not in system.constraint_names:
-            raise ValueError(f"`multiplier`: {suggestion(joint, set(system.constraint_names))}.")
-        return states.lam[..., system.multiplier_rows(joint)]
+        system, (states, t) = self._multibody(), self._kinematics()
+        return system.multiplier(joint, states.q, states.v, states.vdot, states.lam, t)
 
     def force(self, name: str) -> Any:
         """What a force element measures, every array with a leading axis n + 1 if this is a trajectory.
@@ -100,11 +100,12 @@ class AbstractMotion(eqx.Module):
         Raises `ValueError` for an unknown name, or one of several loads (gravity).
         """
         states, t = self._kinematics()
-        measure = partial(self._multibody().measure, name)
+        system, q, v, _ = self._multibody().of_parts(states.q, states.v, states.vdot)
+        measure = partial(system.measure, name)
         if jnp.ndim(t) == 0:
-            stacked = measure(*jax.tree.map(lambda leaf: leaf[None], (states.q, states.v, t)))
+            stacked = measure(*jax.tree.map(lambda leaf: leaf[None], (q, v, t)))
             return jax.tree.map(lambda leaf: leaf[0], stacked)
-        return measure(states.q, states.v, t)
+        return measure(q, v, t)
 
 
 class Trajectory(AbstractMotion):

@@ -3,8 +3,10 @@
 from lgsens.integrate._integrate import (
     Constants as Constants,
     Guess as Guess,
+    Mark as Mark,
     Stats as Stats,
     integrate as integrate,
+    integrate_onward as integrate_onward,
     integrate_outputs as integrate_outputs,
     take_step as take_step,
 )

@@ -187,6 +187,38 @@ def integrate_outputs(
     output: Callable[[State, Any], Any],
 ) -> tuple[Any, State, Stats]:
     """`output(state, t)` stacked instead of the states, the final state, and what Newton did."""
+    later, end, stats = integrate_onward(scheme, num_steps, system, Mark.first(state0), t0, h, output)
+    first = jax.tree.map(jnp.asarray, output(state0, t0))
+    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), first, later), end.state, stats
+
+
+class Mark(NamedTuple):
+    """Where a run can go on: the n-th state, and what the iteration of the next step knows of the steps before."""
+
+    n: Float[Array, ""]
+    state: State
+    guess: Guess
+    running: Bool[Array, ""]
+
+    @classmethod
+    def first(cls, state0: State) -> "Mark":
+        return cls(jnp.zeros((), state0.a.dtype), state0, Guess.first(state0), jnp.ones((), bool))
+
+
+def integrate_onward(
+    scheme: GeneralizedAlpha,
+    num_steps: int,
+    system: AbstractSystem,
+    mark: Mark,
+    t0,
+    h,
+    output: Callable[[State, Any], Any],
+) -> tuple[Any, Mark, Stats]:
+    """`num_steps` steps on from a mark: `output(state, t)` after each of them, stacked; the mark that they reach.
+
+    The steps are those of one long run where n of the mark is a multiple of `factor_every`: the inverse of the
+    iteration matrix is due there, and is not part of the mark.
+    """
     constants = Constants.of(system)
 
     def inverse(state: State, n) -> Factors:
@@ -206,21 +238,18 @@ def integrate_outputs(
             # A matrix that contracts slowly is renewed, unless it was new: then full Newton takes over. In a batch
             # every lane pays for the slowest; for its full iterations it would pay more. A loop of no or one turn,
             # because `cond` would copy the inverse.
-            due = (age >= scheme.factor_every) | ((guess.contraction >= _SLOW) & (age > 1))
+            due = (jnp.mod(n, scheme.factor_every) == 0) | ((guess.contraction >= _SLOW) & (age > 1))
             age = jnp.where(due, 0, age) + 1
             _, earlier = lax.while_loop(lambda carry: carry[0], partial(renewed, previous, n), (due, earlier))
         t = t0 + (n + 1) * h
         state, guess, stats = take_step(scheme, system, constants, previous, guess, earlier, running, t, h)
         return (state, guess, earlier, age, stats.converged), (output(state, t), stats)
 
-    count = jnp.arange(num_steps, dtype=constants.scale.dtype)
+    count = mark.n + jnp.arange(num_steps, dtype=constants.scale.dtype)
     earlier = None
     if scheme.factor_every:
-        shape = jax.eval_shape(inverse, state0, count[0])
+        shape = jax.eval_shape(inverse, mark.state, count[0])
         earlier = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
-    age = jnp.full((), scheme.factor_every, jnp.int32)
-    start = (state0, Guess.first(state0), earlier, age, jnp.ones((), bool))
-    (final, *_), (outputs, stats) = lax.scan(step, start, count)
-    first = jax.tree.map(jnp.asarray, output(state0, t0))
-    outputs = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), first, outputs)
-    return outputs, final, stats
+    start = (mark.state, mark.guess, earlier, jnp.zeros((), jnp.int32), mark.running)
+    (state, guess, _, _, running), (outputs, stats) = lax.scan(step, start, count)
+    return outputs, Mark(mark.n + num_steps, state, guess, running), stats

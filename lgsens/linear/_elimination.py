@@ -46,7 +46,7 @@ class Elimination:
 
     @cached_property
     def _places(self):
-        """Of each unknown the level, the cluster and the place in it; and the place of (cluster, unknown) in boundaries."""
+        """Of each unknown the level, the cluster, the place in it; of (cluster, unknown) the place in its boundary."""
         level, cluster, place = (np.full(self.size + 1, -1) for _ in range(3))
         level[self.rest] = len(self.levels)
         place[self.rest] = np.arange(len(self.rest))

@@ -163,9 +163,12 @@ class RigidBody(eqx.Module):
         """J about the origin of the body frame [kg m²]: with a pivot at −c it is J + m (|c|² I − c cᵀ) (Steiner)."""
         if self.pivot is None:
             return self.inertia_matrix
-        arm = self.centre
-        parallel = jnp.dot(arm, arm) * jnp.eye(3, dtype=arm.dtype) - jnp.outer(arm, arm)
-        return self.inertia_matrix + self.mass * parallel
+        return self.inertia_matrix + self.mass * parallel_axis(self.centre)
+
+
+def parallel_axis(arm: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """|c|² I − c cᵀ: the inertia of a unit mass at c."""
+    return jnp.dot(arm, arm) * jnp.eye(3, dtype=arm.dtype) - jnp.outer(arm, arm)
 
 
 def _is_physical(inertia) -> bool:

@@ -7,18 +7,17 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from lgsens._validate import is_concrete
-from lgsens.liegroups import Pose, nearest_rotation
+from lgsens.liegroups import nearest_rotation
 from lgsens.linear import AbstractLinearSolver
+from lgsens.model._assemble import assemble, assemble_merged
 from lgsens.model._body import RigidBody
 from lgsens.model._forces import AbstractForce
-from lgsens.model._frames import Frame, ground_frame
 from lgsens.model._joints import AbstractJoint
-from lgsens.model._needed import needed
-from lgsens.model._stack import Placed, stack, stacked
+from lgsens.model._merge import Group, groups
+from lgsens.model._stack import stacked
 from lgsens.model._summary import Summary, summarize
 from lgsens.model._system import MultibodySystem
 
@@ -32,18 +31,30 @@ class Model(eqx.Module):
         forces: force elements by name.
         linear_solver: how the equations of a step are solved, `DenseLU()` or `BlockSparse()`; None: the one that is
             estimated to take less time for this scene.
+        merge_fixed: bodies that a `FixedJoint` connects are one body in the equations of motion, those that it connects
+            to the ground are ground: six unknowns per merged body and the joint's equations less.
 
     The constructors can be traced, so a function that builds a model from design parameters is the
     general parametrization; the gradient with respect to a model is again a model.
 
+    With `merge_fixed` every body and joint keeps its name, and its numbers as leaves: `Trajectory.body(name)` is the
+    motion of a part, `Trajectory.multiplier(name)` of a merged joint is recovered from the equations of motion of its
+    parts. The states are those of the merged bodies, another second-order solution of the same equations; that is
+    why False is the default. Initial velocities that are not those of one body are projected, as always: momentum and
+    angular momentum stay. Bodies with some of their degrees of freedom (`RigidBody.free`) can be merged with whole ones
+    and with each other where the result is a `RigidBody`: all of them translate alike, all move in one plane alike, or
+    only one turns about a point.
+
     Raises `ValueError` for a scene without bodies or without degrees of freedom, unknown body names, a joint or
-    force between a body and itself, and two joints that are the same connection.
+    force between a body and itself, and two joints that are the same connection. With `merge_fixed` also for a joint
+    within one merged body, and for bodies whose degrees of freedom cannot be merged.
     """
 
     bodies: dict[str, RigidBody]
     joints: dict[str, AbstractJoint]
     forces: dict[str, AbstractForce]
     linear_solver: AbstractLinearSolver | None = eqx.field(static=True)
+    merge_fixed: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -52,11 +63,15 @@ class Model(eqx.Module):
         forces: Mapping[str, AbstractForce] | None = None,
         *,
         linear_solver: AbstractLinearSolver | None = None,
+        merge_fixed: bool = False,
     ):
         if not isinstance(linear_solver, AbstractLinearSolver | None):
             raise ValueError(f"Model: `linear_solver` must be DenseLU(), BlockSparse() or None, got {linear_solver!r}.")
         self.linear_solver = linear_solver
         self.bodies, self.joints, self.forces = dict(bodies), dict(joints or {}), dict(forces or {})
+        self.merge_fixed = merge_fixed
+        if not isinstance(merge_fixed, bool):
+            raise ValueError(f"Model: `merge_fixed` must be True or False, got {merge_fixed!r}.")
         if not self.bodies:
             raise ValueError("Model: `bodies` is empty; a scene needs at least one RigidBody.")
         for what, kind, members in (
@@ -74,6 +89,8 @@ class Model(eqx.Module):
         for name, force in self.forces.items():
             self._check_connection(f"Force {name!r}", force.bodies)
         self._check_duplicates()
+        if self._groups is not None and all(group.name is None for group in self._groups):
+            raise ValueError("Model: fixed joints hold all bodies on the ground; let at least one of them move.")
 
     def _check_connection(self, what: str, ends: tuple[str | None, ...]) -> None:
         for end in ends:
@@ -97,55 +114,27 @@ class Model(eqx.Module):
                     )
 
     def system(self) -> MultibodySystem:
-        """The equations of motion, elements stacked by type.
-
-        Names are sorted here and nowhere else: a dict comes out of `jit` sorted, so its own order cannot
-        be relied on.
-        """
-        names = tuple(sorted(self.bodies))
-        number = {None: None} | {name: i for i, name in enumerate(names)}
+        """The equations of motion, elements stacked by type."""
+        names = sorted(self.bodies)
         # An optimizer that updates a whole model leaves SO(3) by the square of its step.
         rotations = nearest_rotation(stacked([self.bodies[name].orientation for name in names]))
         bodies = {
             name: eqx.tree_at(lambda body: body.orientation, self.bodies[name], rotations[i])
             for i, name in enumerate(names)
         }
-        ordered = list(bodies.values())
-        dtype = ordered[0].mass.dtype
-        ground = ground_frame(dtype)
+        if self._groups is None:
+            system = assemble(bodies, self.joints, self.forces)
+        else:
+            system = assemble_merged(bodies, self.joints, self.forces, self._groups)
+        return dataclasses.replace(system, linear_solver=self.linear_solver)
 
-        def frame(name: str | None) -> Frame:
-            return ground if name is None else bodies[name].frame
-
-        constraints = []
-        for name, joint in sorted(self.joints.items()):
-            elements = joint.constraints(frame(joint.a), frame(joint.b))
-            free = [() if end is None else bodies[end].free for end in (joint.a, joint.b)]
-            for element, kept in zip(elements, needed(name, joint, elements, *free)):
-                if any(kept):
-                    constraints.append(Placed(element, number[joint.a], number[joint.b], name, kept))
-        loads = [
-            Placed(attached.load, number[attached.a], number[attached.b], name)
-            for name, force in sorted(self.forces.items())
-            for attached in force.loads(bodies)
-        ]
-        pivoted = any(body.pivot is not None for body in ordered)
-        return MultibodySystem(
-            mass=stacked([body.mass for body in ordered]),
-            inertia=stacked([body.frame_inertia for body in ordered]),
-            pose=Pose(
-                stacked([body.frame.position for body in ordered]),
-                rotations,
-            ),
-            velocity=jnp.concatenate([part for body in ordered for part in body.free_velocity]),
-            centre=stacked([body.centre for body in ordered]) if pivoted else None,
-            constraints=stack(constraints),
-            loads=stack(loads),
-            body_names=names,
-            free=tuple(body.coordinates for body in ordered),
-            assembled=all(joint.assembled for joint in self.joints.values()),
-            linear_solver=self.linear_solver,
-        )
+    @property
+    def _groups(self) -> tuple[Group, ...] | None:
+        """What fixed joints make of the bodies; None where each of them stays a body of its own."""
+        if not self.merge_fixed:
+            return None
+        found = groups(self.bodies, self.joints)
+        return None if all(group.name in self.bodies for group in found) else found
 
     def summary(self) -> Summary:
         """Bodies with their free coordinates, joints with their equations, force elements, and the totals.
@@ -154,7 +143,7 @@ class Model(eqx.Module):
         the degrees of freedom of a mechanism without redundant equations.
         """
         system = eqx.filter_eval_shape(Model.system, self)
-        return summarize(self.bodies, self.joints, self.forces, system.constraint_names)
+        return summarize(self.bodies, self.joints, self.forces, system, self._groups or ())
 
 
 def _is_same_connection(one: AbstractJoint, other: AbstractJoint) -> bool:

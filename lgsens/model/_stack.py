@@ -25,13 +25,14 @@ Element = TypeVar("Element", AbstractConstraint, AbstractLoad)
 
 class Placed(NamedTuple, Generic[Element]):
     """An element, the numbers of its two bodies (None: the ground), the name of its owner; of a constraint, which of
-    its equations are kept."""
+    its equations are kept, and which one of its joint's it is."""
 
     element: Element
     a: int | None
     b: int | None
     owner: str
     kept: tuple[bool, ...] = ()
+    place: int = 0
 
 
 class Stack(eqx.Module, Generic[Element]):
@@ -42,6 +43,7 @@ class Stack(eqx.Module, Generic[Element]):
     b: tuple[int, ...] | None = eqx.field(static=True)
     owners: tuple[str, ...] = eqx.field(static=True)
     kept: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
+    places: tuple[int, ...] = eqx.field(static=True)
 
     @property
     def part(self) -> slice:
@@ -99,6 +101,7 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
                 b=None if first.b is None else tuple(m.b for m in members if m.b is not None),
                 owners=tuple(m.owner for m in members),
                 kept=tuple(m.kept for m in members),
+                places=tuple(m.place for m in members),
             )
         )
     return tuple(stacks)

@@ -8,6 +8,8 @@ from lgsens._validate import is_concrete
 from lgsens.model._body import RigidBody
 from lgsens.model._forces import AbstractForce
 from lgsens.model._joints import AbstractJoint
+from lgsens.model._merge import Group
+from lgsens.model._system import MultibodySystem
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,7 +17,8 @@ class Summary:
     """A scene in numbers; `print` shows it as a table.
 
     Attributes:
-        bodies: for each body its degrees of freedom, names as in `RigidBody.free`.
+        bodies: for each body its degrees of freedom, names as in `RigidBody.free`; for a part of a merged body those
+            of that body.
         equations: for each joint the number of its equations; those that its bodies cannot violate do not count.
         coordinates: number of unknown coordinates k.
         constraints: number of constraint equations m, and of multipliers.
@@ -41,14 +44,17 @@ def summarize(
     bodies: Mapping[str, RigidBody],
     joints: Mapping[str, AbstractJoint],
     forces: Mapping[str, AbstractForce],
-    constraint_names: Sequence[str],
+    system: MultibodySystem,
+    groups: Sequence[Group],
 ) -> Summary:
-    """The summary of a scene whose constraint equations have the given names."""
+    """The summary of a scene with the given equations of motion, of whose bodies `groups` are merged."""
+    constraint_names = system.constraint_names
     count = Counter(constraint_names)
     equations = {name: count[name] for name in joints}
-    coordinates = sum(len(body.free) for body in bodies.values())
+    coordinates = sum(map(len, system.free))
+    part_of = {part: group for group in groups if group.name not in bodies for part in group.parts}
     lines = [f"Bodies ({len(bodies)}): mass [kg], free coordinates"]
-    lines += _columns([(name, _mass(body), _free(body)) for name, body in bodies.items()])
+    lines += _columns([(name, _mass(body), _free(body, part_of.get(name))) for name, body in bodies.items()])
     lines += [f"Joints ({len(joints)}): type, bodies, equations"]
     lines += _columns(
         [(name, type(joint).__name__, _ends((joint.a, joint.b)), equations[name]) for name, joint in joints.items()]
@@ -61,7 +67,7 @@ def summarize(
         ("Degrees of freedom", coordinates - len(constraint_names)),
     ]
     lines += [f"{what:<24}{number:>5}" for what, number in totals]
-    free = {name: body.free for name, body in bodies.items()}
+    free = {name: part_of[name].free if name in part_of else body.free for name, body in bodies.items()}
     return Summary(free, equations, coordinates, len(constraint_names), "\n".join(lines))
 
 
@@ -69,7 +75,11 @@ def _mass(body: RigidBody) -> str:
     return f"{float(body.mass):.6g}" if is_concrete(body.mass) else "traced"
 
 
-def _free(body: RigidBody) -> str:
+def _free(body: RigidBody, group: Group | None) -> str:
+    if group is not None and group.name is None:
+        return "fixed to the ground"
+    if group is not None:
+        return " ".join(group.free) + f", one body: {group.name}"
     return " ".join(body.free) + (" about its pivot" if body.pivot is not None else "") if body.free else "held"
 
 

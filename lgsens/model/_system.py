@@ -15,6 +15,7 @@ from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, cho
 from lgsens.model._constraints import AbstractConstraint
 from lgsens.model._frames import ROTATION, turn
 from lgsens.model._loads import AbstractLoad
+from lgsens.model._parts import Parts
 from lgsens.model._stack import (
     BODY_DIM,
     Stack,
@@ -51,6 +52,7 @@ class MultibodySystem(AbstractSparseSystem):
     centre: Float[Array, "N 3"] | None  # centre of mass in the body frame; None: its origin, for all bodies
     constraints: tuple[Stack[AbstractConstraint], ...]
     loads: tuple[Stack[AbstractLoad], ...]
+    parts: "Parts[MultibodySystem] | None"  # of merged bodies
     body_names: tuple[str, ...] = eqx.field(static=True)
     free: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # the coordinates, 0 to 5, of each body
     assembled: bool = eqx.field(static=True)
@@ -124,7 +126,44 @@ class MultibodySystem(AbstractSparseSystem):
 
     def multiplier_rows(self, joint: str) -> np.ndarray:
         """Where the multipliers of a joint are in λ, in the order of its basic constraints."""
-        return np.flatnonzero(np.asarray(self.constraint_names) == joint)
+        own = [
+            (place, rows[rows >= 0])
+            for stack, of_stack in zip(self.constraints, self.topology.rows)
+            for owner, place, rows in zip(stack.owners, stack.places, of_stack)
+            if owner == joint
+        ]
+        return np.concatenate([np.zeros(0, int), *(rows for _, rows in sorted(own, key=lambda each: each[0]))])
+
+    def of_parts(self, q, v, vdot):
+        """The system of the bodies as they are named, and their q, v, v̇: those of this one unless some are merged."""
+        if self.parts is None:
+            return self, q, v, vdot
+        return self.parts.system, *self.parts.motion(self._placed(q), self.twists(v), self.twists(vdot))
+
+    def multiplier(self, joint: str, q, v, vdot, lam, t):
+        """The multipliers of a joint, along leading axes; those of a merged one from the equations of its bodies."""
+        whole, q, v, vdot = self.of_parts(q, v, vdot)
+        if joint not in whole.constraint_names:
+            raise ValueError(f"`multiplier`: {suggestion(joint, set(whole.constraint_names))}.")
+        if self.parts is None or joint not in self.parts.joints:
+            return lam[..., self.multiplier_rows(joint)]
+        places, own_places = [np.zeros(0, int)], [np.zeros(0, int)]
+        for name in sorted(set(whole.constraint_names) - set(self.parts.joints)):
+            rows, own = whole.multiplier_rows(name), self.multiplier_rows(name)
+            if len(rows) != len(own):
+                raise ValueError(
+                    f"`multiplier`: what {joint!r} carries is not determined: joint {name!r} has {len(rows)} "
+                    f"equations between the bodies that it names, and {len(own)} between the merged ones. Leave "
+                    "`merge_fixed` out and remove the equations that are redundant then."
+                )
+            places.append(rows)
+            own_places.append(own)
+        others = jnp.zeros((*lam.shape[:-1], len(whole.constraint_names)), lam.dtype)
+        others = others.at[..., np.concatenate(places)].set(lam[..., np.concatenate(own_places)])
+        complete = partial(self.parts.with_fixed, joint)
+        for _ in lam.shape[:-1]:
+            complete = jax.vmap(complete)
+        return complete(q, v, vdot, others, t)[..., whole.multiplier_rows(joint)]
 
     def reference(self):
         return self.pose, self.velocity
@@ -254,6 +293,7 @@ class MultibodySystem(AbstractSparseSystem):
             b=None if stack.b is None else (stack.b[i],),
             owners=(force,),
             kept=((),),
+            places=(0,),
         )
 
         def at_time(q, v, t):

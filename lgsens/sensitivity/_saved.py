@@ -5,18 +5,27 @@ batch of designs does not stack whole trajectories. Derivatives need the states 
 trajectory and takes the same function of it: the values are the same, and so is what is differentiated.
 """
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.flatten_util import ravel_pytree
 
-from lgsens.dynamics import AbstractSystem, State
+from lgsens.dynamics import State
 from lgsens.integrate import GeneralizedAlpha, Stats, integrate_outputs
 from lgsens.sensitivity._linearization import Parameters, times
-from lgsens.sensitivity._methods import AbstractSensitivity, DirectDifferentiation, decoded, encoded
-
-Output = Callable[[AbstractSystem, State, Any], Any]
+from lgsens.sensitivity._methods import AbstractSensitivity, AdjointVariable, DirectDifferentiation, decoded, encoded
+from lgsens.sensitivity._segments import (
+    Output,
+    Segments,
+    adjoint_in_segments,
+    direct_in_segments,
+    run_in_segments,
+)
 
 
 class SavedRun(NamedTuple):
@@ -35,7 +44,15 @@ def saved_run(
     state0: State,
     parameters: Parameters,
 ) -> SavedRun:
-    """`output(system, state, t)` at t0 + n h, n = 0 … num_steps; only the default method does without the states."""
+    """`output(system, state, t)` at t0 + n h, n = 0 … num_steps.
+
+    The default method does without the states where nothing is differentiated, those with `checkpoints` always.
+    """
+    if isinstance(method, DirectDifferentiation | AdjointVariable) and method.checkpoints is not None:
+        segments = Segments.of(scheme, num_steps, method.checkpoints)
+        rule = _direct_segments if isinstance(method, DirectDifferentiation) else _adjoint_segments
+        run, _ = cast(tuple[SavedRun, Any], rule(output, scheme, segments, state0, parameters))
+        return _decoded(run)
     if method == DirectDifferentiation():
         return _decoded(_saved(output, scheme, num_steps, state0, parameters))
     return _from_states(method, output, scheme, num_steps, state0, parameters)
@@ -65,3 +82,78 @@ def _rule(output, scheme, num_steps, primals, tangents):
         return run._replace(stats=encoded(run.stats, parameters.h.dtype))
 
     return jax.jvp(whole, primals, tangents)
+
+
+# With checkpoints the linear map from the tangents x of (state0, parameters) to those y of outputs and final state,
+# y = A x, is the solution of [[I, 0], [−A, I]] [x; y] = [b; 0]: so `custom_linear_solve` again carries both sweeps, and
+# takes second derivatives of A by the rule above, which keeps all states.
+
+
+def _segmented(output, scheme, segments: Segments, state0, parameters) -> tuple[SavedRun, Any]:
+    outputs, final, stats, marks = run_in_segments(output, scheme, segments, state0, parameters)
+    return SavedRun(outputs, final, encoded(stats, parameters.h.dtype)), marks
+
+
+def _without_derivative(tree):
+    """Zero tangents, of the type that JAX asks for."""
+
+    def zero(leaf):
+        inexact = jnp.issubdtype(leaf.dtype, jnp.inexact)
+        return jnp.zeros_like(leaf) if inexact else np.zeros(leaf.shape, jax.dtypes.float0)
+
+    return jax.tree.map(zero, tree)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
+def _direct_segments(output, scheme, segments, state0, parameters) -> tuple[SavedRun, Any]:
+    return _segmented(output, scheme, segments, state0, parameters)
+
+
+@_direct_segments.defjvp
+def _direct_segments_rule(output, scheme, segments, primals, tangents):
+    run, marks = _direct_segments(output, scheme, segments, *primals)
+    kept = lax.stop_gradient((marks, run.final))
+    floats = eqx.filter((run.outputs, run.final), eqx.is_inexact_array)
+    flat, unravel = ravel_pytree((tangents, jax.tree.map(jnp.zeros_like, floats)))
+
+    def whole(state0, parameters):
+        found = _saved(output, scheme, segments.num_steps, state0, parameters)
+        return eqx.filter((found.outputs, found.final), eqx.is_inexact_array)
+
+    def matvec(unknown):
+        x, y = unravel(unknown)
+        return ravel_pytree((x, jax.tree.map(jnp.subtract, y, jax.jvp(whole, primals, x)[1])))[0]
+
+    def solve(_, rhs):
+        b, y = unravel(rhs)
+        found = direct_in_segments(output, scheme, segments, kept[0], primals[1], b)
+        return ravel_pytree((b, jax.tree.map(jnp.add, y, found)))[0]
+
+    def transpose_solve(_, rhs):
+        c, c_outputs = unravel(rhs)
+        found = adjoint_in_segments(output, scheme, segments, *kept, primals[1], c_outputs)
+        return ravel_pytree((jax.tree.map(jnp.add, c, found), c_outputs))[0]
+
+    solution = lax.custom_linear_solve(matvec, flat, solve=solve, transpose_solve=transpose_solve)
+    d_outputs, d_final = eqx.combine(unravel(solution)[1], _without_derivative((run.outputs, run.final)))
+    return (run, marks), (SavedRun(d_outputs, d_final, _without_derivative(run.stats)), _without_derivative(marks))
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
+def _adjoint_segments(output, scheme, segments, state0, parameters) -> tuple[SavedRun, Any]:
+    return _segmented(output, scheme, segments, state0, parameters)
+
+
+def _adjoint_segments_forward(output, scheme, segments, state0, parameters):
+    run, marks = _segmented(output, scheme, segments, state0, parameters)
+    return (run, marks), (marks, run.final, parameters)
+
+
+def _adjoint_segments_backward(output, scheme, segments, kept, cotangents):
+    marks, final, parameters = kept
+    run, _ = cotangents
+    floats = eqx.filter((run.outputs, run.final), lambda leaf: leaf.dtype != jax.dtypes.float0)
+    return adjoint_in_segments(output, scheme, segments, marks, final, parameters, floats)
+
+
+_adjoint_segments.defvjp(_adjoint_segments_forward, _adjoint_segments_backward)

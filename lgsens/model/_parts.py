@@ -1,0 +1,82 @@
+"""The parts of merged bodies: their motion, and what their fixed joints carry."""
+
+from typing import Generic, TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from lgsens.dynamics import AbstractSystem
+from lgsens.liegroups import Pose
+from lgsens.model._frames import ROTATION, Frame
+from lgsens.model._stack import BODY_DIM
+
+System = TypeVar("System", bound=AbstractSystem)
+
+
+class Parts(eqx.Module, Generic[System]):
+    """A scene whose fixed joints are merged, as a scene of its parts.
+
+    With the pose (c, C) of the frame of a part in that of its body,
+
+        x_p = x + R c,   R_p = R C,   ẋ_p = ẋ + R (Ω × c),   Ω_p = Cᵀ Ω,
+        ẍ_p = ẍ + R (Ω̇ × c + Ω × (Ω × c)),   Ω̇_p = Cᵀ Ω̇.
+
+    The equations of motion of the parts that one fixed joint after the other holds together determine the multipliers
+    μ of these joints: r_p + B_pᵀ μ = 0 with r_p the residual of the parts without them, whence B_p B_pᵀ μ = −B_p r_p.
+    """
+
+    system: System  # the equations of the parts, of which each fixed joint is one
+    offset: Frame  # (c, C) of all parts, leading axis P
+    body: tuple[int | None, ...] = eqx.field(static=True)  # the number of the body of each part; None: the ground
+    free: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # the coordinates, 0 to 5, of each part
+    fixed: tuple[tuple[str, ...], ...] = eqx.field(static=True)  # the merged joints, by body
+
+    def motion(self, q: Pose, twist, rate):
+        """q, v, v̇ of the parts, from poses, [ẋ, Ω] and their rates of change of the bodies; along leading axes."""
+        lead, (c, turn) = q.position.shape[:-2], self.offset
+
+        def of_bodies(array, ground):
+            """The entries of the bodies of the parts; the ground comes after the last body."""
+            ground = jnp.broadcast_to(ground, (*lead, 1, *ground.shape))
+            last = array.shape[len(lead)]
+            index = np.asarray([last if body is None else body for body in self.body])
+            return jnp.take(jnp.concatenate([array, ground], axis=len(lead)), index, axis=len(lead))
+
+        at_rest = jnp.zeros(BODY_DIM, c.dtype)
+        position = of_bodies(q.position, jnp.zeros(3, c.dtype))
+        orientation = of_bodies(q.orientation, jnp.eye(3, dtype=c.dtype))
+        twist, rate = of_bodies(twist, at_rest), of_bodies(rate, at_rest)
+
+        arm = jnp.broadcast_to(c, position.shape)
+        to_inertial = lambda local: jnp.einsum("...ij,...j->...i", orientation, local)
+        to_part = lambda x: jnp.einsum("pji,...pj->...pi", turn, x)
+        spin, change = twist[..., ROTATION], rate[..., ROTATION]
+        swing = jnp.cross(spin, arm)
+        velocity = twist[..., : ROTATION.start] + to_inertial(swing)
+        acceleration = rate[..., : ROTATION.start] + to_inertial(jnp.cross(change, arm) + jnp.cross(spin, swing))
+        return (
+            Pose(position + to_inertial(arm), orientation @ jnp.broadcast_to(turn, orientation.shape)),
+            self._coordinates(velocity, to_part(spin)),
+            self._coordinates(acceleration, to_part(change)),
+        )
+
+    def _coordinates(self, linear, angular):
+        both = jnp.concatenate([linear, angular], axis=-1)
+        flat = both.reshape(*both.shape[:-2], both.shape[-2] * BODY_DIM)
+        return flat[..., np.asarray([i * BODY_DIM + own for i, free in enumerate(self.free) for own in free], int)]
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """All merged joints."""
+        return tuple(name for own in self.fixed for name in own)
+
+    def with_fixed(self, joint: str, q, v, vdot, lam, t):
+        """λ of the parts with μ of a fixed joint, and of those of the same body, in their rows; at one instant."""
+        names = np.asarray(self.system.constraint_names)
+        (group,) = [own for own in self.fixed if joint in own]
+        rows = np.concatenate([np.flatnonzero(names == name) for name in group])
+        residual = self.system.residual(q, v, vdot, lam, t)
+        jacobian = self.system.constraint_jacobian(q)[rows]
+        found = jnp.linalg.solve(jacobian @ jacobian.T, -(jacobian @ residual))
+        return jnp.zeros(len(names), lam.dtype).at[rows].set(found)
