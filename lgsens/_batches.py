@@ -86,7 +86,7 @@ def trace(fn: Callable[[PyTree], PyTree], designs: PyTree) -> Traced:
 
 
 def compile_batch(
-    traced: Traced, designs: PyTree, count: int, batch_size: int | None, devices: Sequence[jax.Device]
+    traced: Traced, designs: PyTree, count: int, batch_size: int | None, devices: Sequence[Any]
 ) -> Program:
     """A batch of `designs`, of which `count` are to be computed, in batches of nearly equal size.
 
@@ -140,7 +140,7 @@ def memory(program: Any) -> float:
     return float(stats.temp_size_in_bytes + stats.argument_size_in_bytes + stats.output_size_in_bytes)
 
 
-def free_memory(devices: Sequence[jax.Device]) -> float:
+def free_memory(devices: Sequence[Any]) -> float:
     """The memory that is free for each device [bytes]: its own, or a share of the machine's."""
     local = [device for device in devices if device.process_index == jax.process_index()]
     if not local:

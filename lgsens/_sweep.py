@@ -80,7 +80,7 @@ def sweep(
     *,
     batch_size: int | None = None,
     folder: str | os.PathLike | None = None,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Any] | None = None,
     progress: bool = True,
 ) -> SweepResult:
     """Evaluate a function of one design for each of N designs, in compiled batches over all devices.
