@@ -24,7 +24,7 @@ from lgsens.dynamics import RESULTS
 
 AXIS = "designs"
 # The most lanes per device. A CPU gains nothing beyond its caches (`benchmarks/sweep.py`); elsewhere memory decides.
-LANES = {"cpu": 128}
+LANES = {"cpu": 256}
 LANES_ELSEWHERE = 8192
 FREE_SHARE = 0.5  # of the memory that is free, what a batch may take
 
@@ -35,11 +35,13 @@ class Program(NamedTuple):
     Attributes:
         run: the leaves of `size` designs ↦ the leaves of their values, and ok; NumPy arrays with a leading axis.
         size: designs in a batch.
+        memory: what it needs on each device [bytes].
         seconds: wall time [s].
     """
 
     run: Callable[[list[np.ndarray]], tuple[list[np.ndarray], np.ndarray]]
     size: int
+    memory: float
     seconds: float
 
 
@@ -110,7 +112,7 @@ def compile_batch(
     size = even(count, batch_size or lanes * len(devices), len(devices))
     program = compiled(size)
     if batch_size is None:
-        fits = free_memory(devices) * FREE_SHARE / max(memory(program), 1.0)
+        fits = _smallest(free_memory(devices) * FREE_SHARE / max(memory(program), 1.0))
         if fits < 1.0 and size > len(devices):
             size = even(count, int(size * fits), len(devices))
             program = compiled(size)
@@ -121,7 +123,7 @@ def compile_batch(
         *values, ok = on_host(program(*map(place, batch)))
         return [np.asarray(leaf) for leaf in values], np.asarray(ok)
 
-    return Program(run, size, seconds)
+    return Program(run, size, memory(program), seconds)
 
 
 def even(count: int, largest: int, devices: int) -> int:
@@ -149,6 +151,13 @@ def free_memory(devices: Sequence[Any]) -> float:
     if stats and "bytes_limit" in stats:
         return float(stats["bytes_limit"] - stats.get("bytes_in_use", 0))
     return _host_memory() / len(local)
+
+
+def _smallest(value: float) -> float:
+    """The least of all processes: they must agree on the size of a batch."""
+    if jax.process_count() == 1:
+        return value
+    return float(np.min(multihost_utils.process_allgather(np.asarray(value, np.float32))))
 
 
 def _host_memory() -> float:

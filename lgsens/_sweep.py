@@ -44,18 +44,19 @@ class SweepResult(NamedTuple):
         """The result as `xarray.Dataset.from_dict` takes it: dimension "design", designs as coordinates.
 
         A leaf is named by its path, `bodies.top.mass`; a design that is one array "x", a value that is one array
-        "value". Where a design and a value share a name, the design's is prefixed by "design.".
+        "value"; "ok" is the mask, and a value of that name "value.ok". Where a design and a value share a name, the
+        design's is prefixed by "design.".
         """
 
-        def entries(tree, root):
-            return {leaf_name(path, root): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+        def entries(tree, root, taken, prefix):
+            named = [(leaf_name(path, root), leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)]
+            return {prefix + name if name in taken else name: leaf for name, leaf in named}
 
         def variable(name, leaf):
             return {"dims": ("design", *(f"{name}_{axis}" for axis in range(leaf.ndim - 1))), "data": leaf}
 
-        values = entries(self.values, "value") | {"ok": self.ok}
-        names = {name: f"design.{name}" if name in values else name for name in entries(self.designs, "x")}
-        designs = {names[name]: leaf for name, leaf in entries(self.designs, "x").items()}
+        values = entries(self.values, "value", {"ok"}, "value.") | {"ok": self.ok}
+        designs = entries(self.designs, "x", values, "design.")
         return {
             "coords": {name: variable(name, leaf) for name, leaf in designs.items()},
             "data_vars": {name: variable(name, leaf) for name, leaf in values.items()},
@@ -91,7 +92,7 @@ def sweep(
         designs: a pytree whose arrays have a leading axis N (a `Model` made under `jax.vmap` is one), or a list of N
             pytrees of one structure.
         batch_size: the most designs computed at once, on all devices together; rounded up to a multiple of their
-            number. None: at most 128 per CPU device, where larger batches gain nothing, 8192 per other device, and no
+            number. None: at most 256 per CPU device, where larger batches gain nothing, 8192 per other device, and no
             more than fit into half of the memory that is free.
         folder: where to keep the results as they come, a folder of `.npy` files. If it is there already, with the same
             designs, the sweep continues where it stopped; the arrays of the result are then mapped from its
