@@ -59,7 +59,8 @@ def main() -> None:
         jax.distributed.initialize(f"127.0.0.1:{options.port}", 2, options.process)
     if options.die_in_batch is not None:
         die_in_batch(options.die_in_batch)
-    found = lg.sweep(psi, designs(options.count), batch_size=BATCH, folder=options.folder, progress=False)
+    size = BATCH if options.process is None else None  # two processes agree on one by themselves
+    found = lg.sweep(psi, designs(options.count), batch_size=size, folder=options.folder, progress=False)
     np.savez(options.out, values=found.values, ok=found.ok, devices=jnp.asarray(jax.device_count()))
 
 
