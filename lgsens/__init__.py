@@ -20,6 +20,7 @@ from lgsens._simulate import (
     initial_state as initial_state,
     simulate as simulate,
 )
+from lgsens._sweep import SweepResult as SweepResult, sweep as sweep
 from lgsens._trajectory import (
     BodyMotion as BodyMotion,
     Instant as Instant,
@@ -58,7 +59,12 @@ from lgsens.sensitivity import (
     DirectDifferentiation as DirectDifferentiation,
 )
 
-_NAMESPACES = ("examples", "optimize", "plotting")  # imported when first used: optax and matplotlib take their time
+_NAMESPACES = (
+    "examples",
+    "optimize",
+    "plotting",
+    "testing",
+)  # imported when first used: optax and matplotlib take their time
 
 
 def __getattr__(name: str):

@@ -1,14 +1,13 @@
 """`lgsens paper`: figures 2 and 4 of the paper, errors of sensitivities against the step size by all its methods."""
 
 import argparse
-import contextlib
 import itertools
 import json
 import os
 import platform
 import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -18,6 +17,7 @@ from lgsens import plotting
 from lgsens._cli_report import output_folder, version
 from lgsens._cli_top import REFERENCE
 from lgsens._differentiate import Method, differentiate
+from lgsens._progress import progress_bar
 from lgsens._reference_methods import IndexReduced
 from lgsens.criteria import Criterion
 from lgsens.examples import PROBLEMS
@@ -181,14 +181,17 @@ def measure(study: Study, coarse: bool, progress: bool) -> dict[str, dict[str, A
         }
     methods = {name: method for panel in study.panels.values() for name, method in panel.methods.items()}
     num_steps = study.coarse if coarse else study.num_steps
-    for name, count in _with_bar(list(itertools.product(methods, num_steps)), progress):
-        for key, panel in study.panels.items():
-            if name in panel.methods:
-                row = _timed(study, panel, methods[name], count, found[key]["reference"]["value"])
-                for column, number in zip(COLUMNS, row):
-                    found[key]["methods"][name][column].append(number)
-        if count == num_steps[-1]:
-            jax.clear_caches()  # a program of the quarter-car takes 6,000 of the 65,530 memory maps that Linux allows
+    runs = list(itertools.product(methods, num_steps))
+    with progress_bar(len(runs), "run", progress) as bar:
+        for name, count in runs:
+            for key, panel in study.panels.items():
+                if name in panel.methods:
+                    row = _timed(study, panel, methods[name], count, found[key]["reference"]["value"])
+                    for column, number in zip(COLUMNS, row):
+                        found[key]["methods"][name][column].append(number)
+            if count == num_steps[-1]:
+                jax.clear_caches()  # a program of the quarter-car takes 6,000 of the 65,530 memory maps of Linux
+            bar.update()
     for curve in (curve for panel in found.values() for curve in panel["methods"].values()):
         h, error = np.log(curve["h"]), np.log(curve["relative_error"])
         curve["slopes_between"] = (np.diff(error) / np.diff(h)).tolist()
@@ -218,16 +221,6 @@ def _timed(study: Study, panel: Curves, method: Method, num_steps: int, referenc
         seconds.append(time.perf_counter() - started)
     error = abs(value / reference - 1)
     return panel.t1 / num_steps, value, error, statistics.median(seconds[1:]), seconds[0]
-
-
-def _with_bar(runs: list[tuple[str, int]], progress: bool) -> Iterable[tuple[str, int]]:
-    """The runs, behind a bar if tqdm is installed."""
-    if progress:
-        with contextlib.suppress(ImportError):
-            from tqdm import tqdm
-
-            return tqdm(runs, unit="run", dynamic_ncols=True)
-    return runs
 
 
 def table(panel: Mapping[str, Any]) -> str:

@@ -11,12 +11,20 @@ from jax.core import Tracer
 from lgsens.dynamics import RESULTS
 from lgsens.linear import Matrix, SparseMatrix
 
+# Whether a failure becomes NaN. JAX keys its caches on it: what was compiled for one is traced again for the other.
+_failures_as_nan = jax.make_user_context(False)
+
 # Which of several runs: `details["run"]`.
 _RUNS = ("", " of the coarser of two runs", " of the finer of two runs")
 
 
 class SimulationError(RuntimeError):
     """A simulation or an equilibrium that failed; the message says at which step, when, and what to try."""
+
+
+def failures_as_nan():
+    """A context in which what is traced turns failures into NaN, in the values and in every derivative of them."""
+    return _failures_as_nan(True)
 
 
 def redundant_names(jacobian: Matrix, names: tuple[str, ...]) -> list[str]:
@@ -71,7 +79,8 @@ def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tupl
     `note` is what else to say where the constraints are redundant.
 
     Inside a trace the exception is JAX's runtime error with the same message. The callback runs only in the
-    failing branch (under `vmap`, always, and names the first lane that failed).
+    failing branch (under `vmap`, always, and names the first lane that failed). Under `failures_as_nan` nothing is
+    raised there.
     """
 
     def host(result, details) -> np.ndarray:
@@ -90,6 +99,10 @@ def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tupl
             raise _exception(int(result), values, names, note)
         return tree
 
+    if _failures_as_nan.value:
+        passed = lax.stop_gradient(result) == RESULTS.successful
+        return jax.tree.map(lambda leaf: _poisoned(passed, leaf), tree)
+
     def fail(operands):
         shape = jax.ShapeDtypeStruct((), bool)
         return jax.pure_callback(host, shape, *operands, vmap_method="broadcast_all")
@@ -106,5 +119,10 @@ def _value(array: Any) -> Any:
 
 
 def _poisoned(passed, leaf):
-    """`leaf`, made to depend on the callback so that it is not removed."""
-    return jnp.where(passed, leaf, jnp.nan) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+    """`leaf` if `passed`, else NaN; it depends on the callback, which is therefore not removed.
+
+    A product and no selection: the derivatives of a failure are NaN too, where those of a selection would be zero.
+    """
+    return (
+        leaf * jnp.where(passed, 1.0, jnp.nan).astype(leaf.dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+    )

@@ -63,6 +63,11 @@ def suggestion(name: str, known: Any) -> str:
     return f"{name!r} is not one of {sorted(known)}"
 
 
+def leaf_name(path: tuple[Any, ...], root: str) -> str:
+    """The name of a leaf of a pytree from its path, bodies.top.mass; `root` where the pytree is the leaf."""
+    return jax.tree_util.keystr(path, simple=True, separator=".") or root
+
+
 def number_field(name: str, **kwargs: Any) -> Any:
     """A keyword-only scalar leaf of an element; with `default=None` it may be left out."""
     return eqx.field(

@@ -149,9 +149,10 @@ assert all(leaf.dtype == jnp.float64 for leaf in leaves)
 
 
 def test_namespaces_are_attributes():
-    """`lgsens.examples`, `.optimize` and `.plotting` without an import of their own; other names raise."""
+    """`lgsens.examples`, `.optimize`, `.plotting` and `.testing` without an import of their own; other names raise."""
     assert callable(lgsens.examples.spinning_top)
     assert callable(lgsens.optimize.minimize)
     assert lgsens.plotting.__name__ == "lgsens.plotting"
+    assert callable(lgsens.testing.check_sensitivities)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = lgsens.nothing

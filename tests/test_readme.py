@@ -8,8 +8,9 @@ import numpy as np
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
 
-def test_examples():
+def test_examples(tmp_path, monkeypatch):
     """One after the other, as a reader would."""
+    monkeypatch.chdir(tmp_path)  # where a sweep keeps its results
     source = "\n".join(re.findall(r"```python\n(.*?)```", README, re.DOTALL))
     names: dict = {}
     exec(compile(source, "README.md", "exec"), names)
@@ -23,6 +24,7 @@ def test_examples():
     # the same scheme in two programs, 1000 steps
     np.testing.assert_allclose(names["found"].gradient["side"]["length"], by_jax, rtol=1e-9)
     assert np.isfinite(names["found"].value["force"])
+    assert names["values"].shape == names["gradient"]["mass"].shape == (500,)
 
 
 def test_commands():

@@ -44,6 +44,13 @@ from lgsens.model._roads import (
     FlatRoad as FlatRoad,
     SampledRoad as SampledRoad,
 )
+from lgsens.model._stack import (
+    constraint_force as constraint_force,
+    constraint_jacobian as constraint_jacobian,
+    constraint_stiffness as constraint_stiffness,
+    load_tangents as load_tangents,
+    moved as moved,
+)
 from lgsens.model._summary import Summary as Summary
 from lgsens.model._system import MultibodySystem as MultibodySystem
 from lgsens.model._trim import static_preload as static_preload

@@ -110,7 +110,8 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
 # Elements with closed-form tangents use them; for the others autodiff perturbs by retraction, R exp(θ̃).
 
 
-def _moved(frame: Frame, x) -> Frame:
+def moved(frame: Frame, x) -> Frame:
+    """The frame after x = [u, θ]: x + u, R exp(θ̃)."""
     return Frame(*R3xSO3().retract(Pose(*frame), x))
 
 
@@ -119,7 +120,7 @@ def constraint_jacobian(element: AbstractConstraint, a: Frame, b: Frame):
     if isinstance(element, AbstractClosedFormConstraint):
         return element.jacobian(a, b)
     zero = jnp.zeros(12, a.position.dtype)
-    return jax.jacfwd(lambda x: element.value(_moved(a, x[BODY_A]), _moved(b, x[BODY_B])))(zero)
+    return jax.jacfwd(lambda x: element.value(moved(a, x[BODY_A]), moved(b, x[BODY_B])))(zero)
 
 
 def constraint_force(element: AbstractConstraint, a: Frame, b: Frame, lam):
@@ -134,7 +135,7 @@ def constraint_stiffness(element: AbstractConstraint, a: Frame, b: Frame, lam):
     if isinstance(element, AbstractClosedFormConstraint):
         return element.geometric_stiffness(a, b, lam)
     zero = jnp.zeros(12, a.position.dtype)
-    return jax.jacfwd(lambda x: lam @ constraint_jacobian(element, _moved(a, x[BODY_A]), _moved(b, x[BODY_B])))(zero)
+    return jax.jacfwd(lambda x: lam @ constraint_jacobian(element, moved(a, x[BODY_A]), moved(b, x[BODY_B])))(zero)
 
 
 def load_tangents(element: AbstractLoad, a: Frame, b: Frame, va, vb, t) -> LoadTangents:
@@ -142,6 +143,6 @@ def load_tangents(element: AbstractLoad, a: Frame, b: Frame, va, vb, t) -> LoadT
     if isinstance(element, AbstractClosedFormLoad):
         return element.tangents(a, b, va, vb, t)
     zero = jnp.zeros(12, a.position.dtype)
-    position = jax.jacfwd(lambda x: element.force(_moved(a, x[BODY_A]), _moved(b, x[BODY_B]), va, vb, t))(zero)
+    position = jax.jacfwd(lambda x: element.force(moved(a, x[BODY_A]), moved(b, x[BODY_B]), va, vb, t))(zero)
     velocity = jax.jacfwd(lambda x: element.force(a, b, va + x[BODY_A], vb + x[BODY_B], t))(zero)
     return LoadTangents(position, velocity)

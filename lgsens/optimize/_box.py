@@ -9,7 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lgsens._validate import as_float
+from lgsens._validate import as_float, leaf_name
 
 
 class Box(NamedTuple):
@@ -78,7 +78,7 @@ def checked_box(x0, lower, upper, log_scale) -> tuple[Array, Callable[[Array], P
 def entry_names(tree) -> list[str]:
     """Names for the numbers of a pytree, in the order of `ravel_pytree`: stiffness, points[0, 2], x[1]."""
     return [
-        (jax.tree_util.keystr(path, simple=True, separator=".") or "x") + (str(list(map(int, index))) if index else "")
+        leaf_name(path, "x") + (str(list(map(int, index))) if index else "")
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
         for index in np.ndindex(np.shape(leaf))
     ]

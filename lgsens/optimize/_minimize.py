@@ -20,6 +20,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PyTree
 
+from lgsens._progress import progress_bar
 from lgsens._validate import as_count
 from lgsens.optimize._box import Box, checked_box
 
@@ -149,7 +150,7 @@ def minimize(
 
     records: list[tuple] = []
     best: Any = None  # rank, step, x, f, g
-    with _bar(num_steps, progress) as bar:
+    with progress_bar(num_steps, "step", progress) as bar:
         for i in range(num_steps):
             carry, (x, f, g, worst, norm) = step(carry, jnp.asarray(i % PERIOD == PERIOD - 1))
             f, worst = float(f), float(worst)
@@ -230,29 +231,3 @@ def _make_step(fun, box: Box, optimizer: optax.GradientTransformation, tolerance
         return chosen, (x, f, g, worst, norm)
 
     return step
-
-
-class _Silent:
-    """Stands in for the bar."""
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        return None
-
-    def set_postfix(self, *_, **__):
-        return None
-
-    def update(self):
-        return None
-
-
-def _bar(num_steps: int, progress: bool) -> Any:
-    if not progress:
-        return _Silent()
-    try:
-        from tqdm import tqdm
-    except ImportError:
-        return _Silent()
-    return tqdm(total=num_steps, unit="step", dynamic_ncols=True)

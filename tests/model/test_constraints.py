@@ -9,7 +9,6 @@ from helpers import (
     GRAVITY,
     central_difference,
     close,
-    moved,
     moved_without_library,
     random_body,
     random_point,
@@ -26,6 +25,7 @@ from lgsens.model import (
     InPlane,
     Orthogonality,
 )
+from lgsens.testing import check_joint
 
 KINDS = {"Coincidence": Coincidence, "Orthogonality": Orthogonality, "InPlane": InPlane, "Distance": Distance}
 ROWS = {"Coincidence": 3, "Orthogonality": 1, "InPlane": 1, "Distance": 1}
@@ -57,27 +57,13 @@ def closed_form(element, a, b, lam):
     return element.value(a, b), element.jacobian(a, b), element.geometric_stiffness(a, b, lam)
 
 
-@eqx.filter_jit
-@eqx.filter_vmap
-def differentiated(element, a, b, lam):
-    """B = ∂Φ/∂x, and ∂/∂x of Bᵀλ where B is itself the derivative at the moved pose."""
-
-    def jacobian(x):
-        first, second = moved(a, x[:6]), moved(b, x[6:])
-        return jax.jacfwd(lambda y: element.value(moved(first, y[:6]), moved(second, y[6:])))(jnp.zeros_like(x))
-
-    zero = jnp.zeros(12, a.position.dtype)
-    return jacobian(zero), jax.jacfwd(lambda x: lam @ jacobian(x))(zero)
-
-
 @pytest.mark.parametrize("name", KINDS)
 def test_tangents_equal_autodiff(name):
-    element, a, b, lam = sample(name)
-    value, jacobian, stiffness = closed_form(element, a, b, lam)
-    expected_jacobian, expected_stiffness = differentiated(element, a, b, lam)
-    assert value.shape == (POSES, element.num_rows) == (POSES, ROWS[name])
-    close(jacobian, expected_jacobian, ULPS)
-    close(stiffness, expected_stiffness, ULPS)
+    element, *_ = sample(name)
+    assert element.num_rows == ROWS[name]
+    one = jax.tree.map(lambda leaf: leaf[0], element)
+    # two poses of a few numbers, round-off as it is measured: some ten units in the last place of the largest entry
+    check_joint(one, poses=POSES).raise_if_failed()
 
 
 @pytest.mark.parametrize("name", KINDS)

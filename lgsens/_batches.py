@@ -1,0 +1,180 @@
+"""A function of one design as a program for a batch of them, spread over devices.
+
+Every device works through its share of the batch on its own (`shard_map` of `vmap`): partitioned by the compiler
+instead, the loops of the lanes would wait for each other across devices at every iteration of Newton.
+"""
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.extend
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import PyTree
+
+from lgsens._errors import failures_as_nan
+from lgsens._trajectory import Saved, Trajectory
+from lgsens.dynamics import RESULTS
+
+AXIS = "designs"
+# The most lanes per device. A CPU gains nothing beyond its caches (`benchmarks/sweep.py`); elsewhere memory decides.
+LANES = {"cpu": 256}
+LANES_ELSEWHERE = 8192
+FREE_SHARE = 0.5  # of the memory that is free, what a batch may take
+
+
+class Program(NamedTuple):
+    """A compiled batch.
+
+    Attributes:
+        run: the leaves of `size` designs ↦ the leaves of their values, and ok; NumPy arrays with a leading axis.
+        size: designs in a batch.
+        memory: what it needs on each device [bytes].
+        seconds: wall time [s].
+    """
+
+    run: Callable[[list[np.ndarray]], tuple[list[np.ndarray], np.ndarray]]
+    size: int
+    memory: float
+    seconds: float
+
+
+def succeeded(values: PyTree) -> jax.Array:
+    """Whether the values of one design are finite, and every `Trajectory` or `Saved` among them successful."""
+    is_run = lambda node: isinstance(node, Trajectory | Saved)
+    checks = [
+        jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(values) if jnp.issubdtype(leaf.dtype, jnp.inexact)
+    ]
+    runs = [node for node in jax.tree.leaves(values, is_leaf=is_run) if is_run(node)]
+    checks += [run.result == RESULTS.successful for run in runs]
+    return jnp.all(jnp.stack(checks)) if checks else jnp.ones((), bool)
+
+
+class Traced(NamedTuple):
+    """A function of one design, traced: it is called no more, whatever the batches.
+
+    Attributes:
+        run: the leaves of a design ↦ the leaves of its values, and whether it succeeded as the last.
+        shapes: the values of one design, a pytree of shapes and dtypes.
+        seconds: wall time [s].
+    """
+
+    run: Callable[..., list[jax.Array]]
+    shapes: PyTree
+    seconds: float
+
+
+def trace(fn: Callable[[PyTree], PyTree], designs: PyTree) -> Traced:
+    """`fn` for one of `designs`, with failures as NaN."""
+    leaves, structure = jax.tree.flatten(designs)
+    one = [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in leaves]
+
+    def single(*leaves):
+        values = jax.tree.map(jnp.asarray, fn(jax.tree.unflatten(structure, leaves)))
+        if not jax.tree.leaves(values):
+            raise ValueError(f"`fn` must return at least one array, got {values!r}.")
+        return values, succeeded(values)
+
+    started = time.perf_counter()
+    with failures_as_nan():
+        jaxpr, (shapes, _) = jax.make_jaxpr(single, return_shape=True)(*one)
+    return Traced(jax.extend.core.jaxpr_as_fun(jaxpr), shapes, time.perf_counter() - started)
+
+
+def compile_batch(
+    traced: Traced, designs: PyTree, count: int, batch_size: int | None, devices: Sequence[Any]
+) -> Program:
+    """A batch of `designs`, of which `count` are to be computed, in batches of nearly equal size.
+
+    Without `batch_size` the largest batch is compiled first and, if it takes more memory than is free, once more for
+    as many as fit: memory grows in proportion to the batch.
+    """
+    mesh = Mesh(np.asarray(devices), (AXIS,))
+    rows = PartitionSpec(AXIS)
+    sharding = NamedSharding(mesh, rows)
+    spread = jax.jit(jax.shard_map(jax.vmap(traced.run), mesh=mesh, in_specs=rows, out_specs=rows, check_vma=False))
+
+    def compiled(size):
+        shapes = [
+            jax.ShapeDtypeStruct((size, *leaf.shape[1:]), leaf.dtype, sharding=sharding)
+            for leaf in jax.tree.leaves(designs)
+        ]
+        return spread.lower(*shapes).compile()
+
+    started = time.perf_counter()
+    lanes = LANES.get(devices[0].platform, LANES_ELSEWHERE)
+    size = even(count, batch_size or lanes * len(devices), len(devices))
+    program = compiled(size)
+    if batch_size is None:
+        fits = _smallest(free_memory(devices) * FREE_SHARE / max(memory(program), 1.0))
+        if fits < 1.0 and size > len(devices):
+            size = even(count, int(size * fits), len(devices))
+            program = compiled(size)
+    seconds = time.perf_counter() - started
+
+    def run(batch):
+        place = lambda leaf: jax.make_array_from_callback(leaf.shape, sharding, lambda index: leaf[index])
+        *values, ok = on_host(program(*map(place, batch)))
+        return [np.asarray(leaf) for leaf in values], np.asarray(ok)
+
+    return Program(run, size, memory(program), seconds)
+
+
+def even(count: int, largest: int, devices: int) -> int:
+    """The size of batches for `count` designs: at most `largest`, as even as can be, a multiple of `devices`."""
+    per_device = max(largest // devices, 1)
+    shares = -(-count // devices)  # designs per device, rounded up
+    batches = -(-shares // per_device)
+    return devices * -(-shares // batches)
+
+
+def memory(program: Any) -> float:
+    """What a compiled program needs on each device [bytes]; 0 where the backend does not say."""
+    stats = program.memory_analysis()
+    if stats is None:
+        return 0.0
+    return float(stats.temp_size_in_bytes + stats.argument_size_in_bytes + stats.output_size_in_bytes)
+
+
+def free_memory(devices: Sequence[Any]) -> float:
+    """The memory that is free for each device [bytes]: its own, or a share of the machine's."""
+    local = [device for device in devices if device.process_index == jax.process_index()]
+    if not local:
+        return np.inf
+    stats = local[0].memory_stats()
+    if stats and "bytes_limit" in stats:
+        return float(stats["bytes_limit"] - stats.get("bytes_in_use", 0))
+    return _host_memory() / len(local)
+
+
+def _smallest(value: float) -> float:
+    """The least of all processes: they must agree on the size of a batch."""
+    if jax.process_count() == 1:
+        return value
+    return float(np.min(multihost_utils.process_allgather(np.asarray(value, np.float32))))
+
+
+def _host_memory() -> float:
+    """Free memory of the machine [bytes]; all of it where the system does not tell what is free."""
+    info = Path("/proc/meminfo")
+    if info.exists():
+        for line in info.read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return 1024.0 * int(line.split()[1])
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, ValueError, OSError):
+        return np.inf
+
+
+def on_host(tree: PyTree) -> PyTree:
+    """NumPy arrays of the whole of a distributed pytree, in every process."""
+    if jax.process_count() > 1:
+        return multihost_utils.process_allgather(tree, tiled=True)
+    return jax.device_get(tree)

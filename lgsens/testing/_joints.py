@@ -1,0 +1,145 @@
+"""Joints: what they say of their derivatives, against what follows from their equation."""
+
+from collections.abc import Iterator, Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lgsens.model import (
+    AbstractClosedFormConstraint,
+    AbstractConstraint,
+    AbstractJoint,
+    RigidBody,
+    constraint_force,
+    constraint_jacobian,
+    constraint_stiffness,
+)
+from lgsens.testing._poses import DIM, Poses, displaced, same, slope, vanishes
+from lgsens.testing._report import Check, Report, worst
+from lgsens.testing._sensitivities import check_sensitivities
+
+RANK = 1e-8  # singular values below this share of the largest are zero: the square root of round-off
+
+
+def check_joint(
+    joint: AbstractJoint | AbstractConstraint,
+    *,
+    bodies: Mapping[str, RigidBody] | None = None,
+    length: float = 1.0,
+    poses: int = 3,
+    seed: int = 0,
+) -> Report:
+    """Check a joint, or one basic constraint, against its equation Φ.
+
+        δΦ = B δx,     K = ∂(Bᵀλ)/∂x at fixed λ
+
+    at random poses that need not satisfy it: B and K by autodiff under the retraction R exp(θ̃) and by differences; of a
+    constraint in closed form, `jacobian`, `force` and `geometric_stiffness` against autodiff. Φ, Bᵀλ and K by every
+    number of it, as `check_sensitivities` does. Of a joint, in the reference configuration: Φ = 0 if it says
+    `assembled`, and B of full rank, so that its equations are independent.
+
+    Arguments:
+        joint: an `AbstractJoint` or an `AbstractConstraint`.
+        bodies: the bodies that a joint names, in its reference configuration; None: bodies at random poses.
+        length: size of the scene [m], shape (): random poses and steps of differences are in proportion.
+        poses: how many random poses.
+        seed: of poses and multipliers.
+
+    Returns a `Report`; a row holds the worst of all poses. Raises `ValueError` for a Φ that has not `num_rows` entries.
+    """
+    scene = Poses(seed, length)
+    is_joint = isinstance(joint, AbstractJoint)
+    names = (joint.a, joint.b) if is_joint else ("a", "b")
+    bodies = scene.bodies([name for name in names if name is not None]) if bodies is None else bodies
+    (a, b), free = scene.ends(*names, bodies)
+
+    def elements_of(joint) -> tuple[AbstractConstraint, ...]:
+        return joint.constraints(a, b) if is_joint else (joint,)
+
+    elements = elements_of(joint)
+    labels = [f"{i + 1} {type(e).__name__}: " for i, e in enumerate(elements)] if is_joint else [""]
+    multipliers = []
+    for label, element in zip(labels, elements):
+        rows = jax.eval_shape(element.value, a, b).shape
+        if rows != (element.num_rows,):
+            raise ValueError(
+                f"{label or f'{type(element).__name__}: '}`value` has shape {rows}, `num_rows` is {element.num_rows}."
+            )
+        multipliers.append(jnp.asarray(scene.rng.standard_normal(rows), scene.dtype))
+    starts = [scene.displacement(free) for _ in range(poses)]
+
+    checks: list[Check] = list(_reference(joint, scene, a, b, free)) if is_joint else []
+    for label, element, lam in zip(labels, elements, multipliers):
+        program = _program(element, lam, free)
+        for start in starts:
+            first, second = displaced(a, b, start)
+            found = scene.sampled(program(scene.points(free), first, second), free)
+            checks += _compared(label, isinstance(element, AbstractClosedFormConstraint), found)
+
+    def numbers(joint):
+        frames = displaced(a, b, starts[0])
+        return [
+            (e.value(*frames), constraint_force(e, *frames, lam), constraint_stiffness(e, *frames, lam))
+            for e, lam in zip(elements_of(joint), multipliers)
+        ]
+
+    if jax.tree.leaves(joint):
+        checks += check_sensitivities(numbers, joint, seed=seed).checks
+    return Report(f"{type(joint).__name__}, {poses} poses", worst(checks))
+
+
+def _program(element: AbstractConstraint, lam, free):
+    """What a constraint says, and what follows from its value, at displacements x of two frames."""
+    zero = jnp.zeros(DIM, lam.dtype)
+
+    def jacobian(a, b):
+        return jax.jacfwd(lambda y: element.value(*displaced(a, b, y)))(zero)
+
+    def quantities(x, a, b):
+        a, b = displaced(a, b, x)
+        force = lambda y: lam @ jacobian(*displaced(a, b, y))
+        return {
+            "Φ": element.value(a, b),
+            "B": constraint_jacobian(element, a, b)[:, free],
+            "B by autodiff": jacobian(a, b)[:, free],
+            "force": constraint_force(element, a, b, lam)[free],
+            "force by autodiff": force(zero)[free],
+            "K": constraint_stiffness(element, a, b, lam)[free][:, free],
+            "K by autodiff": jax.jacfwd(force)(zero)[free][:, free],
+        }
+
+    return jax.jit(jax.vmap(quantities, in_axes=(0, None, None)))
+
+
+def _compared(label: str, closed_form: bool, found) -> Iterator[Check]:
+    stiffness = f"{label}K = ∂(Bᵀλ)/∂x"
+    if closed_form:
+        yield same(f"{label}B", found["B"], found["B by autodiff"])
+        yield same(f"{label}Bᵀλ", found["force"], found["force by autodiff"])
+        yield same(stiffness, found["K"], found["K by autodiff"])
+    yield slope(f"{label}B", found["B by autodiff"], found["Φ"])
+    yield slope(stiffness, found["K by autodiff"], found["force by autodiff"])
+
+
+def _reference(joint: AbstractJoint, scene: Poses, a, b, free) -> Iterator[Check]:
+    """Φ = 0 and full rank of B where the joint was made; moved with the bodies, it is made elsewhere."""
+
+    @jax.jit
+    @jax.vmap
+    def at(x):
+        frames = displaced(a, b, x)
+        elements = joint.constraints(*frames)
+        return {
+            "Φ": jnp.concatenate([element.value(*frames) for element in elements]),
+            "B": jnp.concatenate([constraint_jacobian(element, *frames) for element in elements])[:, free],
+        }
+
+    found = scene.sampled(at(scene.points(free)), free)
+    if joint.assembled:
+        size = max(float(jnp.linalg.norm(frame.position)) for frame in (a, b))
+        yield vanishes("Φ", "reference, 0", found["Φ"], max(size, scene.length))
+    jacobian = found["B"].value
+    lengths = np.linalg.norm(jacobian, axis=1, keepdims=True)
+    rank = np.linalg.matrix_rank(jacobian / np.where(lengths > 0, lengths, 1.0), tol=RANK)
+    yield Check("rank of B", "reference, equations", float(len(jacobian) - rank), 0.0, f"{rank} of {len(jacobian)}")
