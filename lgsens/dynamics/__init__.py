@@ -17,6 +17,12 @@ from lgsens.dynamics._initial import (
     mass_scale as mass_scale,
     split_velocity as split_velocity,
 )
+from lgsens.dynamics._kinematics import (
+    AbstractDrive as AbstractDrive,
+    Positions as Positions,
+    forces_of_motion as forces_of_motion,
+    positions as positions,
+)
 from lgsens.dynamics._results import RESULTS as RESULTS
 from lgsens.dynamics._state import State as State, Tangents as Tangents
 from lgsens.dynamics._system import (

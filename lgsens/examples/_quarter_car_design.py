@@ -11,7 +11,8 @@ from lgsens._simulate import simulate
 from lgsens._trajectory import Trajectory
 from lgsens._validate import suggestion
 from lgsens.criteria import time_integral
-from lgsens.examples._quarter_car import GRAVITY, QuarterCar, _read, _Reader
+from lgsens.examples._hardpoint_file import Reader, read
+from lgsens.examples._quarter_car import GRAVITY, QuarterCar
 
 # What the user may ask for, and the members of the design that it frees.
 PARAMETERS = {
@@ -45,8 +46,8 @@ class DesignLimits(eqx.Module):
         Raises `ValueError` naming the file and the key for a table that is missing, incomplete or
         contradictory.
         """
-        document, name = _read(path)
-        table = _Reader(document, name).table("design")
+        document, name = read(path)
+        table = Reader(document, name).table("design")
         shortest, longest = table.number("minimum_spring_length"), table.number("maximum_spring_length")
         if not shortest < longest:
             raise ValueError(
@@ -148,7 +149,7 @@ class SuspensionDesign(eqx.Module):
             lower, upper = map(float, getattr(limits, key))
             if not lower <= float(value) <= upper:
                 raise ValueError(
-                    f"Hardpoint file {_read(path)[1]!r}, key 'design.{key}': the start, {float(value)}, lies "
+                    f"Hardpoint file {read(path)[1]!r}, key 'design.{key}': the start, {float(value)}, lies "
                     f"outside [{lower}, {upper}]."
                 )
         return SuspensionDesign(car, limits, **settings)
