@@ -122,8 +122,8 @@ def kinematics(
     drive = _Drive(system, tuple(_place(system, name) for name in names))
     values = jnp.stack(columns, axis=1)
     speed = jnp.stack([jnp.broadcast_to(speed, columns[0].shape) for speed in speeds], axis=1)
-    found, details = _kinematics_jit(drive, values, speed, as_float(t0, (), "`t0`"))
-    found = Kinematics(dict(zip(names, columns)), *found, system)
+    (t, states, result), details = _kinematics_jit(drive, values, speed, as_float(t0, (), "`t0`"))
+    found = Kinematics(values=dict(zip(names, columns)), t=t, states=states, result=result, system=system)
     if throw:
         found = throw_if_failed(found, found.result, details, system.constraint_names)
     return found

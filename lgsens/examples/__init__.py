@@ -22,4 +22,5 @@ from lgsens.examples._quarter_car_design import (
 )
 from lgsens.examples._simple_pendulum import simple_pendulum as simple_pendulum
 from lgsens.examples._slider_crank import slider_crank as slider_crank
+from lgsens.examples._suspension_curves import SuspensionCurves as SuspensionCurves
 from lgsens.examples._top import spinning_top as spinning_top

@@ -8,9 +8,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lgsens._kinematics import Kinematics, kinematics
 from lgsens._validate import require
 from lgsens.examples._hardpoint_file import Reader, read
 from lgsens.examples._point_masses import with_point_masses
+from lgsens.examples._suspension_curves import SuspensionCurves, suspension_curves
 from lgsens.model import (
     ALL_FREE,
     BumpRoad,
@@ -23,6 +25,7 @@ from lgsens.model import (
     RigidBody,
     SphericalJoint,
     SpringDamper,
+    TranslationDriver,
     TyreSpring,
     UniversalJoint,
     static_preload,
@@ -192,6 +195,43 @@ class QuarterCar(eqx.Module):
             self.chassis.mass,
         )
         return model
+
+    def travel(self, travel, *, links: str = "rods", throw: bool = True) -> Kinematics:
+        """The suspension on a rig: the chassis held, the wheel locked, its centre moved up and down at rate 1.
+
+        Arguments:
+            travel: vertical displacements of the wheel centre [m], positive in bump, shape (n,), in an order in which
+                each is near the one before.
+            links: as in `model`; the motion is the same.
+            throw: as in `lgsens.kinematics`.
+
+        Velocities and rates are derivatives by the travel. The forces are not those of the car: its spring has no
+        preload here. Raises `ValueError` for travel that the links do not allow.
+        """
+        # Lengths that are given need no preload to be found.
+        scene = self.model(wheel="locked", chassis="heave", links=links, free_length=1.0, free_radius=1.0)
+        along_z = jnp.asarray([0.0, 0.0, 1.0], self.bearing.dtype)
+        rig = Model(
+            scene.bodies | {"chassis": _body(self.chassis, free=())},
+            scene.joints | {"travel": TranslationDriver(None, "wheel", at=self.wheel.centre, axis=along_z)},
+            scene.forces,
+        )
+        return kinematics(rig, {"travel": travel}, throw=throw)
+
+    def curves(self, travel, *, axle: str = "rear", throw: bool = True) -> SuspensionCurves:
+        """Camber, toe, track, wheelbase, motion ratios and roll centre over the travel of the wheel.
+
+        Arguments:
+            travel: as in `travel`.
+            axle: "rear" or "front", for the sign of the wheelbase.
+            throw: as in `lgsens.kinematics`.
+
+        `SuspensionCurves` says what they are and their signs (ISO 8855); the wheel is upright and straight at the
+        design position. Differentiable by every number of the suspension, exactly. Raises `ValueError` for another
+        axle and as `travel`.
+        """
+        _check_choice("axle", axle, ("rear", "front"))
+        return suspension_curves(self.travel(travel, throw=throw), self.wheel.centre, rear=axle == "rear")
 
 
 def _check_choice(name: str, value: str, known: tuple[str, str]) -> None:
