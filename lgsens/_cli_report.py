@@ -67,7 +67,7 @@ def document(outcome: Any, settings: dict[str, Any], tolerance: float) -> dict[s
             "after": result.objective,
             "reduction": 1 - result.objective / float(before.objective),
         },
-        "constraints": constraints(outcome, tolerance),
+        "constraints": constraints(outcome, tolerance) + kept_curves(outcome, tolerance),
         "constraint_tolerance": tolerance,
         "feasible": result.feasible,
         "gradient_check": {
@@ -111,6 +111,29 @@ def constraints(outcome: Any, tolerance: float) -> list[dict[str, Any]]:
     return rows
 
 
+def kept_curves(outcome: Any, tolerance: float) -> list[dict[str, Any]]:
+    """How far each curve that is kept strays from its band's middle, before and after, at worst."""
+    keep, rows = outcome.design.keep, []
+    if keep is None:
+        return rows
+    cars = {"before": outcome.design.car, "after": outcome.design.with_design(outcome.result.x)}
+    curves = {label: keep.curves(car) for label, car in cars.items()}
+    for name, band in keep.bands.items():
+        middle, half = np.asarray(band.lower + band.upper) / 2, np.asarray(band.upper - band.lower) / 2
+        row = {"name": f"change of {name}", "unit": "rad", "limit": float(half[0])}
+        for label, found in curves.items():
+            change = np.asarray(getattr(found, name)) - middle
+            worst = int(np.argmax(np.abs(change) / half))
+            row[label] = {
+                "worst_value": float(change[worst]),
+                "travel": float(keep.travel[worst]),
+                "violation_over_scale": float(np.abs(change[worst]) / half[worst] - 1),
+            }
+        row["active"] = abs(row["after"]["violation_over_scale"]) <= tolerance
+        rows.append(row)
+    return rows
+
+
 def _values(design: Any, name: str, value: Any) -> Any:
     if name != "hardpoints":
         return float(value)
@@ -143,8 +166,9 @@ def table(outcome: Any, tolerance: float) -> str:
                 line(f"{link} {axis} [mm]", 1e3 * a, 1e3 * b, f"+-{box:.0f} mm{at_bound}", 1)
     reduction = 100 * (1 - result.objective / float(outcome.before.objective))
     line("Psi_0 [m^2/s^3]", float(outcome.before.objective), result.objective, f"{-reduction:+.1f} %", 4)
-    for row in constraints(outcome, tolerance):
-        factor, unit = (1e3, "mm") if row["unit"] == "m" else (1.0, row["unit"])
+    shown = {"m": (1e3, "mm"), "rad": (np.degrees(1.0), "deg")}
+    for row in constraints(outcome, tolerance) + kept_curves(outcome, tolerance):
+        factor, unit = shown.get(row["unit"], (1.0, row["unit"]))
         violation = row["after"]["violation_over_scale"]
         state = "active" if row["active"] else "satisfied" if violation <= tolerance else "VIOLATED"
         line(
