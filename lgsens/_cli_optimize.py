@@ -162,8 +162,7 @@ def _figures(outcome: Outcome, out: Path) -> None:
     if outcome.curves is not None:  # k and c do not show
         cars["after"] = design.with_design(outcome.result.x)
         keep = design.keep
-        bands = {} if keep is None else keep.bands
-        bounds = {name: (keep.travel, band.lower, band.upper) for name, band in bands.items()}
+        bounds = {} if keep is None else {name: (keep.travel, b.lower, b.upper) for name, b in keep.bands.items()}
         fig = plotting.suspension_curves(outcome.curves, bounds, title=design.car.name)
         plotting.save(fig, out / "curves.png")
     # Preloads do not show either; with any free length they are not computed.

@@ -94,8 +94,8 @@ def sensitivities(
     for axes in rest[len(joints) :]:
         axes.remove()
     for column in grid.T:
-        axes = [axes for axes in column if axes.figure is not None][-1]
-        axes.set_xlabel("time [s]")
-        axes.tick_params(labelbottom=True)
+        for axes in [axes for axes in column if axes.figure is not None][-1:]:  # the lowest, if there is one
+            axes.set_xlabel("time [s]")
+            axes.tick_params(labelbottom=True)
     fig.suptitle(title or f"Sensitivities with respect to {per[0]}")
     return fig
