@@ -13,7 +13,7 @@ import numpy as np
 from lgsens._kinematics import Kinematics
 from lgsens._trajectory import Trajectory
 from lgsens._validate import as_count
-from lgsens.model import MultibodySystem
+from lgsens.model import Angle, MultibodySystem
 from lgsens.plotting._mechanism import VIEW, draw, frame
 from lgsens.plotting._shapes import Mark, Shapes, placed, shapes, stretched
 from lgsens.plotting._style import ROAD, ROLES, figure
@@ -115,7 +115,8 @@ def film(motion: Trajectory | Kinematics, speed: float, max_frames: int) -> Film
         (label, values), *_ = motion.values.items()
         values = np.asarray(values)
         clock = np.linspace(0.0, SWEEP, len(values)) / speed
-        unit = "rad" if "Angle" in _owner_type(system, label) else "m"
+        turns = any(isinstance(stack.elements, Angle) and label in stack.owners for stack in system.constraints)
+        unit = "rad" if turns else "m"
     else:
         label, unit, values = "t", "s", np.asarray(motion.t)
         clock = (values - values[0]) / speed
@@ -129,10 +130,6 @@ def film(motion: Trajectory | Kinematics, speed: float, max_frames: int) -> Film
     road = [np.asarray(jax.vmap(tyre.road)(t)) for tyre in drawn.tyres]
     heights = np.stack(road, axis=1) if road else np.zeros((len(chosen), 0))
     return Film(drawn, clock[chosen], values[chosen], label, unit, position, orientation, heights)
-
-
-def _owner_type(system: MultibodySystem, driver: str) -> str:
-    return next(type(stack.elements).__name__ for stack in system.constraints if driver in stack.owners)
 
 
 def _digits(film: Film) -> int:

@@ -180,7 +180,7 @@ def _box(system: MultibodySystem, body: int, centre: np.ndarray) -> list[np.ndar
 def _spin_axis(orientation: np.ndarray, owners, wheel: int) -> np.ndarray:
     """The axis of the wheel's hinge, in its frame; y of the inertial frame without one.
 
-    Of the joints only a hinge has two orthogonalities, both with its axis in b.
+    A hinge and a sleeve have two orthogonalities, both with their axis in b; no other joint has two.
     """
     for elements in owners:
         a, b, axis = elements[0]

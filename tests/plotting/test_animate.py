@@ -104,6 +104,14 @@ def test_a_rig_is_swept_through(rig, tmp_path):
     np.testing.assert_allclose(wheel[:, 1], centre[1], atol=1e-5)  # its axis is along y
 
 
+def test_a_driven_angle_has_its_unit(tmp_path):
+    model = four_bar()
+    motor = {"motor": lg.RotationDriver(None, "crank", axis=(0.0, 0.0, 1.0))}
+    motion = lg.kinematics(lg.Model(model.bodies, model.joints | motor), {"motor": [0.0, 0.25]})
+    data = Page(plotting.animate(motion, tmp_path / "a.html")).data
+    assert (data["label"], data["unit"], data["values"]) == ("motor", "rad", [0.0, 0.25])
+
+
 def test_the_road_is_under_the_wheel(car, tmp_path):
     data = Page(plotting.animate(car, tmp_path / "a.html")).data
     (tyre,) = data["tyres"]
