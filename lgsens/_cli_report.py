@@ -69,6 +69,11 @@ def document(outcome: Any, settings: dict[str, Any], tolerance: float) -> dict[s
         },
         "constraints": constraints(outcome, tolerance) + kept_curves(outcome, tolerance),
         "constraint_tolerance": tolerance,
+        "curves": outcome.curves
+        and {
+            label: {member: np.asarray(values).tolist() for member, values in curves._asdict().items()}
+            for label, curves in outcome.curves.items()
+        },
         "feasible": result.feasible,
         "gradient_check": {
             where: {
@@ -178,6 +183,13 @@ def table(outcome: Any, tolerance: float) -> str:
             f"{factor * row['limit']:g}, {state} ({violation:+.1e} of scale)",
             2,
         )
+    for name in () if outcome.curves is None else ("camber", "toe"):
+        if design.keep is None or name not in design.keep.bands:
+            before, after = (np.degrees(getattr(outcome.curves[label], name)) for label in ("before", "after"))
+            travel = 1e3 * float(outcome.curves["before"].travel[-1])
+            change = after - before
+            note = f"free, at worst over +-{travel:.0f} mm of travel"
+            line(f"change of {name} [deg]", 0.0, change[np.argmax(np.abs(change))], note, 2)
     lines.append("-" * 92)
     errors = {where: float(np.max(check.error)) for where, check in outcome.checks.items()}
     lines.append(
