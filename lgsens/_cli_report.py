@@ -183,10 +183,11 @@ def table(outcome: Any, tolerance: float) -> str:
             f"{factor * row['limit']:g}, {state} ({violation:+.1e} of scale)",
             2,
         )
-    for name in () if outcome.curves is None else ("camber", "toe"):
+    curves = outcome.curves or {}
+    for name in ("camber", "toe") if curves else ():
         if design.keep is None or name not in design.keep.bands:
-            before, after = (np.degrees(getattr(outcome.curves[label], name)) for label in ("before", "after"))
-            travel = 1e3 * float(outcome.curves["before"].travel[-1])
+            before, after = (np.degrees(getattr(curves[label], name)) for label in ("before", "after"))
+            travel = 1e3 * float(curves["before"].travel[-1])
             change = after - before
             note = f"free, at worst over +-{travel:.0f} mm of travel"
             line(f"change of {name} [deg]", 0.0, change[np.argmax(np.abs(change))], note, 2)
