@@ -13,6 +13,7 @@ from lgsens._cost import measure_costs as measure_costs
 from lgsens._differentiate import Sensitivities as Sensitivities, differentiate as differentiate
 from lgsens._errors import SimulationError as SimulationError
 from lgsens._index_reduced_ode import IndexReducedODE as IndexReducedODE
+from lgsens._kinematics import Kinematics as Kinematics, kinematics as kinematics
 from lgsens._reference_methods import FiniteDifferences as FiniteDifferences, IndexReduced as IndexReduced
 from lgsens._richardson import Extrapolated as Extrapolated, Richardson as Richardson, richardson as richardson
 from lgsens._simulate import (
@@ -44,9 +45,11 @@ from lgsens.model import (
     PrismaticJoint as PrismaticJoint,
     RevoluteJoint as RevoluteJoint,
     RigidBody as RigidBody,
+    RotationDriver as RotationDriver,
     SampledRoad as SampledRoad,
     SphericalJoint as SphericalJoint,
     SpringDamper as SpringDamper,
+    TranslationDriver as TranslationDriver,
     TyreSpring as TyreSpring,
     UniversalJoint as UniversalJoint,
     static_preload as static_preload,

@@ -10,7 +10,7 @@ from typing import NoReturn
 
 import jax
 
-from lgsens import _cli_optimize, _cli_paper, _cli_top
+from lgsens import _cli_curves, _cli_optimize, _cli_paper, _cli_top
 from lgsens._cli_report import version
 from lgsens._errors import SimulationError
 from lgsens.examples import PARAMETERS
@@ -82,8 +82,51 @@ def _parser() -> argparse.ArgumentParser:
         default="hinged",
         help="whether the wheel turns on its hinge (default: %(default)s)",
     )
+    for angle in ("camber", "toe"):
+        optimize.add_argument(
+            f"--keep-{angle}",
+            type=_positive,
+            metavar="DEG",
+            help=f"keep the {angle} curve within this of the one at the start [degree] (default: it may change)",
+        )
+    optimize.add_argument(
+        "--travel",
+        type=_positive,
+        default=0.05,
+        metavar="M",
+        help="wheel travel up and down over which curves are kept and drawn [m] (default: %(default)s)",
+    )
     optimize.add_argument("--quiet", action="store_true", help="no progress bar and no table")
     optimize.set_defaults(run=_cli_optimize.run)
+
+    curves = commands.add_parser(
+        "curves",
+        help="draw the curves of a suspension",
+        description="Camber, toe, track, wheelbase, motion ratio and roll centre of a suspension over wheel travel: a "
+        "figure, a table, and a page on which it moves.",
+    )
+    curves.add_argument("suspension", choices=["quarter-car"], help="which suspension")
+    curves.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/curves"),
+        metavar="DIR",
+        help="new folder for curves.png, curves.csv and travel.html (default: %(default)s)",
+    )
+    curves.add_argument("--overwrite", action="store_true", help="write into --out even if it exists")
+    curves.add_argument(
+        "--hardpoints",
+        type=Path,
+        metavar="FILE.toml",
+        help="a suspension of your own (default: the one that ships with lgsens)",
+    )
+    curves.add_argument("--axle", choices=["rear", "front"], default="rear", help="(default: %(default)s)")
+    curves.add_argument(
+        "--travel", type=_positive, default=0.08, metavar="M", help="up and down [m] (default: %(default)s)"
+    )
+    curves.add_argument("--points", type=_count, default=41, help="positions (default: %(default)s)")
+    curves.add_argument("--quiet", action="store_true", help="no table")
+    curves.set_defaults(run=_cli_curves.run)
 
     top = commands.add_parser(
         "top",

@@ -12,11 +12,12 @@ import numpy as np
 from lgsens import plotting
 from lgsens._cli_report import document, output_folder, table
 from lgsens.dynamics import RESULTS
-from lgsens.examples import Response, SuspensionDesign
+from lgsens.examples import CurveBounds, QuarterCar, Response, SuspensionCurves, SuspensionDesign
 from lgsens.optimize import GradientCheck, OptimizationResult, check_gradient, minimize
 
 TOLERANCE = 1e-3  # of the scale of a constraint
 CHECKED_DIRECTIONS = 4
+CURVE_POINTS = 41  # of the figure
 CHECK_STEP = 3e-5  # accelerations carry the round-off of positions over βh², too much for a smaller step
 
 
@@ -29,6 +30,7 @@ class Outcome(NamedTuple):
     after: Response
     checks: dict[str, GradientCheck]
     seconds: dict[str, float]
+    curves: dict[str, SuspensionCurves] | None = None  # before and after, where hardpoints were free
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -44,14 +46,24 @@ def _run(arguments: argparse.Namespace, out: Path) -> int:
             f"--t1 must be a whole number of steps --dt, got t1 = {arguments.t1} s and dt = {arguments.dt} s"
         )
     plotting.figure()  # asks for matplotlib now, not after minutes
+    kept = {name: np.radians(width) for name in ("camber", "toe") if (width := getattr(arguments, f"keep_{name}"))}
+    if kept and "hardpoints" not in arguments.parameters:
+        names = " and ".join(f"--keep-{name}" for name in kept)
+        raise ValueError(f"{names} is about hardpoints, which --parameters {arguments.parameters} does not move")
+    keep = CurveBounds.around(QuarterCar.load(arguments.hardpoints), travel=arguments.travel, **kept) if kept else None
     design = SuspensionDesign.load(
         arguments.hardpoints,
+        keep=keep,
         parameters=arguments.parameters,
         wheel=arguments.wheel,
         t1=arguments.t1,
         num_steps=num_steps,
     )
     outcome = _optimize(design, arguments.steps, progress=not arguments.quiet)
+    if "hardpoints" in design.start:
+        travel = np.linspace(-arguments.travel, arguments.travel, CURVE_POINTS)
+        cars = {"before": design.car, "after": design.with_design(outcome.result.x)}
+        outcome = outcome._replace(curves={name: car.curves(travel) for name, car in cars.items()})
     settings = {name: value for name, value in vars(arguments).items() if name not in ("run", "command")}
     text = json.dumps(document(outcome, settings, TOLERANCE), indent=2, default=str, allow_nan=False)
     (out / "result.json").write_text(text + "\n", encoding="utf-8")
@@ -147,8 +159,12 @@ def _figures(outcome: Outcome, out: Path) -> None:
     )
     plotting.save(fig, out / "convergence.png")
     cars = {"before": design.car}
-    if "hardpoints" in design.start:  # k and c do not show
+    if outcome.curves is not None:  # k and c do not show
         cars["after"] = design.with_design(outcome.result.x)
+        keep = design.keep
+        bounds = {} if keep is None else {name: (keep.travel, b.lower, b.upper) for name, b in keep.bands.items()}
+        fig = plotting.suspension_curves(outcome.curves, bounds, title=design.car.name)
+        plotting.save(fig, out / "curves.png")
     # Preloads do not show either; with any free length they are not computed.
     models = {name: car.model(wheel=design.wheel, free_length=1.0, free_radius=1.0) for name, car in cars.items()}
     plotting.save(plotting.mechanism(models, title=design.car.name), out / "mechanism.png")

@@ -67,8 +67,13 @@ def document(outcome: Any, settings: dict[str, Any], tolerance: float) -> dict[s
             "after": result.objective,
             "reduction": 1 - result.objective / float(before.objective),
         },
-        "constraints": constraints(outcome, tolerance),
+        "constraints": constraints(outcome, tolerance) + kept_curves(outcome, tolerance),
         "constraint_tolerance": tolerance,
+        "curves": outcome.curves
+        and {
+            label: {member: np.asarray(values).tolist() for member, values in curves._asdict().items()}
+            for label, curves in outcome.curves.items()
+        },
         "feasible": result.feasible,
         "gradient_check": {
             where: {
@@ -111,6 +116,29 @@ def constraints(outcome: Any, tolerance: float) -> list[dict[str, Any]]:
     return rows
 
 
+def kept_curves(outcome: Any, tolerance: float) -> list[dict[str, Any]]:
+    """How far each curve that is kept strays from its band's middle, before and after, at worst."""
+    keep, rows = outcome.design.keep, []
+    if keep is None:
+        return rows
+    cars = {"before": outcome.design.car, "after": outcome.design.with_design(outcome.result.x)}
+    curves = {label: keep.curves(car) for label, car in cars.items()}
+    for name, band in keep.bands.items():
+        middle, half = np.asarray(band.lower + band.upper) / 2, np.asarray(band.upper - band.lower) / 2
+        row = {"name": f"change of {name}", "unit": "rad", "limit": float(half[0])}
+        for label, found in curves.items():
+            change = np.asarray(getattr(found, name)) - middle
+            worst = int(np.argmax(np.abs(change) / half))
+            row[label] = {
+                "worst_value": float(change[worst]),
+                "travel": float(keep.travel[worst]),
+                "violation_over_scale": float(np.abs(change[worst]) / half[worst] - 1),
+            }
+        row["active"] = abs(row["after"]["violation_over_scale"]) <= tolerance
+        rows.append(row)
+    return rows
+
+
 def _values(design: Any, name: str, value: Any) -> Any:
     if name != "hardpoints":
         return float(value)
@@ -143,8 +171,9 @@ def table(outcome: Any, tolerance: float) -> str:
                 line(f"{link} {axis} [mm]", 1e3 * a, 1e3 * b, f"+-{box:.0f} mm{at_bound}", 1)
     reduction = 100 * (1 - result.objective / float(outcome.before.objective))
     line("Psi_0 [m^2/s^3]", float(outcome.before.objective), result.objective, f"{-reduction:+.1f} %", 4)
-    for row in constraints(outcome, tolerance):
-        factor, unit = (1e3, "mm") if row["unit"] == "m" else (1.0, row["unit"])
+    shown = {"m": (1e3, "mm"), "rad": (np.degrees(1.0), "deg")}
+    for row in constraints(outcome, tolerance) + kept_curves(outcome, tolerance):
+        factor, unit = shown.get(row["unit"], (1.0, row["unit"]))
         violation = row["after"]["violation_over_scale"]
         state = "active" if row["active"] else "satisfied" if violation <= tolerance else "VIOLATED"
         line(
@@ -154,6 +183,14 @@ def table(outcome: Any, tolerance: float) -> str:
             f"{factor * row['limit']:g}, {state} ({violation:+.1e} of scale)",
             2,
         )
+    curves = outcome.curves or {}
+    for name in ("camber", "toe") if curves else ():
+        if design.keep is None or name not in design.keep.bands:
+            before, after = (np.degrees(getattr(curves[label], name)) for label in ("before", "after"))
+            travel = 1e3 * float(curves["before"].travel[-1])
+            change = after - before
+            note = f"free, at worst over +-{travel:.0f} mm of travel"
+            line(f"change of {name} [deg]", 0.0, change[np.argmax(np.abs(change))], note, 2)
     lines.append("-" * 92)
     errors = {where: float(np.max(check.error)) for where, check in outcome.checks.items()}
     lines.append(

@@ -57,6 +57,14 @@ def describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> st
             f"residual {details['residual']:.3g}. "
             "`throw=False` returns the data up to the step before."
         )
+    if code is RESULTS.position_failed:
+        violation = np.abs(details["violation"])
+        worst = int(np.argmax(np.where(np.isfinite(violation), violation, np.inf)))
+        return (
+            f"{code.message} It failed at position {int(details['position'])}, driven values "
+            f"{np.array2string(details['values'], precision=6)}. Left over: |Φ| = {violation[worst]:.3g}, largest in "
+            f"joint {names[worst]!r}."
+        )
     if code is RESULTS.integration_failed:
         return (
             f"{code.message} It failed in interval {int(details['step'])} of {int(details['num_steps'])}, from "
@@ -66,7 +74,7 @@ def describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> st
 
 
 def _exception(result: int, details: dict[str, Any], names: tuple[str, ...], note: str) -> Exception:
-    bad_input = (RESULTS.assembly_failed, RESULTS.redundant_constraints)
+    bad_input = (RESULTS.assembly_failed, RESULTS.redundant_constraints, RESULTS.position_failed)
     kind = ValueError if result in bad_input else SimulationError
     if result != RESULTS.redundant_constraints:
         note = ""

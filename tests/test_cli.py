@@ -102,6 +102,8 @@ def test_every_choice_of_parameters_at_full_resolution(parameters, tmp_path, cap
         moves = [b - a for link in points["after"] for a, b in zip(points["before"][link], points["after"][link])]
         assert len(moves) == 15
         assert max(map(abs, moves)) == pytest.approx(0.030, rel=1e-9)
+    freed = parameters != "k,c"
+    assert ("change of toe [deg]" in text) == (out / "curves.png").exists() == (result["curves"] is not None) == freed
     for check in result["gradient_check"].values():
         assert max(check["relative_error"]) < 1e-5  # round-off of Ψ₀ over the step, 1e-12/3e-5 at h = 2e-3, times 10
 

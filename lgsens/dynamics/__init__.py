@@ -15,6 +15,12 @@ from lgsens.dynamics._initial import (
     is_redundant as is_redundant,
     split_velocity as split_velocity,
 )
+from lgsens.dynamics._kinematics import (
+    AbstractDrive as AbstractDrive,
+    Positions as Positions,
+    forces_of_motion as forces_of_motion,
+    positions as positions,
+)
 from lgsens.dynamics._matrices import (
     constraint_jacobian as constraint_jacobian,
     factor_size as factor_size,

@@ -12,6 +12,7 @@ class RESULTS(IntEnum):
     newton_failed = 3
     equilibrium_failed = 4
     integration_failed = 5
+    position_failed = 6
 
     @property
     def message(self) -> str:
@@ -41,5 +42,10 @@ _MESSAGES = {
     RESULTS.integration_failed: (
         "The explicit integration left the finite numbers, or took more than `max_steps` steps in an output interval. "
         "Try more `num_steps`, a looser `rtol`, more `max_steps`, or, for stiff forces, GeneralizedAlpha."
+    ),
+    RESULTS.position_failed: (
+        "No position satisfies the joints for these values of the driven ones: they are out of reach, or the mechanism "
+        "passes a dead centre, where the driven values do not determine it. Ask for values within reach, drive another "
+        "coordinate, or come there in smaller steps."
     ),
 }

@@ -1,9 +1,6 @@
 """The quarter-car of the paper's §9 with a real five-link rear suspension."""
 
-import math
-import tomllib
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +8,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float, require
+from lgsens._kinematics import Kinematics, kinematics
+from lgsens._validate import require
+from lgsens.examples._hardpoint_file import Reader, read
 from lgsens.examples._point_masses import with_point_masses
+from lgsens.examples._suspension_curves import SuspensionCurves, suspension_curves
 from lgsens.model import (
     ALL_FREE,
     BumpRoad,
@@ -25,6 +25,7 @@ from lgsens.model import (
     RigidBody,
     SphericalJoint,
     SpringDamper,
+    TranslationDriver,
     TyreSpring,
     UniversalJoint,
     static_preload,
@@ -92,7 +93,7 @@ class QuarterCar(eqx.Module):
         `ValueError` naming the file and the key (or the line) for a file that cannot be read or is
         incomplete.
         """
-        return _parse(*_read(path))
+        return _parse(*read(path))
 
     def model(
         self,
@@ -195,6 +196,43 @@ class QuarterCar(eqx.Module):
         )
         return model
 
+    def travel(self, travel, *, links: str = "rods", throw: bool = True) -> Kinematics:
+        """The suspension on a rig: the chassis held, the wheel locked, its centre moved up and down at rate 1.
+
+        Arguments:
+            travel: vertical displacements of the wheel centre [m], positive in bump, shape (n,), in an order in which
+                each is near the one before.
+            links: as in `model`; the motion is the same.
+            throw: as in `lgsens.kinematics`.
+
+        Velocities and rates are derivatives by the travel. The forces are not those of the car: its spring has no
+        preload here. Raises `ValueError` for travel that the links do not allow.
+        """
+        # Lengths that are given need no preload to be found.
+        scene = self.model(wheel="locked", chassis="heave", links=links, free_length=1.0, free_radius=1.0)
+        along_z = jnp.asarray([0.0, 0.0, 1.0], self.bearing.dtype)
+        rig = Model(
+            scene.bodies | {"chassis": _body(self.chassis, free=())},
+            scene.joints | {"travel": TranslationDriver(None, "wheel", at=self.wheel.centre, axis=along_z)},
+            scene.forces,
+        )
+        return kinematics(rig, {"travel": travel}, throw=throw)
+
+    def curves(self, travel, *, axle: str = "rear", throw: bool = True) -> SuspensionCurves:
+        """Camber, toe, track, wheelbase, motion ratios and roll centre over the travel of the wheel.
+
+        Arguments:
+            travel: as in `travel`.
+            axle: "rear" or "front", for the sign of the wheelbase.
+            throw: as in `lgsens.kinematics`.
+
+        `SuspensionCurves` says what they are and their signs (ISO 8855); the wheel is upright and straight at the
+        design position. Differentiable by every number of the suspension, exactly. Raises `ValueError` for another
+        axle and as `travel`.
+        """
+        _check_choice("axle", axle, ("rear", "front"))
+        return suspension_curves(self.travel(travel, throw=throw), self.wheel.centre, rear=axle == "rear")
+
 
 def _check_choice(name: str, value: str, known: tuple[str, str]) -> None:
     if value not in known:
@@ -219,94 +257,8 @@ def _bar(link: Link, radius) -> RigidBody:
     return RigidBody(mass=link.mass, inertia=inertia, position=(link.knuckle + link.chassis) / 2)
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-class _Reader:
-    """Reads keys of a TOML document, and says which one is missing or wrong."""
-
-    def __init__(self, table: dict, path: str, keys: tuple[str, ...] = ()):
-        self._table, self._path, self._keys = table, path, keys
-
-    def _fail(self, key: str, why: str) -> ValueError:
-        return ValueError(f"Hardpoint file {self._path!r}, key {'.'.join((*self._keys, key))!r}: {why}")
-
-    def _get(self, key: str) -> Any:
-        if key not in self._table:
-            raise self._fail(key, "is missing; see lgsens/examples/data/five_link_suspension.toml for the format.")
-        return self._table[key]
-
-    def table(self, key: str) -> "_Reader":
-        value = self._get(key)
-        if not isinstance(value, dict):
-            raise self._fail(key, f"must be a table, got {value!r}.")
-        return _Reader(value, self._path, (*self._keys, key))
-
-    def names(self) -> list[str]:
-        return list(self._table)
-
-    def number(self, key: str, scale: float = 1.0, positive: bool = True) -> Array:
-        value = self._get(key)
-        if not _is_number(value):
-            raise self._fail(key, f"must be a finite number, got {value!r}.")
-        if positive and not value > 0:
-            raise self._fail(key, f"must be positive, got {value!r}.")
-        return as_float(value * scale, (), key)
-
-    def vector(self, key: str, scale: float = 1.0) -> Array:
-        value = self._get(key)
-        if not isinstance(value, list) or len(value) != 3 or not all(map(_is_number, value)):
-            raise self._fail(key, f"must be three numbers [x, y, z], got {value!r}.")
-        return as_float([x * scale for x in value], (3,), key)
-
-    def segment(self, first: str, second: str, scale: float) -> tuple[Array, Array]:
-        """Two points that differ."""
-        if self.vector(first).tolist() == self.vector(second).tolist():
-            raise self._fail(second, f"must differ from {first!r}; the two points coincide.")
-        return self.vector(first, scale), self.vector(second, scale)
-
-    def moments(self, key: str) -> Array:
-        """Principal moments of inertia that a body can have."""
-        value = self.vector(key)
-        try:
-            RigidBody(mass=1.0, inertia=value)
-        except ValueError as error:
-            raise self._fail(key, str(error)) from error
-        return value
-
-    def interval(self, key: str) -> tuple[Array, Array]:
-        value = self._get(key)
-        is_pair = isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))
-        if not is_pair or not 0 < value[0] < value[1]:
-            raise self._fail(key, f"must be two numbers [lower, upper] with 0 < lower < upper, got {value!r}.")
-        return as_float(value[0], (), key), as_float(value[1], (), key)
-
-    def choice(self, key: str, known) -> str:
-        value = self._get(key)
-        if value not in list(known):  # a list, for a value that has no hash
-            raise self._fail(key, f"must be one of {sorted(known)}, got {value!r}.")
-        return value
-
-
-def _read(path: str | Path | None) -> tuple[dict, str]:
-    """The TOML document and the name by which messages call it; None: the file that ships with lgsens."""
-    if path is None:
-        source = resources.files("lgsens.examples") / "data" / "five_link_suspension.toml"
-        text, path = source.read_text(encoding="utf-8"), source.name
-    else:
-        try:
-            text = Path(path).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise ValueError(f"Hardpoint file {str(path)!r} cannot be read: {error}.") from error
-    try:
-        return tomllib.loads(text), str(path)
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"Hardpoint file {str(path)!r} is not valid TOML: {error}.") from error
-
-
 def _parse(document: dict, path: str) -> QuarterCar:
-    root = _Reader(document, path)
+    root = Reader(document, path)
     units = root.table("units")
     metre, kilogram = float(units.number("length")), float(units.number("mass"))
     table = root.table("links")

@@ -11,7 +11,9 @@ from lgsens._simulate import simulate
 from lgsens._trajectory import Trajectory
 from lgsens._validate import suggestion
 from lgsens.criteria import time_integral
-from lgsens.examples._quarter_car import GRAVITY, QuarterCar, _read, _Reader
+from lgsens.examples._curve_bounds import CurveBounds
+from lgsens.examples._hardpoint_file import Reader, read
+from lgsens.examples._quarter_car import GRAVITY, QuarterCar
 
 # What the user may ask for, and the members of the design that it frees.
 PARAMETERS = {
@@ -45,8 +47,8 @@ class DesignLimits(eqx.Module):
         Raises `ValueError` naming the file and the key for a table that is missing, incomplete or
         contradictory.
         """
-        document, name = _read(path)
-        table = _Reader(document, name).table("design")
+        document, name = read(path)
+        table = Reader(document, name).table("design")
         shortest, longest = table.number("minimum_spring_length"), table.number("maximum_spring_length")
         if not shortest < longest:
             raise ValueError(
@@ -91,10 +93,10 @@ class SuspensionDesign(eqx.Module):
         Ψ₂(t) = l_min − l(t) ≤ 0   over l_max − l_min          (49)
         Ψ₃(t) = l(t) − l_max ≤ 0   over l_max − l_min          (50)
 
-    at every time step. The design is a dict: `stiffness` k [N/m] and `damping` c [N s/m] of shape (),
-    `hardpoints` [m] of shape (5, 3), the chassis ends of the links in sorted order of their names, or all
-    three. Whatever the design, the preloads of spring and tyre are those that hold the car at rest at the
-    design position.
+    at every time step; and, with `keep`, camber and toe within bands over the travel of the wheel. The design is a
+    dict: `stiffness` k [N/m] and `damping` c [N s/m] of shape (), `hardpoints` [m] of shape (5, 3), the chassis ends of
+    the links in sorted order of their names, or all three. Whatever the design, the preloads of spring and tyre are
+    those that hold the car at rest at the design position.
 
     Arguments:
         car: the suspension to start from.
@@ -102,6 +104,7 @@ class SuspensionDesign(eqx.Module):
         parameters: a key of `PARAMETERS`.
         wheel: "hinged" or "locked".
         t1: duration [s]. num_steps: its number of steps, static.
+        keep: bands for the curves of the suspension, `CurveBounds`; None: the curves may change.
 
     The limits that ship with lgsens, and why:
       - the start (k = 109 kN/m, c = 4.9 kN s/m, as in the source) is a firm production set-up: motion ratios
@@ -127,6 +130,7 @@ class SuspensionDesign(eqx.Module):
     wheel: str = eqx.field(static=True, default="hinged")
     t1: float = eqx.field(static=True, default=2.0)
     num_steps: int = eqx.field(static=True, default=1000)
+    keep: CurveBounds | None = None
 
     def __check_init__(self):
         if self.parameters not in PARAMETERS:
@@ -138,7 +142,7 @@ class SuspensionDesign(eqx.Module):
 
         Arguments:
             path: the TOML file.
-            settings: `parameters`, `wheel`, `t1`, `num_steps` as above.
+            settings: `parameters`, `wheel`, `t1`, `num_steps`, `keep` as above.
 
         Raises `ValueError` naming the file and the key for a file that cannot be read, is incomplete, or
         starts outside its own bounds.
@@ -148,7 +152,7 @@ class SuspensionDesign(eqx.Module):
             lower, upper = map(float, getattr(limits, key))
             if not lower <= float(value) <= upper:
                 raise ValueError(
-                    f"Hardpoint file {_read(path)[1]!r}, key 'design.{key}': the start, {float(value)}, lies "
+                    f"Hardpoint file {read(path)[1]!r}, key 'design.{key}': the start, {float(value)}, lies "
                     f"outside [{lower}, {upper}]."
                 )
         return SuspensionDesign(car, limits, **settings)
@@ -224,10 +228,15 @@ class SuspensionDesign(eqx.Module):
             jnp.stack(constraints, axis=1),
         )
 
-    def __call__(self, design: dict[str, Array]) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
-        """Ψ₀ [m²/s³] and the scaled path constraints, as `lgsens.optimize.minimize` wants them.
+    def __call__(self, design: dict[str, Array]) -> tuple[Float[Array, ""], Float[Array, " m"]]:
+        """Ψ₀ [m²/s³] and the scaled constraints in a row, those of the path and of the curves.
 
-        A step that does not converge makes them NaN from there on, which `minimize` steps back from.
+        As `lgsens.optimize.minimize` wants them: a step that does not converge makes them NaN from there on, which
+        `minimize` steps back from.
         """
         response = self.response(self.simulate(design, throw=False))
-        return response.objective, response.constraints
+        constraints = response.constraints.ravel()
+        if self.keep is not None:
+            kept = self.keep.constraints(self.keep.curves(self.with_design(design)))
+            constraints = jnp.concatenate([constraints, kept])
+        return response.objective, constraints

@@ -9,6 +9,12 @@ from lgsens.model._constraints import (
     InPlane as InPlane,
     Orthogonality as Orthogonality,
 )
+from lgsens.model._drivers import (
+    Angle as Angle,
+    Displacement as Displacement,
+    RotationDriver as RotationDriver,
+    TranslationDriver as TranslationDriver,
+)
 from lgsens.model._forces import (
     AbstractForce as AbstractForce,
     AppliedForce as AppliedForce,

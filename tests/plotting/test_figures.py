@@ -3,14 +3,16 @@
 import sys
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from scipy.spatial.transform import Rotation
 
 import lgsens as lg
 from lgsens import plotting
-from lgsens.examples import QuarterCar
+from lgsens.examples import QuarterCar, SuspensionCurves, spinning_top
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -140,6 +142,102 @@ def test_a_mechanism_in_a_plane_or_with_one_body_is_drawn():
     FigureCanvasAgg(fig).draw()
     (polygon, _) = fig.axes[0].collections[:2]
     assert polygon.get_facecolor().shape[0] == 1  # the hull of a plane would fail
+
+
+def test_work_precision():
+    """The price of the target lies on a line in the logarithms between the settings around it."""
+    second = plotting.WorkPrecision([4.0, 1.0, 2.0], [1e-4, 1.6e-3, 4e-4])  # error 1.6e-3/cost², not in order
+    slow = plotting.WorkPrecision([3.0, 6.0], [1e-2, 5e-3])
+    fig = plotting.work_precision({"second": second, "slow": slow}, target=1e-3, cost="time [s]", error="error [m]")
+    (axes,) = fig.axes
+    assert (axes.get_xscale(), axes.get_yscale(), axes.get_xlabel(), axes.get_ylabel()) == (
+        "log",
+        "log",
+        "time [s]",
+        "error [m]",
+    )
+    np.testing.assert_array_equal(axes.lines[0].get_data(), ([1.0, 2.0, 4.0], [1.6e-3, 4e-4, 1e-4]))
+    np.testing.assert_array_equal(axes.lines[2].get_ydata(), [1e-3, 1e-3])
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert labels == [f"second: {np.sqrt(1.6):.3g} s", "slow: not reached"]
+    assert second.cost_of(1e-3) == pytest.approx(np.sqrt(1.6), rel=1e-12)
+    assert second.cost_of(0.1) == 1.0  # the cheapest setting is better already
+    assert slow.cost_of(1e-3) is None
+    assert plotting.WorkPrecision([1.0, 2.0], [1.0, 0.0]).cost_of(0.5) == 2.0  # no logarithm of an error of 0
+    assert len(plotting.work_precision({"second": second}).axes[0].lines) == 1
+    with pytest.raises(ValueError, match=r"`target` must be positive, got -1.0"):
+        plotting.work_precision({"second": second}, target=-1.0)
+    with pytest.raises(ValueError, match=r"`methods\['free'\]`: costs must be positive"):
+        plotting.work_precision({"free": plotting.WorkPrecision([0.0], [1.0])})
+
+
+def test_sensitivities_along_a_trajectory():
+    """w, v′ and λ′ of the top against differences of two simulations: w is the rotation from one to the other."""
+
+    def motion(alpha):
+        return lg.simulate(spinning_top(alpha), t1=0.3, num_steps=30)
+
+    alpha, h = jnp.asarray(0.7), 1e-5
+    trajectory, derivative = jax.jvp(motion, (alpha,), (jnp.ones(()),))
+    ahead, behind = motion(alpha + h), motion(alpha - h)
+    fig = plotting.sensitivities(trajectory, derivative, "α₀ [rad]")
+    titles = [axes.get_title() for axes in fig.axes]
+    assert titles == [
+        "top: w, translation",
+        "top: w, rotation",
+        "top: v′, translation",
+        "top: v′, rotation",
+        "pivot: λ′",
+    ]
+    assert [axes.get_ylabel() for axes in fig.axes[:4]] == ["m per rad", "rad per rad", "m/s per rad", "rad/s per rad"]
+    drawn = [np.stack([line.get_ydata() for line in axes.lines], axis=1) for axes in fig.axes]
+    first, second = (m.body("top") for m in (behind, ahead))
+    relative = np.einsum("nji,njk->nik", first.orientation, second.orientation)
+    turn = Rotation.from_matrix(relative).as_rotvec() / (2 * h)
+    # at the middle the body has turned half of it: R(α) = R(α − h) exp(h w), so w is the same to h²
+    for found, expected in (
+        (drawn[0], (second.position - first.position) / (2 * h)),
+        (drawn[1], turn),
+        (drawn[2], (second.velocity - first.velocity) / (2 * h)),
+        (drawn[3], (second.angular_velocity - first.angular_velocity) / (2 * h)),
+        (drawn[4], (ahead.multiplier("pivot") - behind.multiplier("pivot")) / (2 * h)),
+    ):
+        # h²/6 of the third derivative and round-off over h, that of positions over h² of the scheme in λ: 1e-11/1e-5
+        np.testing.assert_allclose(found, expected, rtol=0, atol=3e-6 * max(1.0, np.abs(expected).max()))
+    only = plotting.sensitivities(trajectory, derivative.states, bodies=[], joints=["pivot"])
+    assert [axes.get_title() for axes in only.axes] == ["pivot: λ′"]
+    assert only.axes[0].get_xlabel() == "time [s]"
+    with pytest.raises(ValueError, match="`bodies`: 'topp' is not one of"):
+        plotting.sensitivities(trajectory, derivative, bodies=["topp"])
+    with pytest.raises(ValueError, match="are empty; name something to draw"):
+        plotting.sensitivities(trajectory, derivative, bodies=[], joints=[])
+
+
+def test_suspension_curves():
+    travel = np.linspace(-0.05, 0.05, 11)
+    values = lambda factor: SuspensionCurves(travel, *(factor * i * travel for i in range(1, 9)))
+    band = (travel[::5], np.full(3, -0.01), np.full(3, 0.02))
+    fig = plotting.suspension_curves({"before": values(1.0), "after": values(2.0)}, {"camber": band}, title="mine")
+    assert [axes.get_title() for axes in fig.axes] == [
+        "camber",
+        "toe",
+        "track",
+        "wheelbase",
+        "motion ratio",
+        "roll centre",
+    ]
+    members = ("camber", "toe", "track_change", "wheelbase_change", "spring_motion_ratio", "roll_centre_height")
+    factors = (180 / np.pi, 180 / np.pi, 1e3, 1e3, 1.0, 1e3)
+    for axes, member, factor in zip(fig.axes, members, factors):
+        for line, curves in zip(axes.lines, (values(1.0), values(2.0))):
+            np.testing.assert_allclose(line.get_xdata(), 1e3 * travel, rtol=1e-14)
+            np.testing.assert_allclose(line.get_ydata(), factor * getattr(curves, member), rtol=1e-14)
+    lower, upper = fig.axes[0].lines[2:4]
+    np.testing.assert_allclose(lower.get_ydata(), -0.01 * 180 / np.pi, rtol=1e-14)
+    np.testing.assert_allclose(upper.get_data(), (1e3 * band[0], 180 / np.pi * band[2]), rtol=1e-14)
+    assert [text.get_text() for text in fig.axes[0].get_legend().get_texts()] == ["before", "after"]
+    with pytest.raises(ValueError, match="`bounds`: 'cambre' is not one of"):
+        plotting.suspension_curves({"a": values(1.0)}, {"cambre": band})
 
 
 def test_a_missing_matplotlib_says_what_to_install(monkeypatch):

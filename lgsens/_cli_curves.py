@@ -1,0 +1,61 @@
+"""`lgsens curves quarter-car`: what a suspension does with its wheel as it travels, drawn, listed and animated."""
+
+import argparse
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from lgsens import plotting
+from lgsens._cli_report import output_folder
+from lgsens.examples import QuarterCar, SuspensionCurves
+
+# Heading, member of SuspensionCurves, factor to the unit shown, decimals.
+COLUMNS = (
+    ("travel [mm]", "travel", 1e3, 1),
+    ("camber [deg]", "camber", np.degrees(1.0), 4),
+    ("toe [deg]", "toe", np.degrees(1.0), 4),
+    ("track [mm]", "track_change", 1e3, 3),
+    ("wheelbase [mm]", "wheelbase_change", 1e3, 3),
+    ("spring ratio", "spring_motion_ratio", 1.0, 4),
+    ("damper ratio", "damper_motion_ratio", 1.0, 4),
+    ("roll centre [mm]", "roll_centre_height", 1e3, 2),
+)
+SHOWN = 9  # rows of the table on the screen
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write `curves.png`, `curves.csv` and `travel.html`, and print a table."""
+    if arguments.points < 2:
+        raise ValueError(f"argument --points: must be at least 2, got {arguments.points}")
+    with output_folder(arguments.out, arguments.overwrite) as out:
+        plotting.figure()  # asks for matplotlib now
+        car = QuarterCar.load(arguments.hardpoints)
+        travel = np.linspace(-arguments.travel, arguments.travel, arguments.points)
+        curves = car.curves(travel, axle=arguments.axle)
+        write_table(curves, out / "curves.csv")
+        plotting.save(plotting.suspension_curves({car.name: curves}, title=car.name), out / "curves.png")
+        plotting.animate(car.travel(travel, links="bodies"), out / "travel.html", title=car.name)
+        if not arguments.quiet:
+            print(table(curves))
+            print(f"\nwritten to {out}: {', '.join(sorted(path.name for path in out.iterdir()))}")
+    return 0
+
+
+def write_table(curves: SuspensionCurves, path: Path) -> None:
+    """Every member of the curves as a column of a CSV file, SI units, all digits."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(curves._fields)
+        writer.writerows(np.stack([np.asarray(column) for column in curves], axis=1).tolist())
+
+
+def table(curves: SuspensionCurves) -> str:
+    """A few rows of the curves, ISO 8855 signs."""
+    n = len(curves.travel)
+    chosen = np.unique(np.linspace(0, n - 1, min(n, SHOWN)).round().astype(int))
+    lines = ["".join(f"{heading:>17}" for heading, *_ in COLUMNS)]
+    for i in chosen:
+        cells = [f"{factor * float(getattr(curves, member)[i]):>17.{d}f}" for _, member, factor, d in COLUMNS]
+        lines.append("".join(cells))
+    return "\n".join(lines)

@@ -1,0 +1,136 @@
+"""Kinematic analysis: the positions, velocities and accelerations that constraints alone determine, and their forces.
+
+A driven mechanism has as many equations as coordinates, Φ(q, s; p) = 0 with the driven values s and the numbers p of
+the system. Where A = B(q) is regular, it has one solution q(s; p) nearby (Haug 1989, §3.6).
+
+Position. Newton's iteration on the group, q ← q exp(−(A⁻¹Φ)~), from one value of s to the next.
+
+Derivatives of the position. Let δq = q w̃. By the chain rule, with DΦ·(q w̃) = A w,
+
+    0 = δΦ = A w + Φ_s δs + Φ_p δp     ⟹     w = −A⁻¹ (Φ_s δs + Φ_p δp).
+
+One factorization of A at the solution gives w for every δs and δp: in forward mode one right-hand side per
+parameter, in reverse mode, by the transposed factors, μ = A⁻ᵀ q̄ and p̄ = −Φ_pᵀ μ, one per output. Φ_s δs + Φ_p δp is the
+tangent of Φ at fixed q: nothing is differentiated along the iteration, nor by where it started.
+
+Velocity and acceleration. With s moving at constant rates ṡ, two derivatives of Φ(q(s), s) = 0 along the motion
+(q ṽ, ṡ) are
+
+    A v + Φ_s ṡ = 0,     A v̇ + Γ = 0,     Γ = d/dt (DΦ·(q ṽ) + Φ_s ṡ) at fixed v.
+
+Forces. Inverse dynamics: r(q, v, v̇, λ, t) = r(q, v, v̇, 0, t) + Aᵀλ = 0 determines λ, as A is square.
+"""
+
+import abc
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from lgsens.dynamics._state import State
+from lgsens.dynamics._system import AbstractSystem
+
+_MAX_ITERATIONS = 40
+
+
+class AbstractDrive(eqx.Module):
+    """A system some of whose constraints prescribe d numbers s, so that it has as many constraints as coordinates."""
+
+    system: eqx.AbstractVar[AbstractSystem]
+
+    @abc.abstractmethod
+    def at(self, values: Float[Array, " d"]) -> AbstractSystem:
+        """The system with these values of s."""
+
+
+class Positions(NamedTuple):
+    """The configurations for n sets of values."""
+
+    q: Any  # stacked along a leading axis n
+    found: Bool[Array, " n"]  # whether Newton's iteration converged
+    violation: Float[Array, "n k"]  # Φ there
+
+
+def _newton(drive: AbstractDrive, q, values):
+    """The configuration for some values, from another one, and the size of the step before the last."""
+    system = drive.at(values)
+    scale = drive.system.coordinate_scale()
+
+    def step(q):
+        return jnp.linalg.solve(system.constraint_jacobian(q), system.constraint(q))
+
+    def body(carry):
+        q, _, iteration = carry
+        x = step(q)
+        # Far from the solution a full step may leave the branch: at most 0.2 rad or a fifth of the scene at a time.
+        size = jnp.max(jnp.abs(x) / scale)
+        return system.group.retract(q, -x * jnp.minimum(1.0, 0.2 / jnp.maximum(size, 0.2))), size, iteration + 1
+
+    def unfinished(carry):
+        _, size, iteration = carry
+        return ~_small(size) & (iteration < _MAX_ITERATIONS)  # a NaN goes on to the end, and costs nothing else
+
+    q, size, _ = lax.while_loop(unfinished, body, (q, jnp.full((), jnp.inf, scale.dtype), jnp.zeros((), jnp.int32)))
+    # Newton is quadratic: one step from √eps is at round-off.
+    return system.group.retract(q, -step(q)), size
+
+
+def _small(size):
+    return size <= jnp.sqrt(jnp.finfo(size.dtype).eps)
+
+
+@jax.custom_jvp
+def _configurations(drive: AbstractDrive, values: Float[Array, "n d"]):
+    """q(s) for each row of `values`, found one from the other, the first from the reference; and Newton's step."""
+
+    def follow(start, row):
+        q, size = _newton(drive, start, row)
+        return jax.tree.map(lambda new, old: jnp.where(_small(size), new, old), q, start), (q, size)
+
+    return lax.scan(follow, drive.system.reference()[0], values)[1]
+
+
+@_configurations.defjvp
+def _configurations_jvp(primals, tangents):
+    (drive, values), (drive_dot, values_dot) = primals, tangents
+    q, size = _configurations(drive, values)
+
+    def tangent(q, row, row_dot):
+        _, violation_dot = jax.jvp(lambda d, s: d.at(s).constraint(q), (drive, row), (drive_dot, row_dot))
+        w = -jnp.linalg.solve(drive.at(row).constraint_jacobian(q), violation_dot)
+        return drive.system.group.to_ambient(q, w)
+
+    return (q, size), (jax.vmap(tangent)(q, values, values_dot), jnp.zeros_like(size))
+
+
+def positions(drive: AbstractDrive, values: Float[Array, "n d"]) -> Positions:
+    """The configurations for each row of driven values, differentiable by the rule above; NaN where none was found."""
+    q, size = _configurations(drive, values)
+    violation = jax.vmap(lambda q, s: drive.at(s).constraint(q))(q, values)
+    length = jnp.maximum(jnp.max(drive.system.coordinate_scale()), 1.0)
+    satisfied = jnp.max(jnp.abs(violation), axis=1) <= 1e3 * jnp.finfo(size.dtype).eps * length  # NaN is not
+    found = _small(size) & satisfied
+    poison = lambda leaf: jnp.where(found.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.nan)
+    return Positions(jax.tree.map(poison, q), found, violation)
+
+
+def forces_of_motion(drive: AbstractDrive, q, values: Float[Array, " d"], rates: Float[Array, " d"], t) -> State:
+    """v, v̇ and λ of the motion through q with constant rates of the driven values; a = v̇."""
+    system, group = drive.at(values), drive.system.group
+    jacobian = system.constraint_jacobian(q)
+    at = lambda q, s: drive.at(s).constraint(q)
+    _, along = jax.jvp(lambda s: at(q, s), (values,), (rates,))
+    v = -jnp.linalg.solve(jacobian, along)
+
+    direction = (group.to_ambient(q, v), rates)
+
+    def rate(q, s):
+        return jax.jvp(at, (q, s), (group.to_ambient(q, v), rates))[1]
+
+    _, change = jax.jvp(rate, (q, values), direction)
+    vdot = -jnp.linalg.solve(jacobian, change)
+    lam = -jnp.linalg.solve(jacobian.T, system.residual(q, v, vdot, jnp.zeros_like(v), t))
+    return State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)

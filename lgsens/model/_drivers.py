@@ -1,0 +1,125 @@
+"""Drivers: joints that prescribe a displacement or an angle. Reference: Haug (1989), §3.5 and §9.6."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens._validate import axis_field, number_field, point_field
+from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint, InPlane
+from lgsens.model._frames import Frame
+from lgsens.model._joints import AbstractJoint, _normals
+
+
+class Displacement(AbstractClosedFormConstraint):
+    """The line between two points has a prescribed component along an axis of a: Φ = α·d − s; λ is a force [N].
+
+    But for the constant s it is `InPlane`, and so are its tangents.
+    """
+
+    line: InPlane
+    prescribed: Float[Array, ""]
+
+    @property
+    def num_rows(self):
+        return 1
+
+    def value(self, a, b):
+        return self.line.value(a, b) - self.prescribed
+
+    def jacobian(self, a, b):
+        return self.line.jacobian(a, b)
+
+    def force(self, a, b, lam):
+        return self.line.force(a, b, lam)
+
+    def geometric_stiffness(self, a, b, lam):
+        return self.line.geometric_stiffness(a, b, lam)
+
+
+class Angle(AbstractConstraint):
+    """b has turned by a prescribed angle s about an axis of a; λ is a moment [N m].
+
+    With x, y fixed in a, normal to the axis, and β in b, which coincided with x before the turn:
+
+        Φ = atan2(β·(−x sin s + y cos s), β·(x cos s + y sin s)),
+
+    the angle from the prescribed direction to β. It is smooth but for a misalignment of π, so that s may grow beyond a
+    turn, and ∂Φ/∂s = −1.
+    """
+
+    first_a: Float[Array, "3"]
+    second_a: Float[Array, "3"]
+    first_b: Float[Array, "3"]
+    prescribed: Float[Array, ""]
+
+    @property
+    def num_rows(self):
+        return 1
+
+    def value(self, a, b):
+        beta = a.local_axis(b.axis(self.first_b))
+        x, y = jnp.sum(beta * self.first_a), jnp.sum(beta * self.second_a)
+        sine, cosine = jnp.sin(self.prescribed), jnp.cos(self.prescribed)
+        return jnp.arctan2(y * cosine - x * sine, x * cosine + y * sine)[None]
+
+
+class TranslationDriver(AbstractJoint):
+    """A prescribed displacement of a point of `b` along an axis of `a`; 1 equation.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at: the point in the reference configuration [m], inertial frame, shape (3,).
+        axis: direction of the displacement, fixed in `a`, inertial frame, shape (3,), any length > 0.
+        value: the displacement from the reference configuration [m], shape (); None: 0. With a value the mechanism
+            is assembled before it moves. `lgsens.kinematics` prescribes many.
+
+    The multiplier is the force of `b` on `a` along the axis [N]: its negative drives `b`. Raises `ValueError` for a
+    wrong shape or a zero axis. Source: Haug (1989), §9.6.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at: Float[Array, "3"] = point_field("at")
+    axis: Float[Array, "3"] = axis_field("axis")
+    value: Float[Array, ""] | None = number_field("value", default=None)
+
+    @property
+    def assembled(self):
+        return self.value is None
+
+    def constraints(self, a: Frame, b: Frame):
+        unit = self.axis / jnp.linalg.norm(self.axis)
+        line = InPlane(a.local_point(self.at), b.local_point(self.at), a.local_axis(unit))
+        return (Displacement(line, _or_zero(self.value, unit.dtype)),)
+
+
+class RotationDriver(AbstractJoint):
+    """A prescribed angle by which `b` has turned about an axis of `a`, as a motor on a hinge; 1 equation.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground. Another joint keeps their axes aligned.
+        axis: direction of the axis, fixed in `a`, inertial frame, shape (3,), any length > 0.
+        value: the angle from the reference configuration [rad], right-handed, any number of turns, shape (); None: 0.
+            With a value the mechanism is assembled before it moves. `lgsens.kinematics` prescribes many.
+
+    The multiplier is the moment of `b` on `a` about the axis [N m]: its negative drives `b`. Raises `ValueError` for a
+    wrong shape or a zero axis. Source: Haug (1989), §9.6.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    axis: Float[Array, "3"] = axis_field("axis")
+    value: Float[Array, ""] | None = number_field("value", default=None)
+
+    @property
+    def assembled(self):
+        return self.value is None
+
+    def constraints(self, a: Frame, b: Frame):
+        _, first, second = _normals(self.axis)
+        axes = a.local_axis(first), a.local_axis(second), b.local_axis(first)
+        return (Angle(*axes, _or_zero(self.value, first.dtype)),)
+
+
+def _or_zero(value, dtype) -> Float[Array, ""]:
+    return jnp.zeros((), dtype) if value is None else value

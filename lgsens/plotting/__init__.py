@@ -1,0 +1,24 @@
+"""Figures and animations: time histories, convergence, errors, sensitivities, suspension curves, mechanisms in space.
+
+Figures are made without pyplot, so they need no display and leave no global state; in a notebook they show themselves,
+and `save` writes them. matplotlib is imported when the first figure is made.
+"""
+
+from lgsens.plotting._animate import animate as animate
+from lgsens.plotting._errors import (
+    ErrorPanel as ErrorPanel,
+    WorkPrecision as WorkPrecision,
+    errors as errors,
+    work_precision as work_precision,
+)
+from lgsens.plotting._histories import Panel as Panel, convergence as convergence, time_histories as time_histories
+from lgsens.plotting._mechanism import mechanism as mechanism
+from lgsens.plotting._sensitivities import sensitivities as sensitivities
+from lgsens.plotting._style import (
+    COLOURS as COLOURS,
+    CURVES as CURVES,
+    ROLES as ROLES,
+    figure as figure,
+    save as save,
+)
+from lgsens.plotting._suspension import suspension_curves as suspension_curves

@@ -1,0 +1,150 @@
+"""Errors against the step size or over time, and what a small error costs."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from lgsens.plotting._style import COLOURS, CURVES, LIMIT, figure, plain
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+class ErrorPanel(NamedTuple):
+    """Errors of several methods.
+
+    Attributes:
+        title: what the errors are of.
+        label: what the vertical axis shows, with its unit: "relative error [–]".
+        series: step sizes [s] and errors by the name of the method, each of shape (n,).
+        order: slope of the reference line; None: no line, and the horizontal axis is linear.
+        horizontal: label of the horizontal axis.
+    """
+
+    title: str
+    label: str
+    series: Mapping[str, tuple[Any, Any]]
+    order: int | None = 2
+    horizontal: str = "step size h [s]"
+
+
+def errors(panels: Sequence[ErrorPanel], title: str = "") -> "Figure":
+    """Errors on a logarithmic axis, panels side by side, four or more in two rows, with a line of the order's slope.
+
+    A name looks the same in every panel, and is in one legend below them.
+
+    Arguments:
+        panels: what to draw, at least one.
+        title: over the figure.
+
+    Raises `ImportError` without matplotlib.
+    """
+    rows = 1 if len(panels) < 4 else 2
+    columns = -(-len(panels) // rows)
+    fig = figure(1.6 + 4.6 * columns, 1.0 + 4.2 * rows)
+    all_axes = fig.subplots(rows, columns, squeeze=False).ravel()
+    for axes in all_axes[len(panels) :]:
+        axes.remove()
+    names = list(dict.fromkeys(name for panel in panels for name in panel.series))
+    handles: dict[str, Any] = {}
+    for axes, panel in zip(all_axes, panels):
+        for name, (x, error) in panel.series.items():
+            style = CURVES[names.index(name) % len(CURVES)]
+            (handles[name],) = axes.plot(np.asarray(x), np.asarray(error), label=name, **style)
+        axes.set_yscale("log")
+        plain(axes)
+        axes.set(title=panel.title, xlabel=panel.horizontal, ylabel=panel.label)
+        if panel.order is not None:
+            _slope(axes, panel, panel.order)
+    style = {"ncols": -(-len(names) // 2) if len(names) > 3 else len(names), "frameon": False, "handlelength": 3.5}
+    fig.legend(handles=list(handles.values()), loc="outside lower center", **style)
+    if title:
+        fig.suptitle(title)
+    return fig
+
+
+def _slope(axes: "Axes", panel: ErrorPanel, order: int) -> None:
+    """A line of this slope, below all curves where h is least, and the step sizes themselves along the axis."""
+    x = np.unique(np.concatenate([np.asarray(h) for h, _ in panel.series.values()]))
+    least = min(np.asarray(error)[np.argmin(h)] for h, error in panel.series.values())
+    ends, middle = x[[0, -1]], np.sqrt(x[0] * x[-1])
+    axes.plot(ends, 0.5 * least * (ends / x[0]) ** order, color=COLOURS[0], linewidth=1.2)
+    axes.text(middle, 0.4 * least * (middle / x[0]) ** order, f"slope {order}", va="top", color=COLOURS[0])
+    axes.set_xscale("log")
+    axes.set_xticks(x, [f"{h:.3g}" for h in x])
+    axes.minorticks_off()
+
+
+class WorkPrecision(NamedTuple):
+    """What a method costs at several settings, and how far off it is there.
+
+    Attributes:
+        cost: of a run, shape (n,); the axis names its unit.
+        error: of its result, shape (n,).
+    """
+
+    cost: Any
+    error: Any
+
+    def cost_of(self, target: float) -> float | None:
+        """What an error of `target` costs: between the two settings around it, along a line in the logarithms.
+
+        The first setting may be better already; None where no setting is as good.
+        """
+        cost, error = (np.asarray(array, float) for array in (self.cost, self.error))
+        order = np.argsort(cost)
+        cost, error = cost[order], error[order]
+        met = np.flatnonzero(error <= target)
+        if not len(met):
+            return None
+        if met[0] == 0:
+            return float(cost[0])
+        a, b = met[0] - 1, met[0]
+        if error[b] == 0:
+            return float(cost[b])
+        share = np.log(error[a] / target) / np.log(error[a] / error[b])
+        return float(cost[a] * (cost[b] / cost[a]) ** share)
+
+
+def work_precision(
+    methods: Mapping[str, WorkPrecision],
+    target: float | None = None,
+    *,
+    cost: str = "time [ms]",
+    error: str = "relative error [–]",
+    title: str = "",
+) -> "Figure":
+    """Error against cost, both logarithmic, one curve per method; a line at the error that is wanted.
+
+    Arguments:
+        methods: costs and errors by name.
+        target: the error that is wanted; the legend then says what each method pays for it. None: no line.
+        cost, error: labels of the axes, with their units.
+        title: over the figure.
+
+    Raises `ValueError` for a target or costs that are not positive, `ImportError` without matplotlib.
+    """
+    if target is not None and not target > 0:
+        raise ValueError(f"`target` must be positive, got {target}.")
+    fig = figure(8.0, 5.4)
+    axes = fig.add_subplot()
+    unit = cost.partition("[")[2].partition("]")[0]
+    for i, (name, method) in enumerate(methods.items()):
+        if not np.all(np.asarray(method.cost) > 0):
+            raise ValueError(f"`methods[{name!r}]`: costs must be positive, got {method.cost}.")
+        label = name
+        if target is not None:
+            price = method.cost_of(target)
+            label += ": not reached" if price is None else f": {price:.3g} {unit}".rstrip()
+        order = np.argsort(method.cost)
+        x, y = (np.asarray(array, float)[order] for array in method)
+        axes.loglog(x, y, label=label, **CURVES[i % len(CURVES)])
+    if target is not None:
+        axes.axhline(target, color=LIMIT, linestyle=(0, (5, 3)), linewidth=1.2)
+        axes.text(0.01, target, f"target {target:g}", color=LIMIT, va="bottom", transform=axes.get_yaxis_transform())
+    plain(axes)
+    axes.set(xlabel=cost, ylabel=error, title=title)
+    axes.legend(frameon=False, title=None if target is None else "cost at the target")
+    return fig

@@ -1,0 +1,209 @@
+"""What a mechanism looks like, in the frames of its bodies: the one description that figures and animations draw.
+
+A body is drawn from the points at which joints hold it: two make a bar, more a solid. With one point (a pendulum, a
+top) it is a bar to the centre of mass and a box, with none a box: the homogeneous cuboid of its mass and inertia. A
+body with a tyre is a wheel. Springs are coils, dampers tubes with a rod, massless rods lines.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from lgsens.model import Coincidence, Distance, MultibodySystem, Orthogonality, SpringDamperLoad, TyreLoad
+
+GROUND = -1
+_TURNS, _RADIUS = 6, 0.12  # of a coil; the radius as a fraction of its length in the reference configuration
+
+
+class Outline(NamedTuple):
+    """A line or a closed polygon fixed to a body: points in its frame [m], shape (n, 3)."""
+
+    body: int
+    role: str
+    points: np.ndarray
+    filled: bool = False
+
+
+class Strut(NamedTuple):
+    """What stretches between two bodies: a coil ("spring"), a tube ("damper") or a rod ("link"); points [m]."""
+
+    role: str
+    a: int
+    at_a: np.ndarray
+    b: int
+    at_b: np.ndarray
+    radius: float  # of the coil [m]
+
+
+class Mark(NamedTuple):
+    """A point of a body [m]: a joint, or a tyre's centre."""
+
+    body: int
+    at: np.ndarray
+
+
+class Tyre(NamedTuple):
+    """A wheel's centre, and the road under it."""
+
+    centre: Mark
+    road: Any  # t ↦ height [m]
+
+
+class Shapes(NamedTuple):
+    """The shapes of a scene; bodies are numbered as in its system, −1 is the ground."""
+
+    outlines: list[Outline]
+    struts: list[Strut]
+    joints: list[Mark]
+    tyres: list[Tyre]
+
+
+def shapes(system: MultibodySystem) -> Shapes:
+    """The shapes of a system with concrete numbers."""
+    position, orientation = (np.asarray(array) for array in system.pose)
+    held: list[list[np.ndarray]] = [[] for _ in system.body_names]
+    struts, joints, axes = [], [], {}
+    for stack in system.constraints:
+        for i, owner in enumerate(stack.owners):
+            element, (a, b) = _element(stack, i)
+            if isinstance(element, Coincidence | Distance):
+                for body, at in ((a, element.point_a), (b, element.point_b)):
+                    if body != GROUND:
+                        held[body].append(np.asarray(at))
+            if isinstance(element, Coincidence):
+                joints.append(Mark(a, np.asarray(element.point_a)))
+            elif isinstance(element, Distance):
+                struts.append(Strut("link", a, np.asarray(element.point_a), b, np.asarray(element.point_b), 0.0))
+                joints += [Mark(a, np.asarray(element.point_a)), Mark(b, np.asarray(element.point_b))]
+            elif isinstance(element, Orthogonality):
+                axes.setdefault(owner, []).append((a, b, np.asarray(element.axis_b)))
+    if system.centre is not None:  # a body with a pivot has it in place of a joint
+        for body, (own, centre) in enumerate(zip(held, np.asarray(system.centre))):
+            if centre.any():
+                own.append(np.zeros(3))
+                joints.append(Mark(body, np.zeros(3)))
+    tyres = []
+    for stack in system.loads:
+        for i in range(len(stack.owners)):
+            load, (a, b) = _element(stack, i)
+            if isinstance(load, TyreLoad):
+                tyres.append(Tyre(Mark(b, np.asarray(load.point_b)), load.road))
+            elif isinstance(load, SpringDamperLoad):
+                role = "spring" if float(load.stiffness) > 0 else "damper"
+                at_a, at_b = np.asarray(load.point_a), np.asarray(load.point_b)
+                line = _world(position, orientation, b, at_b) - _world(position, orientation, a, at_a)
+                struts.append(Strut(role, a, at_a, b, at_b, _RADIUS * float(np.linalg.norm(line))))
+    wheels = {tyre.centre.body: tyre.centre.at for tyre in tyres}
+    outlines = []
+    for body, points in enumerate(held):
+        if body in wheels and (radius := _world(position, orientation, body, wheels[body])[2]) > 0:
+            axis = _spin_axis(orientation, axes.values(), body)
+            outlines.append(Outline(body, "wheel", wheels[body] + radius * _circle(axis, orientation[body]), True))
+        else:
+            outlines += _solid(system, body, _distinct(points))
+    return Shapes(outlines, struts, joints, tyres)
+
+
+def _element(stack, i: int) -> tuple[Any, tuple[int, int]]:
+    """The i-th element of a stack, and the numbers of its two bodies."""
+    a, b = (GROUND if side is None else side[i] for side in (stack.a, stack.b))
+    return jax.tree.map(lambda leaf: leaf[i], stack.elements), (a, b)
+
+
+def _world(position, orientation, body: int, at) -> np.ndarray:
+    """Body-fixed points in the inertial frame, shape of `at`; the last axis holds coordinates."""
+    return at if body == GROUND else position[body] + at @ orientation[body].T
+
+
+def placed(shape: Outline | Mark, position, orientation) -> np.ndarray:
+    """The points of an outline, or a mark, in the inertial frame, at the given poses of all bodies."""
+    return _world(position, orientation, shape.body, shape.points if isinstance(shape, Outline) else shape.at)
+
+
+def stretched(strut: Strut, position, orientation) -> list[np.ndarray]:
+    """The lines that a strut is drawn with, in the inertial frame: a coil; a rod and its tube; a line."""
+    a = _world(position, orientation, strut.a, strut.at_a)
+    b = _world(position, orientation, strut.b, strut.at_b)
+    if strut.role == "spring":
+        return [coil(a, b, strut.radius)]
+    line = np.stack([a, b])
+    return [line, np.stack([a, a + 0.6 * (b - a)])] if strut.role == "damper" else [line]
+
+
+def coil(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
+    """A coil between two points, straight at both ends, shape (n, 3); a line where they meet."""
+    length = np.linalg.norm(b - a)
+    if length == 0:
+        return np.stack([a, b])
+    axis = (b - a) / length
+    first = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0])
+    first /= np.linalg.norm(first)
+    second = np.cross(axis, first)
+    s = np.linspace(0, 1, 20 * _TURNS + 1)[:, None]
+    wave = 2 * np.pi * _TURNS * s
+    turns = a + (0.1 + 0.8 * s) * (b - a) + radius * (np.cos(wave) * first + np.sin(wave) * second)
+    return np.concatenate([[a, a + 0.1 * (b - a)], turns, [b - 0.1 * (b - a), b]])
+
+
+def _distinct(points: list[np.ndarray]) -> np.ndarray:
+    found: list[np.ndarray] = []
+    for point in points:
+        if all(np.abs(point - other).max() > 1e-9 for other in found):
+            found.append(point)
+    return np.array(found).reshape(-1, 3)
+
+
+def _solid(system: MultibodySystem, body: int, points: np.ndarray) -> list[Outline]:
+    """The outlines of a body that joints hold at some points of its frame."""
+    if len(points) == 2:
+        return [Outline(body, "link", points)]
+    if len(points) > 2:
+        return [Outline(body, "body", face, True) for face in _hull(points)]
+    centre = np.zeros(3) if system.centre is None else np.asarray(system.centre[body])
+    box = [Outline(body, "body", face, True) for face in _box(system, body, centre)]
+    off = len(points) == 1 and np.abs(points[0] - centre).max() > 1e-9
+    return [Outline(body, "link", np.stack([points[0], centre])), *box] if off else box
+
+
+def _box(system: MultibodySystem, body: int, centre: np.ndarray) -> list[np.ndarray]:
+    """The faces of the homogeneous cuboid with a body's mass and inertia: J₁ = m (L₂² + L₃²)/12 and so on."""
+    mass, inertia = float(system.mass[body]), np.asarray(system.inertia[body])
+    inertia = inertia - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))  # about the centre of mass
+    moments, axes = np.linalg.eigh(inertia)
+    half = np.sqrt(np.maximum(6 * (moments.sum() - 2 * moments) / mass, 0.0)) / 2
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half @ axes.T + centre
+    faces = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
+    return [corners[list(face)] for face in faces]
+
+
+def _spin_axis(orientation: np.ndarray, owners, wheel: int) -> np.ndarray:
+    """The axis of the wheel's hinge, in its frame; y of the inertial frame without one.
+
+    A hinge and a sleeve have two orthogonalities, both with their axis in b; no other joint has two.
+    """
+    for elements in owners:
+        a, b, axis = elements[0]
+        if len(elements) == 2 and wheel in (a, b):
+            inertial = axis if b == GROUND else orientation[b] @ axis
+            return orientation[wheel].T @ inertial
+    return orientation[wheel].T @ np.array([0.0, 1.0, 0.0])
+
+
+def _circle(axis: np.ndarray, orientation: np.ndarray) -> np.ndarray:
+    """A circle of radius 1 about an axis of the body, closed; its first point is level with the centre."""
+    first = np.cross(axis, orientation.T @ np.array([0.0, 0.0, 1.0]))
+    first = first / np.linalg.norm(first)
+    second = np.cross(axis, first)
+    angle = np.linspace(0, 2 * np.pi, 73)[:, None]
+    return np.cos(angle) * first + np.sin(angle) * second
+
+
+def _hull(points: np.ndarray) -> np.ndarray:
+    """The triangles of the convex hull, shape (m, 3, 3); of points in a plane, the polygon through them."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        return points[ConvexHull(points).simplices]
+    except QhullError:
+        return points[None]

@@ -1,0 +1,45 @@
+"""Figures without pyplot, and how all of them look."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS = ("#8c8c8c", "#1b62a5", "#d9822b", "#3a8a4d")  # before in grey, after in blue, then others
+LIMIT = "#b3262e"
+# For curves that may lie on each other and be printed without colours: each has a marker of its own.
+CURVES: tuple[dict[str, Any], ...] = (
+    {"color": "#1b62a5", "marker": "o", "markersize": 11, "fillstyle": "none", "linestyle": "-", "linewidth": 2.4},
+    {"color": "#d9822b", "marker": "s", "markersize": 4.5, "fillstyle": "full", "linestyle": "--", "linewidth": 1.2},
+    {"color": "#3a8a4d", "marker": "D", "markersize": 8, "fillstyle": "none", "linestyle": "-.", "linewidth": 1.4},
+    {"color": "#7a4b9a", "marker": "^", "markersize": 5.5, "fillstyle": "full", "linestyle": "--", "linewidth": 1.2},
+    {"color": "#3c3c3c", "marker": "v", "markersize": 5, "fillstyle": "none", "linestyle": ":", "linewidth": 0.8},
+    {"color": "#b3262e", "marker": "x", "markersize": 5, "fillstyle": "full", "linestyle": ":", "linewidth": 0.8},
+)
+ROAD = "#b8a58c"
+ROLES = {"link": "#1b62a5", "body": "#3a8a4d", "wheel": "#3c3c3c", "spring": "#d9822b", "damper": "#7a4b9a"}
+
+
+def figure(width: float = 7.0, height: float = 4.5) -> "Figure":
+    """An empty figure of this size [inch]. Raises `ImportError` that says what to install, if need be."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError('Figures need matplotlib: pip install "lgsens[plot]"') from error
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def save(fig: "Figure", path: str | Path, dpi: int = 150) -> Path:
+    """Write a figure as a PNG (or what the suffix says) and return its path; the folder must exist."""
+    path = Path(path)
+    fig.savefig(path, dpi=dpi)
+    return path
+
+
+def plain(axes: "Axes") -> None:
+    """A light grid, and no frame above and on the right."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(True, color="#e4e4e4", linewidth=0.6)
+    axes.set_axisbelow(True)
