@@ -33,6 +33,7 @@ from lgsens.integrate import GeneralizedAlpha as GeneralizedAlpha
 from lgsens.model import (
     AppliedForce as AppliedForce,
     BumpRoad as BumpRoad,
+    Bushing as Bushing,
     CylindricalJoint as CylindricalJoint,
     DistanceJoint as DistanceJoint,
     FixedJoint as FixedJoint,

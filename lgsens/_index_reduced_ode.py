@@ -52,9 +52,10 @@ class IndexReducedODE(eqx.Module):
         mode: with `rtol`, which derivatives: "reverse" (`grad`, `jacrev`) or "forward" (`jvp`, `jacfwd`). Without
             `rtol` every JAX transformation goes through, nested ones too.
 
-    `Trajectory.order` is 4, so integrals need `time_integral(…, order=4)`; times at which forces are not smooth should
-    be output times. Joints hold to the square of the error of a step at every output time, rotations to round-off; no
-    body may turn by half a revolution in an output interval. a is v̇.
+    `Trajectory.order` is 4, so integrals need `time_integral(…, order=4)`. At equal steps a `Criterion` of the
+    trajectory integrates over the stages instead (`Trajectory.stages`), and is of the order of the scheme. Times at
+    which forces are not smooth should be output times. Joints hold to the square of the error of a step at every output
+    time, rotations to round-off; no body may turn by half a revolution in an output interval. a is v̇.
 
     **Step size.** An explicit scheme is stable up to |h ω| of about 3 for the fastest mode. The steps also integrate
     the sensitivities, and tolerances on the motion do not see these: from rest the controller of diffrax alone takes
