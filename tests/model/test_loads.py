@@ -193,7 +193,7 @@ def test_bushing_of_a_model(ends):
     bushing = lg.Bushing(*ends, at=rng.normal(size=3), stiffness=k, damping=c, preload=preload)
     system = lg.Model({"body": body}, forces={"bushing": bushing}).system()
     q, v = system.reference()
-    q = q._replace(position=q.position + moved_by)
+    q = q._replace(position=q.position + moved_by[None])
     residual = system.residual(q, v, jnp.zeros(6), jnp.zeros(0), jnp.zeros(()))
     sign = 1.0 if ends[1] == "body" else -1.0
     close(residual[:3], k * moved_by + c * velocity + sign * preload, ULPS)
