@@ -13,8 +13,6 @@ import argparse
 import json
 import os
 import platform
-import statistics
-import time
 from pathlib import Path
 
 import jax
@@ -22,9 +20,9 @@ import numpy as np
 from tqdm import tqdm
 
 import lgsens as lg
+from lgsens._cost import median_seconds
 from lgsens.examples import COMPARISON
 
-REPEATS = 5
 FACTORS = (1, 2)  # step counts, as multiples of the problem's
 DISCRETE = {
     "AVM": (lg.AdjointVariable(), lg.GeneralizedAlpha()),
@@ -78,17 +76,6 @@ class Scene:
         )
         p = jax.tree.map(np.float64, problem.parameters)
         return median_seconds(lambda: forward(p))
-
-
-def median_seconds(function) -> float:
-    """Of one call, compiled: the median of several after a warm-up."""
-    jax.block_until_ready(function())
-    taken = []
-    for _ in range(REPEATS):
-        started = time.perf_counter()
-        jax.block_until_ready(function())
-        taken.append(time.perf_counter() - started)
-    return statistics.median(taken)
 
 
 def compare(name: str, progress) -> dict:

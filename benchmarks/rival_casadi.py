@@ -12,7 +12,7 @@ import os
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +27,12 @@ FLAGS = ("-O1", "-march=native", "-fPIC", "-shared")
 COARSE = {"top": 140, "quarter_car": 160}  # steps with the accuracy of generalized-α at 1000, or better
 
 
-def _casadi() -> Any:
+def casadi() -> Any:
     return importlib.import_module("casadi")
 
 
 def version() -> str:
-    return _casadi().__version__
+    return casadi().__version__
 
 
 def _leaves(numbers: Numbers) -> list[tuple[str, Any]]:
@@ -57,11 +57,11 @@ def initial(numbers: Numbers):
     return jnp.concatenate([numbers.position.ravel(), quaternions, v.ravel(), jnp.zeros(2)])
 
 
-class _Equations:
-    """The right-hand side, an SX function of the state and θ."""
+class Equations:
+    """The equations as SX expressions of the state and θ."""
 
     def __init__(self, scene: Scene):
-        ca = self.ca = _casadi()
+        ca = self.ca = casadi()
         self.scene = scene
         numbers = scene.arrays()
         sizes = [(name, np.shape(leaf)) for name, leaf in _leaves(numbers)]
@@ -154,8 +154,8 @@ class _Equations:
             force[topology.wheel] = force[topology.wheel] + ca.vertcat(0, 0, push)
         return ca.vertcat(*(part for pair in zip(force, moment) for part in pair))
 
-    def function(self):
-        """ẏ(y, θ)."""
+    def _solved(self, given=None):
+        """(velocities of the configuration, v̇, λ's equation): λ solved for by LDLᵀ, or as given."""
         ca, n = self.ca, self.n
         blocks = [
             block for i in range(n) for block in (ca.SX.eye(3) / self.number("mass", i), self.matrix("inverse", i))
@@ -168,19 +168,47 @@ class _Equations:
             turning.append(ca.vertcat(-ca.dot(u, spin), w * spin + ca.cross(u, spin)) / 2)
         speeds = ca.vertcat(*(self.v[6 * i : 6 * i + 3] for i in range(n)), *turning)
         bias = ca.jtimes(jacobian @ self.v, self.configuration, speeds)
-        factors = ca.ldl(jacobian @ inverse @ jacobian.T)
-        lam = ca.ldl_solve(jacobian @ (inverse @ force) + bias, *factors)
-        vdot = inverse @ (force - jacobian.T @ lam)
+        free = jacobian @ (inverse @ force) + bias
+        light = jacobian @ inverse @ jacobian.T
+        lam = ca.ldl_solve(free, *ca.ldl(light)) if given is None else given
+        return speeds, inverse @ (force - jacobian.T @ lam), free - light @ lam
+
+    def _observed(self, vdot):
+        """Ψ̇."""
         body, quantity, axis = self.scene.observed
         index = self.scene.bodies.index(body)
         observed = self.x[index][axis] if quantity == "position" else vdot[6 * index + axis]
-        rate = ca.vertcat(speeds, vdot, 1, observed**2)
-        return ca.Function("rate", [self.state, self.theta], [rate])
+        return observed**2
+
+    def function(self):
+        """ẏ(y, θ)."""
+        speeds, vdot, _ = self._solved()
+        rate = self.ca.vertcat(speeds, vdot, 1, self._observed(vdot))
+        return self.ca.Function("rate", [self.state, self.theta], [rate])
+
+    def algebraic(self):
+        """The same with λ as algebraic variables: what `casadi.integrator` calls a DAE, of index 1.
+
+        ẏ is that of `function`, and 0 = B M⁻¹ (f − Bᵀλ) + Ḃ v.
+        """
+        ca = self.ca
+        lam = ca.SX.sym("lam", self._jacobian().size1())
+        speeds, vdot, equation = self._solved(lam)
+        rate = ca.vertcat(speeds, vdot, 1, self._observed(vdot))
+        return {"x": self.state, "z": lam, "p": self.theta, "ode": rate, "alg": equation}
+
+
+def puller(scene: Scene):
+    """The function that makes dΨ/dp of dΨ/dy₀ and dΨ/dθ."""
+    p = jnp.asarray(scene.start)
+    both = lambda p: (lambda z: (initial(z), parameters(z)))(scene.numbers(p))
+    pull_back = jax.jit(lambda p, bars: jax.vjp(both, p)[1](bars)[0])
+    return lambda bars: np.asarray(pull_back(p, tuple(jnp.asarray(np.asarray(bar).ravel()) for bar in bars)))
 
 
 def _simulation(rate, num_steps: int, t1: float, name: str):
     """Ψ(y₀, θ) by RK4, an MX function."""
-    ca = _casadi()
+    ca = casadi()
     h = t1 / num_steps
     y, theta = ca.MX.sym("y", rate.size1_in(0)), ca.MX.sym("theta", rate.size1_in(1))
     k1 = rate(y, theta)
@@ -196,7 +224,7 @@ def _simulation(rate, num_steps: int, t1: float, name: str):
 
 def _repeated(function, count: int, name: str):
     """y ↦ f(f(… f(y, θ) …, θ), θ)."""
-    ca = _casadi()
+    ca = casadi()
     y, theta = (ca.MX.sym(s, function.size1_in(i)) for i, s in enumerate(("y", "theta")))
     last = y
     for _ in range(count):
@@ -206,7 +234,7 @@ def _repeated(function, count: int, name: str):
 
 def _built(functions, folder: Path) -> tuple[list[Callable[..., Any]], float, float]:
     """The functions as compiled C, the seconds that took, and the size of the C source in MB."""
-    ca = _casadi()
+    ca = casadi()
     started = time.perf_counter()
     generator = ca.CodeGenerator("generated.c")
     for function in functions:
@@ -218,19 +246,20 @@ def _built(functions, folder: Path) -> tuple[list[Callable[..., Any]], float, fl
     return found, time.perf_counter() - started, source.stat().st_size / 1e6
 
 
-def programs(scene: Scene) -> list[Program]:
-    """Ψ and its gradient at the step of the others, and at the step that gives their accuracy."""
+def programs(scene: Scene, counts: Mapping[int, str] | None = None) -> list[Program]:
+    """Ψ and its gradient at given numbers of steps, the basis of comparison being named with each.
+
+    None: the step of the others, and the step that gives their accuracy.
+    """
     if scene.name not in COARSE:
         return []
-    ca = _casadi()
-    rate = _Equations(scene).function()
-    p = jnp.asarray(scene.start)
+    counts = {scene.num_steps: "equal step", COARSE[scene.name]: "equal accuracy"} if counts is None else counts
+    ca = casadi()
+    rate = Equations(scene).function()
     numbers = scene.arrays()
     y0, theta = (np.asarray(f(numbers)) for f in (initial, parameters))
-    both = lambda p: (lambda z: (initial(z), parameters(z)))(scene.numbers(p))
-    pull_back = jax.jit(lambda p, bars: jax.vjp(both, p)[1](bars)[0])
+    pull_back = puller(scene)
     entries = np.asarray(_entries(numbers)).astype(int)
-    counts = {scene.num_steps: "equal step", COARSE[scene.name]: "equal accuracy"}
     functions = []
     for num_steps in counts:
         psi = _simulation(rate, num_steps, scene.t1, f"psi_{num_steps}")
@@ -253,8 +282,7 @@ def programs(scene: Scene) -> list[Program]:
 
         def run_p(reverse=reverse):
             value, *bars = reverse(y0, theta)
-            bars = tuple(jnp.asarray(np.asarray(bar).ravel()) for bar in bars)
-            return float(value), np.asarray(pull_back(p, bars))
+            return float(value), pull_back(bars)
 
         for kind, program, call in (
             ("forward", "generated C, RK4", run),

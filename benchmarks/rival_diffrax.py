@@ -52,21 +52,25 @@ def _rates(scene: Scene, t, y, numbers):
     return twist[:, :3], turning, vdot, observed**2
 
 
-def criterion(scene: Scene, solver, tolerance: float, adjoint, numbers: Numbers):
+def controller(scene: Scene, tolerance: float, longest: float):
+    """Error control with steps no longer than a limit [s], which end where forces are not smooth."""
+    limited = diffrax.PIDController(tolerance, tolerance, dtmax=longest)
+    return diffrax.ClipStepSizeController(limited, jump_ts=jnp.asarray(scene.breaks) if scene.breaks else None)
+
+
+def criterion(scene: Scene, solver, control, adjoint, numbers: Numbers, dt0=None, max_steps: int = MAX_STEPS):
     """Ψ, and the number of steps."""
     n = numbers.mass.shape[0]
     v = jnp.concatenate([numbers.velocity, numbers.spin], axis=1).ravel()
     y = (numbers.position, jnp.broadcast_to(jnp.eye(3), (n, 3, 3)), v, jnp.zeros(()))
-    controller = diffrax.PIDController(tolerance, tolerance, dtmax=LONGEST[scene.name])
-    jumps = jnp.asarray(scene.breaks) if scene.breaks else None
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(partial(_rates, scene)),
         solver(),
-        *(0.0, scene.t1, None, y),
+        *(0.0, scene.t1, dt0, y),
         args=(numbers, jnp.linalg.inv(numbers.inertia)),
-        stepsize_controller=diffrax.ClipStepSizeController(controller, jump_ts=jumps),
+        stepsize_controller=control,
         adjoint=adjoint,
-        max_steps=MAX_STEPS,
+        max_steps=max_steps,
     )
     return solution.ys[3][0], solution.stats["num_steps"]
 
@@ -78,8 +82,9 @@ def programs(scene: Scene) -> list[Program]:
     p = jnp.asarray(scene.start)
     found = []
     for name, solver, tolerance in SETTINGS:
-        reverse = partial(criterion, scene, solver, tolerance, diffrax.RecursiveCheckpointAdjoint())
-        forward = partial(criterion, scene, solver, tolerance, diffrax.ForwardMode())
+        control = controller(scene, tolerance, LONGEST[scene.name])
+        reverse = partial(criterion, scene, solver, control, diffrax.RecursiveCheckpointAdjoint())
+        forward = partial(criterion, scene, solver, control, diffrax.ForwardMode())
         title = f"{name}, tolerance {tolerance:.0e}"
         of_p = lambda p, psi=reverse: psi(scene.numbers(p))[0]
         with_steps = lambda p, psi=forward: psi(scene.numbers(p))

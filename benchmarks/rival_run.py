@@ -56,14 +56,15 @@ def run(
     for name in scenes:
         scene = SCENES[name]()
         found = _scene(scene, present, kinds, repeats)
-        found["environment"] = _environment(settings)
+        found["environment"] = environment(settings)
         document = _read(path)
         document["scenes"][name] = found
         _write(path, document)
         jax.clear_caches()
 
 
-def _environment(settings: Mapping[str, str]) -> dict[str, Any]:
+def environment(settings: Mapping[str, str]) -> dict[str, Any]:
+    """When and where, with the versions of all packages."""
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -128,17 +129,18 @@ def _compare(scene: Scene, records: list[dict[str, Any]], reference: dict[str, A
             record["value_difference_from_lgsens"] = abs(record["value"] / lgsens["value"] - 1)
         if record["gradient"] is not None and where is not None and reference is not None:
             wanted = np.asarray(reference["gradient"])[where]
-            record["gradient_error"] = _difference(record["gradient"], wanted, scene.scale[where])
+            record["gradient_error"] = difference(record["gradient"], wanted, scene.scale[where])
         elif record["gradient"] is not None and lgsens is not None:
             wanted = np.asarray(lgsens["gradient"])
             scale = 1 / wanted if where is None else scene.scale[where]
-            record["gradient_difference_from_lgsens"] = _difference(record["gradient"], wanted, scale)
+            record["gradient_difference_from_lgsens"] = difference(record["gradient"], wanted, scale)
         if lgsens is not None:
             record["ratio_to_lgsens"] = record["seconds"] / lgsens["seconds"]
             record["cpu_ratio_to_lgsens"] = record["cpu_seconds"] / lgsens["cpu_seconds"]
 
 
-def _difference(found: list[float], wanted: np.ndarray, scale: np.ndarray) -> float:
+def difference(found: list[float], wanted: np.ndarray, scale: np.ndarray) -> float:
+    """Of two gradients, relative to the largest effect of a relative change of a parameter."""
     return float(np.max(np.abs((np.asarray(found) - wanted) * scale)) / np.max(np.abs(wanted * scale)))
 
 

@@ -99,9 +99,9 @@ def _scene(name: str, found: dict[str, Any]) -> list[str]:
     return lines
 
 
-def put_into(readme: Path, text: str) -> None:
-    """Replace what stands between the two marks of the README by the tables."""
-    begin, end = "<!-- tables -->", "<!-- end of tables -->"
+def put_into(readme: Path, text: str, name: str) -> None:
+    """Replace what stands between the two marks of that name in the README by the tables."""
+    begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
     before, rest = readme.read_text(encoding="utf-8").split(begin)
     _, after = rest.split(end)
     readme.write_text(f"{before}{begin}\n\n{text}\n\n{end}{after}", encoding="utf-8")

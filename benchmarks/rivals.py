@@ -55,7 +55,7 @@ def main() -> None:
         run.compare_again(path)
     text = tables.markdown(json.loads(path.read_text(encoding="utf-8")))
     if arguments.readme:
-        tables.put_into(Path(__file__).parent / "README.md", text)
+        tables.put_into(Path(__file__).parent / "README.md", text, "tables")
     print(text)
 
 

@@ -12,7 +12,6 @@ import argparse
 import json
 import os
 import platform
-import statistics
 import time
 from pathlib import Path
 
@@ -22,9 +21,9 @@ import numpy as np
 from tqdm import tqdm
 
 import lgsens as lg
+from lgsens._cost import median_seconds
 from lgsens.examples import PROBLEMS, QuarterCar
 
-REPEATS = 5
 DATA = Path(__file__).parents[1] / "tests" / "data"
 FIDELITIES = {
     "default": {},
@@ -55,17 +54,6 @@ ROUTES = {
 }
 
 
-def seconds(function, *arguments) -> float:
-    """Median wall time of a compiled function, after a warm-up."""
-    jax.block_until_ready(function(*arguments))
-    taken = []
-    for _ in range(REPEATS):
-        started = time.perf_counter()
-        jax.block_until_ready(function(*arguments))
-        taken.append(time.perf_counter() - started)
-    return statistics.median(taken)
-
-
 def compiled(function, *arguments):
     started = time.perf_counter()
     program = jax.jit(function).lower(*arguments).compile()
@@ -86,7 +74,7 @@ def fidelity(options) -> dict:
         "unknowns": summary.coordinates,
         "equations": summary.constraints,
         "psi0": float(program(model)),
-        "step_us": 1e6 * seconds(program, model) / 500,
+        "step_us": 1e6 * median_seconds(lambda: program(model)) / 500,
         "compile_s": compile_time,
     }
 
@@ -120,7 +108,7 @@ def route(name: str, integrator, num_steps: int) -> dict:
         "num_steps": num_steps,
         "error_of_psi": abs(float(value) / reference.value - 1.0),
         "error_of_gradient": float(np.abs(found - exact).max() / np.abs(exact).max()),
-        "value_and_gradient_ms": 1e3 * seconds(program, p),
+        "value_and_gradient_ms": 1e3 * median_seconds(lambda: program(p)),
         "compile_s": compile_time,
     }
 

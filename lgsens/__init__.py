@@ -36,6 +36,7 @@ from lgsens.linear import BlockSparse as BlockSparse, DenseLU as DenseLU
 from lgsens.model import (
     AppliedForce as AppliedForce,
     BumpRoad as BumpRoad,
+    Bushing as Bushing,
     CylindricalJoint as CylindricalJoint,
     DistanceJoint as DistanceJoint,
     FixedJoint as FixedJoint,

@@ -3,6 +3,7 @@
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -15,6 +16,17 @@ from lgsens._simulate import simulate
 from lgsens._validate import as_count
 from lgsens.criteria import Criterion
 from lgsens.sensitivity import AdjointVariable, DirectDifferentiation
+
+
+def median_seconds(function: Callable[[], Any], repeats: int = 5) -> float:
+    """The wall time of a call, the median of several after one that compiles."""
+    jax.block_until_ready(function())
+    taken = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        jax.block_until_ready(function())
+        taken.append(time.perf_counter() - started)
+    return statistics.median(taken)
 
 
 def measure_costs(
@@ -34,14 +46,7 @@ def measure_costs(
     leaves = jax.tree.leaves(criteria, is_leaf=lambda leaf: isinstance(leaf, Criterion))
     flat, unravel = ravel_pytree(p)
 
-    def seconds(function) -> float:
-        jax.block_until_ready(function())
-        taken = []
-        for _ in range(repeats):
-            started = time.perf_counter()
-            jax.block_until_ready(function())
-            taken.append(time.perf_counter() - started)
-        return statistics.median(taken)
+    seconds = partial(median_seconds, repeats=repeats)
 
     def gradient(method, criteria, build, p) -> float:
         return seconds(lambda: differentiate(criteria, build, p, method=method, **settings).gradient)

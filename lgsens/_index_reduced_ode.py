@@ -25,20 +25,13 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from lgsens._explicit_steps import Coefficients, Numbers, equal_steps, projection
+from lgsens._trajectory import Stages
 from lgsens._validate import as_count
-from lgsens.dynamics import (
-    RESULTS,
-    AbstractSystem,
-    ConstrainedInertia,
-    Inertia,
-    State,
-    constraint_velocity,
-    factorized_accelerations,
-)
+from lgsens.dynamics import RESULTS, AbstractSystem, Inertia, State, factorized_accelerations
 
 MODES = ("reverse", "forward")
 
@@ -59,9 +52,10 @@ class IndexReducedODE(eqx.Module):
         mode: with `rtol`, which derivatives: "reverse" (`grad`, `jacrev`) or "forward" (`jvp`, `jacfwd`). Without
             `rtol` every JAX transformation goes through, nested ones too.
 
-    `Trajectory.order` is 4, so integrals need `time_integral(…, order=4)`; times at which forces are not smooth should
-    be output times. Joints hold to the square of the error of a step at every output time, rotations to round-off; no
-    body may turn by half a revolution in an output interval. a is v̇.
+    `Trajectory.order` is 4, so integrals need `time_integral(…, order=4)`. At equal steps a `Criterion` of the
+    trajectory integrates over the stages instead (`Trajectory.stages`), and is of the order of the scheme. Times at
+    which forces are not smooth should be output times. Joints hold to the square of the error of a step at every output
+    time, rotations to round-off; no body may turn by half a revolution in an output interval. a is v̇.
 
     **Step size.** An explicit scheme is stable up to |h ω| of about 3 for the fastest mode. The steps also integrate
     the sensitivities, and tolerances on the motion do not see these: from rest the controller of diffrax alone takes
@@ -78,6 +72,13 @@ class IndexReducedODE(eqx.Module):
     atol: float | None = eqx.field(static=True, default=None, kw_only=True)
     max_steps: int = eqx.field(static=True, default=256, kw_only=True)
     mode: str = eqx.field(static=True, default="reverse", kw_only=True)
+
+    @property
+    def tableau(self) -> Any:
+        """The Butcher tableau of the scheme, as diffrax has it."""
+        import diffrax  # takes its time to import
+
+        return _tableau(diffrax.Tsit5() if self.solver is None else self.solver)
 
     def __check_init__(self):
         for name in ("rtol", "atol"):
@@ -140,43 +141,9 @@ class _Problem(eqx.Module):
 
     def projected(self, q, v):
         """q and v on the constraints, and the drift taken out."""
-        system = self.system
-        if not system.constraint_names:
-            return q, v, jnp.zeros((), v.dtype)
-        kkt = ConstrainedInertia.of(self.inertia, system.constraint_jacobian(q))
-        violation = system.constraint(q)
-        free = jnp.zeros_like(v)
-        x, _ = kkt.solve(free, -violation)
-        q = system.group.retract(q, x)
-        correction, _ = kkt.solve(free, -constraint_velocity(system, q, v))
-        return q, v + correction, lax.stop_gradient(jnp.max(jnp.abs(violation)))
-
-
-def _one_step(tableau, problem: _Problem, q, first: _Local, v, t, h) -> _Local:
-    """One step of an explicit Runge–Kutta scheme from x = 0, whose first stage is known.
-
-    Stages that only the error estimate uses are left out.
-    """
-    rows = [np.zeros(0), *tableau.a_lower]
-    used = max(np.flatnonzero(tableau.b_sol)) + 1
-    matrix = np.zeros((used, used))
-    for i in range(used):
-        matrix[i, :i] = rows[i]
-    nodes = np.concatenate([[0.0], tableau.c])[:used]
-    start = _Local(jnp.zeros_like(v), v)
-
-    def advance(slopes, weights):
-        return jax.tree.map(lambda y, k: y + h * (weights @ k), start, slopes)
-
-    def stage(slopes, inputs):
-        i, weights, node = inputs
-        slope = problem.rate(q, advance(slopes, weights), t + node * h)
-        return jax.tree.map(lambda k, new: k.at[i].set(new), slopes, slope), None
-
-    slopes = jax.tree.map(lambda k: jnp.zeros((used, *k.shape), k.dtype).at[0].set(k), first)
-    inputs = (jnp.arange(1, used), jnp.asarray(matrix[1:], v.dtype), jnp.asarray(nodes[1:], v.dtype))
-    slopes, _ = lax.scan(stage, slopes, inputs)
-    return advance(slopes, jnp.asarray(tableau.b_sol[:used], v.dtype))
+        found = projection(self.inertia, self.system, jnp.zeros_like(v), q, v)
+        drift = jnp.max(jnp.abs(self.system.constraint(q)), initial=0.0)
+        return found.projected, v + found.d, lax.stop_gradient(drift)
 
 
 def _adaptive(settings: IndexReducedODE, problem: _Problem, q, v, t, h, running):
@@ -206,29 +173,57 @@ def _largest(tree) -> Float[Array, ""]:
 
 
 def integrate_ode(settings: IndexReducedODE, num_steps: int, system: AbstractSystem, start: State, t0, h):
-    """The states at t0 + n h, n = 0 … num_steps, stacked along a leading axis, and what happened in between.
+    """The states at t0 + n h, n = 0 … num_steps, stacked along a leading axis; what happened in between; the stages.
 
     An interval that fails ends the simulation: its end and all after it are NaN, and `StepStats` says so.
     """
-    import diffrax  # takes its time to import
+    inertia = Inertia.of(system)
+    vdot, lam = factorized_accelerations(inertia, system, start.q, start.v, t0)
+    first = State(q=start.q, v=start.v, vdot=vdot, lam=lam, a=vdot)
+    if settings.rtol is None:
+        states, stats, stages = _equal(settings, num_steps, Numbers(inertia, system, t0, h), first)
+    else:
+        (states, stats), stages = _controlled(settings, num_steps, _Problem(inertia, system), first, t0, h), None
+    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), first, states), stats, stages
 
-    problem = _Problem(Inertia.of(system), system)
-    tableau = _tableau(diffrax.Tsit5() if settings.solver is None else settings.solver)
 
-    def state(problem: _Problem, q, v, t) -> State:
-        vdot, lam = factorized_accelerations(problem.inertia, problem.system, q, v, t)
-        return State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
+def _equal(settings: IndexReducedODE, num_steps: int, numbers: Numbers, first: State):
+    """The ends of equal steps, and their stages, by which the scheme integrates everything else too."""
+    found = equal_steps(settings, num_steps, numbers, first)
+    finite = jnp.all(jnp.stack([_finite(leaf) for leaf in jax.tree.leaves(found.end)]), axis=0)
+    converged = jnp.cumprod(finite.astype(jnp.int32)) == 1
+    keep = lambda leaf: jnp.where(jnp.expand_dims(converged, range(1, leaf.ndim)), leaf, jnp.nan)
+    system, p = numbers.system, found.projection
+    violation = jax.vmap(system.constraint)(p.q)
+    drift = lax.stop_gradient(jnp.max(jnp.abs(violation), axis=1, initial=0.0))
+    tried = jnp.concatenate([jnp.ones(1, bool), converged[:-1]])  # NaN is where a step failed, 0 after it
+    scheme = Coefficients.of(settings.tableau)
+    t, h = numbers.t0, numbers.h
+    count = jnp.arange(num_steps, dtype=h.dtype)
+    stages = Stages(
+        t=(t + jnp.add.outer(count, jnp.asarray(scheme.c, h.dtype)) * h).reshape(-1),
+        weights=jnp.tile(h * jnp.asarray(scheme.b, h.dtype), num_steps),
+        states=jax.tree.map(
+            lambda leaf: keep(leaf).reshape(num_steps * len(scheme.b), *leaf.shape[2:]),
+            State(found.stages.q, found.stages.v, found.stages.vdot, found.stages.lam, found.stages.vdot),
+        ),
+    )
+    stats = StepStats(tried.astype(jnp.int32), jnp.where(tried, drift, jnp.nan), converged)
+    return jax.tree.map(keep, found.end), stats, stages
+
+
+def _finite(leaf):
+    return jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim)))
+
+
+def _controlled(settings: IndexReducedODE, num_steps: int, problem: _Problem, first: State, t0, h):
+    """The ends of output intervals under error control."""
 
     def interval(problem: _Problem, begin: State, n, running):
-        t = t0 + n * h
-        if settings.rtol is None:
-            first = _Local(begin.v, begin.vdot)  # T(0) is the unit matrix
-            local = _one_step(tableau, problem, begin.q, first, begin.v, t, h)
-            finished, steps = jnp.ones((), bool), jnp.ones((), jnp.int32)
-        else:
-            local, finished, steps = _adaptive(settings, problem, begin.q, begin.v, t, h, running)
-        q, v, drift = problem.projected(system.group.retract(begin.q, local.x), local.v)
-        return state(problem, q, v, t0 + (n + 1) * h), drift, finished, steps
+        local, finished, steps = _adaptive(settings, problem, begin.q, begin.v, t0 + n * h, h, running)
+        q, v, drift = problem.projected(problem.system.group.retract(begin.q, local.x), local.v)
+        vdot, lam = factorized_accelerations(problem.inertia, problem.system, q, v, t0 + (n + 1) * h)
+        return State(q=q, v=v, vdot=vdot, lam=lam, a=vdot), drift, finished, steps
 
     # In reverse mode nothing is kept of an interval but how it begins.
     interval = jax.checkpoint(interval, prevent_cse=False)
@@ -242,10 +237,8 @@ def integrate_ode(settings: IndexReducedODE, num_steps: int, system: AbstractSys
         steps = jnp.where(running, steps, 0).astype(jnp.int32)
         return (end, converged), (end, StepStats(steps, drift, converged))
 
-    first = state(problem, start.q, start.v, t0)
     count = jnp.arange(num_steps, dtype=h.dtype)
-    _, (states, stats) = lax.scan(step, (first, jnp.ones((), bool)), count)
-    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), first, states), stats
+    return lax.scan(step, (first, jnp.ones((), bool)), count)[1]
 
 
 def ode_failure(stats: StepStats, t0, h):

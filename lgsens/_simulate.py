@@ -242,12 +242,13 @@ def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, sa
 def _run_ode(system: AbstractSystem, state0, initial, t0, h, num_steps: int, integrator: IndexReducedODE):
     """`run` of the index-reduced equations, with nothing of generalized-α in the initial state."""
     start = begin(GeneralizedAlpha(second_order_start=False), system, t0, h, state0, initial)
-    states, stats = integrate_ode(integrator, num_steps, system, start.state, t0, h)
+    states, stats, stages = integrate_ode(integrator, num_steps, system, start.state, t0, h)
     result, details = ode_failure(stats, t0, h)
     result = jnp.where(start.result == RESULTS.successful, result, start.result).astype(jnp.int32)
     details = jax.lax.stop_gradient(details | {"violation": start.violation, "jacobian": start.jacobian})
     t = times(num_steps, Parameters(system, t0, h))
-    return Trajectory(t=t, states=states, result=result, stats=stats, system=system, order=4), details
+    found = Trajectory(t=t, states=states, result=result, stats=stats, system=system, order=4, stages=stages)
+    return found, details
 
 
 def outcome(integrator: GeneralizedAlpha, start: Begin, stats: Stats, t0, h):

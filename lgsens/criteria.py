@@ -26,9 +26,10 @@ class Criterion(eqx.Module):
             `s.state`, `s.t`), `p` the design parameters. None: no integral.
         terminal: G(s, p) → scalar, of the instant t1. None: no terminal term.
 
-    `criterion(trajectory, p)` is Ψ, by `time_integral` of the order of the trajectory, and can be differentiated like
-    any function of a trajectory; `differentiate` gives its value and gradient by every method of the paper. Numbers
-    that F and G depend on come through `p`, or are constants.
+    `criterion(trajectory, p)` is Ψ, by `time_integral` of the order of the trajectory or, where this has `stages`, by
+    the quadrature of its Runge–Kutta scheme. It can be differentiated like any function of a trajectory;
+    `differentiate` gives its value and gradient by every method of the paper. Numbers that F and G depend on come
+    through `p`, or are constants.
 
     Raises `ValueError` if both are None or one cannot be called, and, when it is evaluated, for a value that is
     not a scalar. Source: Sonneville & Brüls (2014), §5.
@@ -58,7 +59,11 @@ class Criterion(eqx.Module):
         value = self.final(system, trajectory.state(-1), t[-1], p)
         if self.integrand is None:
             return value
-        rates = jax.vmap(lambda state, t: self.rate(system, state, t, p))(states, t)
+        rate = jax.vmap(lambda state, t: self.rate(system, state, t, p))
+        if trajectory.stages is not None:
+            stages = trajectory.stages
+            return value + stages.weights @ rate(stages.states, stages.t)
+        rates = rate(states, t)
         return value + time_integral(t, rates, order=trajectory.order)
 
 

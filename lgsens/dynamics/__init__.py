@@ -4,6 +4,7 @@ from lgsens.dynamics._accelerations import (
     ConstrainedInertia as ConstrainedInertia,
     Inertia as Inertia,
     constraint_velocity as constraint_velocity,
+    equations_of_motion as equations_of_motion,
     factorized_accelerations as factorized_accelerations,
 )
 from lgsens.dynamics._equilibrium import equilibrium as equilibrium

@@ -92,14 +92,15 @@ def constraint_acceleration(system: AbstractSystem, q, v, vdot) -> Float[Array, 
     return rate + constraint_velocity(system, q, vdot)
 
 
-def _equations(system: AbstractSystem, q, v, vdot, lam, t):
+def equations_of_motion(system: AbstractSystem, q, v, vdot, lam, t):
+    """E, two vectors of shape (k,) and (m,): eq. (25), and the constraint at acceleration level."""
     return system.residual(q, v, vdot, lam, t), constraint_acceleration(system, q, v, vdot)
 
 
 def _solved(inertia: Inertia, system: AbstractSystem, q, v, t):
     kkt = ConstrainedInertia.of(inertia, system.constraint_jacobian(q))
     free = jnp.zeros_like(v), jnp.zeros(kkt.jacobian.shape[0], v.dtype)
-    left = _equations(system, q, v, *free, t)
+    left = equations_of_motion(system, q, v, *free, t)
     return kkt.solve(*jax.tree.map(jnp.negative, left)), kkt
 
 
@@ -113,6 +114,6 @@ def factorized_accelerations(inertia: Inertia, system: AbstractSystem, q: Any, v
 def _rule(primals, tangents):
     inertia, z = primals[0], primals[1:]
     (vdot, lam), kkt = _solved(inertia, *z)
-    equations = lambda system, q, v, t: _equations(system, q, v, vdot, lam, t)
+    equations = lambda system, q, v, t: equations_of_motion(system, q, v, vdot, lam, t)
     _, change = jax.jvp(equations, z, tangents[1:])  # M is one of the numbers of the system
     return (vdot, lam), kkt.solve(*jax.tree.map(jnp.negative, change))

@@ -19,6 +19,7 @@ from lgsens.model._forces import (
     AbstractForce as AbstractForce,
     AppliedForce as AppliedForce,
     Attached as Attached,
+    Bushing as Bushing,
     Gravity as Gravity,
     SpringDamper as SpringDamper,
     TyreSpring as TyreSpring,
@@ -38,6 +39,7 @@ from lgsens.model._joints import (
 from lgsens.model._loads import (
     AbstractClosedFormLoad as AbstractClosedFormLoad,
     AbstractLoad as AbstractLoad,
+    BushingLoad as BushingLoad,
     LineForce as LineForce,
     LoadTangents as LoadTangents,
     SpringDamperLoad as SpringDamperLoad,

@@ -13,6 +13,7 @@ from lgsens.model._body import RigidBody
 from lgsens.model._frames import Frame, ground_frame
 from lgsens.model._loads import (
     AbstractLoad,
+    BushingLoad,
     PointForce,
     SpringDamperLoad,
     TyreLoad,
@@ -121,6 +122,47 @@ class SpringDamper(AbstractForce):
             damping=self.damping,
             free_length=free_length,
             preload=jnp.zeros((), dtype) if self.preload is None else self.preload,
+        )
+        return (Attached(load, self.a, self.b),)
+
+
+class Bushing(AbstractForce):
+    """A rubber bushing in place of a ball joint: a spring and damper along each of three axes fixed to body a.
+
+        g = g₀ + K u + C u̇,     u the vector from the point on a to the point on b, in the frame of a
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at: where it is in the reference configuration [m], inertial frame, shape (3,): both points are there.
+        stiffness: the spring stiffnesses [N/m] along x, y and z of the inertial frame in the reference
+            configuration, shape (3,). The axes turn with a.
+        damping: the damping along the same axes [N s/m], shape (3,).
+        preload: the force g₀ that pulls b to a in the reference configuration [N], inertial frame, shape (3,).
+
+    It resists no rotation. A force between bodies that is stiffer by orders than the others makes explicit integrators
+    take as many more steps; generalized-α does not mind. Raises `ValueError` for wrong shapes.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at: Float[Array, "3"] = point_field("at")
+    stiffness: Float[Array, "3"] = point_field("stiffness")
+    damping: Float[Array, "3"] = point_field("damping", default=(0.0, 0.0, 0.0))
+    preload: Float[Array, "3"] = point_field("preload", default=(0.0, 0.0, 0.0))
+
+    @property
+    def bodies(self):
+        return (self.a, self.b)
+
+    def loads(self, bodies):
+        a, b = (_frame(bodies, name, self.at.dtype) for name in (self.a, self.b))
+        back = a.orientation.T
+        load = BushingLoad(
+            point_a=a.local_point(self.at),
+            point_b=b.local_point(self.at),
+            stiffness=(back * self.stiffness[None]) @ a.orientation,
+            damping=(back * self.damping[None]) @ a.orientation,
+            preload=a.local_axis(self.preload),
         )
         return (Attached(load, self.a, self.b),)
 

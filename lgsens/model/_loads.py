@@ -132,6 +132,63 @@ class SpringDamperLoad(AbstractClosedFormLoad):
         return LoadTangents(-position, -self.damping * jnp.outer(along, along))
 
 
+class BushingLoad(AbstractClosedFormLoad):
+    """Three springs and dampers between two points, along axes fixed to a: Q = −Uᵀ g, g = g₀ + K u + C u̇.
+
+    u = R_aᵀ d is the vector between the points in the frame of a, and with r = X_a + u, where the point of b is in a,
+
+        δu = U δq,    U = [−R_aᵀ,  r̃,  R_aᵀ,  −R_aᵀR_b X̃_b],     u̇ = U v,
+
+    from δ(R_aᵀ) x = (R_aᵀ x)~ δθ_a. With s = ẋ_b + R_b (Ω_b × X_b) − ẋ_a, so that u̇ = R_aᵀ s + r × Ω_a, and
+    l = R_bᵀR_a g,
+
+        ∂u̇/∂q = [0,  (R_aᵀ s)~,  0,  −R_aᵀR_b (Ω_b × X_b)~] − Ω̃_a U,
+        D_q(Uᵀ g)|_g: rows  R_a g̃ δθ_a,  g̃ U δq,  −R_a g̃ δθ_a,  X̃_b (l̃ δθ_b − R_bᵀR_a g̃ δθ_a),
+        ∂Q/∂q = −Uᵀ (K U + C ∂u̇/∂q) − D_q(Uᵀ g),     ∂Q/∂v = −Uᵀ C U.
+    """
+
+    point_a: Float[Array, "3"]
+    point_b: Float[Array, "3"]
+    stiffness: Float[Array, "3 3"]
+    damping: Float[Array, "3 3"]
+    preload: Float[Array, "3"]
+
+    def _gradient(self, a, b):
+        """r and U."""
+        r = a.local_point(b.point(self.point_b))
+        back = a.orientation.T
+        gradient = jnp.concatenate([-back, skew(r), back, -back @ b.orientation @ skew(self.point_b)], axis=1)
+        return r, gradient
+
+    def _tension(self, r, gradient, va, vb):
+        """g, on a, in the frame of a."""
+        rate = gradient @ jnp.concatenate([va, vb])
+        return self.preload + self.stiffness @ (r - self.point_a) + self.damping @ rate
+
+    def force(self, a, b, va, vb, t):
+        r, gradient = self._gradient(a, b)
+        return -self._tension(r, gradient, va, vb) @ gradient
+
+    def tangents(self, a, b, va, vb, t):
+        r, gradient = self._gradient(a, b)
+        g = self._tension(r, gradient, va, vb)
+        relative = b.orientation.T @ a.orientation
+        swing = cross(vb[ROTATION], self.point_b)
+        speed = vb[: ROTATION.start] + b.axis(swing) - va[: ROTATION.start]
+        rate = -skew(va[ROTATION]) @ gradient
+        rate = rate.at[:, ROTATION_A].add(skew(a.local_axis(speed)))
+        rate = rate.at[:, ROTATION_B].add(-relative.T @ skew(swing))
+        turned = a.orientation @ skew(g)
+        geometric = jnp.zeros((12, 12), g.dtype)
+        geometric = geometric.at[: ROTATION.start, ROTATION_A].set(turned)
+        geometric = geometric.at[ROTATION_A].set(skew(g) @ gradient)
+        geometric = geometric.at[TRANSLATION_B, ROTATION_A].set(-turned)
+        geometric = geometric.at[ROTATION_B, ROTATION_A].set(-skew(self.point_b) @ relative @ skew(g))
+        geometric = geometric.at[ROTATION_B, ROTATION_B].set(skew(self.point_b) @ skew(relative @ g))
+        position = gradient.T @ (self.stiffness @ gradient + self.damping @ rate) + geometric
+        return LoadTangents(-position, -gradient.T @ self.damping @ gradient)
+
+
 class TyreLoad(AbstractClosedFormLoad):
     """A vertical spring between the road and a point of b: F_z = F₀ + k (z_road(t) − z + ℓ₀), along the inertial z.
 

@@ -18,7 +18,7 @@ from helpers import (
 )
 
 import lgsens as lg
-from lgsens.model import AbstractForce, AbstractLoad, Attached, Frame, SpringDamperLoad, TyreLoad
+from lgsens.model import AbstractForce, AbstractLoad, Attached, BushingLoad, Frame, SpringDamperLoad, TyreLoad
 from lgsens.model._loads import PointForce, Weight
 
 COUNT = 20
@@ -34,6 +34,7 @@ SIGNALS = {
 LOADS = {
     "weight": lambda v: Weight(v(), v(3)),
     "spring": lambda v: SpringDamperLoad(v(3), v(3), v(), v(), v(), v()),
+    "bushing": lambda v: BushingLoad(v(3), v(3), v(3, 3), v(3, 3), v(3)),
     **{f"tyre-{n}": lambda v, s=s: TyreLoad(v(3), v(), v(), v(), s()) for n, s in SIGNALS.items()},
     "force": lambda v: PointForce(v(3), v(3), v(3), SIGNALS["bump"]()),
 }
@@ -122,9 +123,20 @@ def force_energy(load, a, b, t):
     return -load.signal(t) * jnp.dot(load.vector, b.point(load.point_b))
 
 
+def bushing_energy(load, a, b, t):
+    u = a.local_point(b.point(load.point_b)) - load.point_a
+    return load.preload @ u + u @ load.stiffness @ u / 2
+
+
 def energy_of(name):
     family = name.partition("-")[0]
-    return {"spring": spring_energy, "tyre": tyre_energy, "weight": weight_energy, "force": force_energy}[family]
+    return {
+        "spring": spring_energy,
+        "bushing": bushing_energy,
+        "tyre": tyre_energy,
+        "weight": weight_energy,
+        "force": force_energy,
+    }[family]
 
 
 def without(load, field):
@@ -134,8 +146,10 @@ def without(load, field):
 @pytest.mark.parametrize("name", LOADS)
 def test_force_is_minus_the_gradient_of_the_potential(name):
     load, a, b, va, vb, t = sample(name, seed=2)
-    if name == "spring":
+    if name in ("spring", "bushing"):
         load = without(load, "damping")
+    if name == "bushing":  # a symmetric stiffness
+        load = eqx.tree_at(lambda load: load.stiffness, load, load.stiffness + jnp.swapaxes(load.stiffness, 1, 2))
     if name == "force":
         load = without(load, "moment")  # a moment fixed in the body has no potential
     energy = energy_of(name)
@@ -168,6 +182,21 @@ def test_power_of_a_spring_damper():
     dissipated = load.damping * length_rate**2
     assert np.min(dissipated) > 0
     close(power, -energy_rate - dissipated, ULPS, scale=np.abs(force).max() * np.abs(vb).max())
+
+
+@pytest.mark.parametrize("ends", [(None, "body"), ("body", None)])
+def test_bushing_of_a_model(ends):
+    """Body moved by δ and with the velocity w: diag(k) δ + diag(c) w, and the preload, whatever its frame and point."""
+    rng = np.random.default_rng(6)
+    k, c, preload, moved_by, velocity = rng.uniform(1.0, 2.0, (5, 3))
+    body = lg.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), orientation=random_rotation(rng), velocity=velocity)
+    bushing = lg.Bushing(*ends, at=rng.normal(size=3), stiffness=k, damping=c, preload=preload)
+    system = lg.Model({"body": body}, forces={"bushing": bushing}).system()
+    q, v = system.reference()
+    q = q._replace(position=q.position + moved_by[None])
+    residual = system.residual(q, v, jnp.zeros(6), jnp.zeros(0), jnp.zeros(()))
+    sign = 1.0 if ends[1] == "body" else -1.0
+    close(residual[:3], k * moved_by + c * velocity + sign * preload, ULPS)
 
 
 def test_moment_of_an_applied_force_is_fixed_in_the_body():

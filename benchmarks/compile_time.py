@@ -1,0 +1,143 @@
+"""Compile time of `simulate` and of a gradient, with and without JAX's persistent compilation cache.
+
+    python benchmarks/compile_time.py [--out benchmarks/results] [--scenes top four_bar …]
+    python benchmarks/compile_time.py --table     # the table again, from compile_time.json; measures nothing
+    python benchmarks/compile_time.py --readme    # and into benchmarks/README.md
+
+Each program is traced and compiled in a process of its own, as a session meets it: first with an empty cache, which it
+fills, then again with what the first has left. The gradient is that of Ψ, the integral of the square of an
+acceleration, by all numbers of the model. Processor time stands beside wall time: other load on the machine changes it
+least. "trace" is what no cache saves: Python that makes the program. Writes compile_time.json.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+SCENES = ("top", "four_bar", "quarter_car", "chain_2", "chain_8", "chain_32")
+PROGRAMS = ("simulate", "value_and_grad")
+STEPS = 100  # a scan: compile time does not depend on it
+
+
+def compile_once(scene: str, program: str) -> dict:
+    """Seconds to trace and to compile, in this process."""
+    import jax
+    import jax.numpy as jnp
+
+    import lgsens as lg
+    from lgsens.examples import QuarterCar, four_bar, spatial_chain, spinning_top
+
+    jax.config.update("jax_enable_x64", True)
+    if scene == "top":
+        model = spinning_top(0.7)
+    elif scene == "four_bar":
+        model = four_bar()
+    elif scene == "quarter_car":
+        model = QuarterCar.load().model()
+    else:
+        model = spatial_chain(int(scene.removeprefix("chain_")))
+    observed = sorted(model.bodies)[0]
+
+    def simulate(model):
+        return lg.simulate(model, t1=0.1, num_steps=STEPS, throw=False).states
+
+    def psi(model):
+        trajectory = lg.simulate(model, t1=0.1, num_steps=STEPS, throw=False)
+        return lg.time_integral(trajectory.t, jnp.sum(trajectory.body(observed).acceleration ** 2, axis=1))
+
+    function = simulate if program == "simulate" else jax.value_and_grad(psi)
+    begin, cpu_begin = time.perf_counter(), time.process_time()
+    lowered = jax.jit(function).lower(model)
+    traced = time.perf_counter()
+    lowered.compile()
+    return {
+        "trace_seconds": traced - begin,
+        "seconds": time.perf_counter() - begin,
+        "cpu_seconds": time.process_time() - cpu_begin,
+    }
+
+
+def measure(scene: str) -> dict:
+    """The programs of a scene, each in two processes that share a cache."""
+    found = {}
+    for program in PROGRAMS:
+        with tempfile.TemporaryDirectory() as cache:
+            settings = {
+                "JAX_COMPILATION_CACHE_DIR": cache,
+                "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+                "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+            }
+            command = [sys.executable, __file__, "--one", scene, program]
+            runs = [
+                subprocess.run(command, env=os.environ | settings, check=True, capture_output=True, text=True).stdout
+                for _ in range(2)
+            ]
+            size = sum(path.stat().st_size for path in Path(cache).rglob("*") if path.is_file())
+        first, again = (json.loads(run.splitlines()[-1]) for run in runs)
+        found[program] = {"first": first, "again": again, "cache_bytes": size}
+        print(f"{scene}, {program}: {first['seconds']:.1f} s, again {again['seconds']:.1f} s", flush=True)
+    return found
+
+
+def markdown(document: dict) -> str:
+    environment = document["environment"]
+    versions = ", ".join(f"{package} {version}" for package, version in environment["versions"].items())
+    lines = [
+        f"{environment['date']}, {environment['machine']['architecture']}, {environment['machine']['cores']} cores, "
+        f"load average {environment['load_average']}; {versions}.",
+        "",
+        "| scene | program | compile [s] (CPU) | of it trace [s] | cached [s] (CPU) | ratio | cache [MB] |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for scene, programs in document["scenes"].items():
+        for program, found in programs.items():
+            first, again = found["first"], found["again"]
+            cells = (
+                scene,
+                program,
+                *(f"{run['seconds']:.1f} ({run['cpu_seconds']:.1f})" for run in (first,)),
+                f"{first['trace_seconds']:.1f}",
+                f"{again['seconds']:.1f} ({again['cpu_seconds']:.1f})",
+                f"{first['seconds'] / again['seconds']:.1f}",
+                f"{found['cache_bytes'] / 1e6:.1f}",
+            )
+            lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder (default: %(default)s)")
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
+    parser.add_argument("--table", action="store_true", help="print the table of compile_time.json, measure nothing")
+    parser.add_argument("--readme", action="store_true", help="as --table, and put it into benchmarks/README.md")
+    parser.add_argument("--one", nargs=2, metavar=("SCENE", "PROGRAM"), help="one program in this process, as JSON")
+    arguments = parser.parse_args()
+    if arguments.one:
+        print(json.dumps(compile_once(*arguments.one)))
+        return
+    path = arguments.out / "compile_time.json"
+    document = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"scenes": {}}
+    if not (arguments.table or arguments.readme):
+        from rival_run import environment
+
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        for scene in arguments.scenes:
+            document["scenes"][scene] = measure(scene)
+            document["environment"] = environment({})
+            path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    text = markdown(document)
+    if arguments.readme:
+        from rival_tables import put_into
+
+        put_into(Path(__file__).parent / "README.md", text, "compile time")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

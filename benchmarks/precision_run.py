@@ -1,0 +1,188 @@
+"""One run of `work_precision.py`: families of programs at several steps or tolerances, measured together."""
+
+import importlib
+import importlib.util
+import json
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import rival_casadi
+import rival_diffrax
+import rival_sundials
+from rival_run import difference, environment
+from rival_scenes import SCENES, Scene
+from rival_timing import Program, compiled, measure
+from rivals import SINGLE_THREAD
+
+import lgsens as lg
+
+LEVELS = (1e-2, 1e-3, 1e-4, 1e-6)
+KIND = "gradient, p"
+
+
+class Point(NamedTuple):
+    """An lgsens route: a title for its settings, the integrator, the number of steps."""
+
+    title: str
+    integrator: Any
+    num_steps: int
+
+
+def alpha(num_steps: int, tolerance: float, rho: float = 0.9) -> Point:
+    return Point(f"ρ∞ = {rho}, Newton to {tolerance:.0e}", lg.GeneralizedAlpha(rho, tolerance=tolerance), num_steps)
+
+
+def richardson(num_steps: int, tolerance: float) -> Point:
+    scheme = lg.GeneralizedAlpha(tolerance=tolerance)
+    return Point(f"n and 2n steps, ρ∞ = 0.9, Newton to {tolerance:.0e}", lg.Richardson(scheme), num_steps)
+
+
+def explicit(scheme, num_steps: int) -> Point:
+    return Point(f"{type(scheme).__name__}, equal steps", lg.IndexReducedODE(scheme), num_steps)
+
+
+LGSENS = {
+    "quarter_car": {
+        "lgsens, generalized-α": [alpha(28, 1e-5), alpha(76, 1e-5)],
+        "lgsens, Richardson": [richardson(52, 1e-6)],
+        "lgsens, IndexReducedODE": [
+            *(explicit(diffrax.Dopri8(), n) for n in (24, 40)),
+        ],
+    },
+}
+CASADI_STEPS = {"quarter_car": (44, 68, 104, 288)}
+SUNDIALS = {
+    "quarter_car": {
+        "Adams": (1e-2, 3e-3, 3e-4, 5e-5, 3e-6, 5e-8),
+        "IDAS": (6e-5, 5e-8),
+    }
+}
+
+
+def lgsens_program(family: str, scene: Scene, point: Point) -> Program:
+    """Ψ and dΨ/dp of one route, by the public interface alone."""
+    body, quantity, axis = scene.observed
+    rate = lambda s: getattr(s.body(body), quantity)[..., axis] ** 2
+
+    def psi(p, num_steps=point.num_steps, integrator=point.integrator):
+        trajectory = lg.simulate(scene.model(p), t1=scene.t1, num_steps=num_steps, integrator=integrator, throw=False)
+        if trajectory.stages is not None:
+            return lg.Criterion(integrand=lambda s, _: rate(s))(trajectory)
+        return lg.time_integral(trajectory.t, rate(trajectory), order=trajectory.order)
+
+    if isinstance(point.integrator, lg.Richardson):
+        scheme = point.integrator.integrator
+        function = lambda p: lg.richardson(lambda n: psi(p, n, scheme), point.num_steps).value
+    else:
+        function = psi
+    return compiled(
+        jax.value_and_grad(function),
+        (jnp.asarray(scene.start),),
+        rival=family,
+        program=point.title,
+        kind=KIND,
+        num_steps=point.num_steps,
+        basis="",
+    )
+
+
+def diffrax_program(scene: Scene, scheme, num_steps: int | None, tolerance: float, longest: float) -> Program:
+    """Plain JAX and diffrax: equal steps, or error control (`num_steps` None); every step is kept for reverse mode."""
+    if num_steps is None:
+        control, dt0, count = rival_diffrax.controller(scene, tolerance, longest), None, 512
+        title = f"{scheme.__name__}, tolerance {tolerance:.0e}, steps of at most {1e3 * longest:g} ms"
+    else:
+        control, dt0, count = diffrax.ConstantStepSize(), scene.t1 / num_steps, num_steps + 1
+        title = f"{scheme.__name__}, equal steps"
+    adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=count)
+    psi = lambda p: rival_diffrax.criterion(scene, scheme, control, adjoint, scene.numbers(p), dt0, count)
+    p = jnp.asarray(scene.start)
+    program = compiled(
+        jax.value_and_grad(psi, has_aux=True), (p,), rival="diffrax", program=title, kind=KIND, num_steps=0, basis=""
+    )
+    prepare = program.prepare
+    assert prepare is not None
+
+    def show(found):
+        (value, _), gradient = found
+        return float(value), jnp.ravel(gradient)
+
+    def count_steps(program: Program) -> None:
+        prepare(program)
+        assert program.call is not None
+        program.num_steps = int(program.call()[0][1])
+
+    program.show, program.prepare = show, count_steps
+    return program
+
+
+DIFFRAX: dict[str, list[tuple]] = {
+    "quarter_car": [
+        *((diffrax.Tsit5, n, 0.0, 0.0) for n in (44,)),
+        *((diffrax.Dopri8, n, 0.0, 0.0) for n in (24, 40)),
+    ],
+}
+
+
+def families(scene: Scene) -> dict[str, Callable[[], list[Program]]]:
+    """All families of programs for a scene, each made when it is called."""
+    found: dict[str, Callable[[], list[Program]]] = {}
+    for family, points in LGSENS[scene.name].items():
+        found[family] = lambda family=family, points=points: [lgsens_program(family, scene, point) for point in points]
+    found["diffrax"] = lambda: [diffrax_program(scene, *point) for point in DIFFRAX[scene.name]]
+    if importlib.util.find_spec("casadi") is not None:
+        found["CasADi, RK4 in C"] = partial(_casadi, scene)
+        found["CasADi, SUNDIALS"] = lambda: rival_sundials.programs(scene, SUNDIALS[scene.name])
+    return found
+
+
+def _casadi(scene: Scene) -> list[Program]:
+    programs = rival_casadi.programs(scene, dict.fromkeys(CASADI_STEPS[scene.name], ""))
+    chosen = [program for program in programs if program.kind == KIND]
+    for program in chosen:
+        program.rival = "CasADi, RK4 in C"
+    return chosen
+
+
+def run(scenes: Iterable[str], chosen: Sequence[str] | None, repeats: int, path: Path, cache: str | None) -> None:
+    """Measure the scenes and write them to `path`; families that are not in `chosen` are left out (None: all)."""
+    jax.config.update("jax_enable_x64", True)
+    if cache is not None:
+        jax.config.update("jax_compilation_cache_dir", cache)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    document: dict[str, Any] = {"what": "Ψ and its gradient by p: error against time", "scenes": {}}
+    if path.exists():
+        document = json.loads(path.read_text(encoding="utf-8"))
+    references = json.loads((Path(__file__).parent / "results" / "rivals.json").read_text(encoding="utf-8"))[
+        "references"
+    ]
+    for name in scenes:
+        scene, reference = SCENES[name](), references[name]
+        programs = []
+        for family, make in families(scene).items():
+            if chosen is not None and not family.startswith(("lgsens", *chosen)):
+                continue
+            for program in make():
+                print(f"{name}: {family}, {program.program}, {program.num_steps or ''}", flush=True)
+                if program.prepare is not None:
+                    program.prepare(program)
+                programs.append(program)
+        records = measure(programs, repeats)
+        for record in records:
+            record["value_error"] = abs(record["value"] / reference["value"] - 1)
+            record["gradient_error"] = difference(record["gradient"], jnp.asarray(reference["gradient"]), scene.scale)
+            for key in ("gradient", "kind", "basis", "microseconds_per_step"):
+                del record[key]
+        document["scenes"][name] = {
+            "levels": LEVELS,
+            "repeats": repeats,
+            "parameters": len(scene.names),
+            "programs": records,
+            "environment": environment(SINGLE_THREAD),
+        }
+        path.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -1,0 +1,57 @@
+"""Work against precision: Ψ and its gradient on the quarter-car, by lgsens and by its rivals.
+
+    python benchmarks/work_precision.py [--scenes quarter_car] [--cache FOLDER] [--out benchmarks/results]
+    python benchmarks/work_precision.py --table     # table and plot again, from work_precision.json; measures nothing
+    python benchmarks/work_precision.py --readme    # and the table into benchmarks/README.md
+
+The gradient is that of Ψ₀ with respect to stiffness, damping and the 30 coordinates of the hardpoints. Each family of
+programs runs at several numbers of steps or tolerances; its error is that of the gradient against the motion itself
+(the references of `rivals.py --references`), relative to the largest effect of a relative change of a parameter. For
+each error asked for, the fastest program of a family that reaches it stands in the table. All run in one process on one
+thread and take turns, `--repeats` rounds; medians count, compilation apart. Compiling takes many minutes: `--cache`
+keeps compiled programs in a folder, so that a run that was ended goes on.
+"""
+
+import argparse
+import importlib
+import json
+import os
+from pathlib import Path
+
+from rivals import SINGLE_THREAD
+
+SCENES = ("quarter_car",)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder (default: %(default)s)")
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
+    parser.add_argument("--families", nargs="+", help="only these families of programs, lgsens's always (default: all)")
+    parser.add_argument("--repeats", type=int, default=5, help="rounds, at least 5 (default: %(default)s)")
+    parser.add_argument("--cache", help="folder for compiled programs (default: none)")
+    parser.add_argument("--table", action="store_true", help="print the table, draw the plot, measure nothing")
+    parser.add_argument("--readme", action="store_true", help="as --table, and put the table into benchmarks/README.md")
+    arguments = parser.parse_args()
+    if arguments.repeats < 5:
+        parser.error("--repeats must be at least 5")
+    path = arguments.out / "work_precision.json"
+    os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
+    if not (arguments.table or arguments.readme):
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        run = importlib.import_module("precision_run")
+        run.run(arguments.scenes, arguments.families, arguments.repeats, path, arguments.cache)
+    tables = importlib.import_module("precision_tables")
+    document = json.loads(path.read_text(encoding="utf-8"))
+    text = tables.markdown(document)
+    if arguments.readme:
+        importlib.import_module("rival_tables").put_into(
+            Path(__file__).parent / "README.md", text, "work against precision"
+        )
+    print(text)
+    for name in document["scenes"]:
+        tables.plot(document["scenes"][name], arguments.out / f"work_precision_{name}.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,290 @@
+"""Equal steps of an explicit Runge–Kutta scheme on the index-reduced equations, with their derivative by hand.
+
+One step, from (q, v) at t with v̇ and λ known, has the stages i and then two projections,
+
+    x_i = h Σ_j a_ij T⁻¹(x_j) v_j,    v_i = v + h Σ_j a_ij v̇_j,    q_i = q exp(x̃_i),    E(v̇_i, λ_i; q_i, v_i, t_i) = 0,
+
+    x = h Σ_j b_j T⁻¹(x_j) v_j,       P = [ M y + Bᵀμ; Φ + B y ] = 0             at q* = q exp(x̃),       q⁺ = q* exp(ỹ),
+    u = v + h Σ_j b_j v̇_j,            R = [ M d + Bᵀν; B d + B(q⁺) u ] = 0       with B at q*,           v⁺ = u + d,
+
+and at last E(v̇⁺, λ⁺; q⁺, v⁺, t⁺) = 0, the first stage of the next step. E is that of `factorized_accelerations`. Only
+E, P and R contain the numbers of the system. Differentiated at the solution, each is a solve with the matrix
+A = [[M, Bᵀ], [B, 0]] of its point, as for E:
+
+    A [v̇'; λ'] = −E_q q' − E_v v' − ε,     ε = E_p p' + E_t t',          and P, R alike.
+
+The ε of all stages of all steps are vectors that depend on the solution alone: they are found at once, before the loop
+over steps, which then carries nothing but (q', v', v̇'). Transposed, by JAX, the loop carries the adjoint variables and
+nothing of the size of the model; what they weigh is summed up once behind it. Each step is linearized anew from its
+stages, so that no matrix is kept.
+
+Source: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I (2008), §II.1; derivation: here.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from lgsens.dynamics import (
+    AbstractSystem,
+    ConstrainedInertia,
+    Inertia,
+    State,
+    constraint_velocity,
+    equations_of_motion,
+    factorized_accelerations,
+)
+
+
+class Coefficients(NamedTuple):
+    """a, b and c of a scheme, without stages that only its error estimate uses."""
+
+    a: np.ndarray
+    b: np.ndarray
+    c: np.ndarray
+
+    @classmethod
+    def of(cls, tableau) -> "Coefficients":
+        used = max(np.flatnonzero(tableau.b_sol)) + 1
+        a = np.zeros((used, used))
+        for i, row in enumerate(tableau.a_lower[: used - 1]):
+            a[i + 1, : i + 1] = row
+        return cls(a, np.asarray(tableau.b_sol)[:used], np.concatenate([[0.0], tableau.c])[:used])
+
+
+class Numbers(NamedTuple):
+    """What all steps depend on, or a tangent of it."""
+
+    inertia: Inertia
+    system: AbstractSystem
+    t0: Float[Array, ""]
+    h: Float[Array, ""]
+
+
+class Stage(NamedTuple):
+    """One stage: its increment and its state."""
+
+    x: Float[Array, " k"]
+    q: Any
+    v: Float[Array, " k"]
+    vdot: Float[Array, " k"]
+    lam: Float[Array, " m"]
+
+
+class Projection(NamedTuple):
+    """From where a step would end to the constraints: q* and u as above, the unknowns of P and of R, and q⁺."""
+
+    x: Float[Array, " k"]
+    q: Any
+    v: Float[Array, " k"]
+    y: Float[Array, " k"]
+    mu: Float[Array, " m"]
+    d: Float[Array, " k"]
+    nu: Float[Array, " m"]
+    projected: Any
+
+
+class Step(NamedTuple):
+    """The stages of a step, stacked, its projection and its end; stacked again, all steps."""
+
+    stages: Stage
+    projection: Projection
+    end: State
+
+
+def _weighted(h, weights, slopes):
+    return jax.tree.map(lambda k: h * (weights @ k), slopes)
+
+
+def _slopes(count: int, first) -> Any:
+    return jax.tree.map(lambda k: jnp.zeros((count, *k.shape), k.dtype).at[0].set(k), first)
+
+
+def _set(slopes, i, slope):
+    return jax.tree.map(lambda k, new: k.at[i].set(new), slopes, slope)
+
+
+def _kinematics(group, q, x, v):
+    """q exp(x̃) and T⁻¹(x) v."""
+    return group.retract(q, x), group.tangent_inv_mv(x, v)
+
+
+def _with(first, rest):
+    """One instant before a stack of others."""
+    return jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), first, rest)
+
+
+def projection(inertia: Inertia, system: AbstractSystem, x, q, v) -> Projection:
+    """One step of Newton's iteration for q, then v, with one factorization."""
+    if not system.constraint_names:
+        none = jnp.zeros(0, v.dtype)
+        return Projection(x, q, v, jnp.zeros_like(v), none, jnp.zeros_like(v), none, q)
+    kkt = ConstrainedInertia.of(inertia, system.constraint_jacobian(q))
+    still = jnp.zeros_like(v)
+    y, mu = kkt.solve(still, -system.constraint(q))
+    projected = system.group.retract(q, y)
+    d, nu = kkt.solve(still, -constraint_velocity(system, projected, v))
+    return Projection(x, q, v, y, mu, d, nu, projected)
+
+
+def _step(scheme: Coefficients, numbers: Numbers, begin: State, n) -> Step:
+    system, h = numbers.system, numbers.h
+    t = numbers.t0 + n * h
+    count = len(scheme.b)
+    first = Stage(jnp.zeros_like(begin.v), begin.q, begin.v, begin.vdot, begin.lam)
+
+    def stage(slopes, inputs):
+        i, weights, node = inputs
+        x, dv = _weighted(h, weights, slopes)
+        v = begin.v + dv
+        q, rate = _kinematics(system.group, begin.q, x, v)
+        vdot, lam = factorized_accelerations(numbers.inertia, system, q, v, t + node * h)
+        return _set(slopes, i, (rate, vdot)), Stage(x, q, v, vdot, lam)
+
+    slopes = _slopes(count, (begin.v, begin.vdot))  # T(0) is the unit matrix
+    slopes, stages = lax.scan(stage, slopes, _rows(scheme, h.dtype))
+    x, dv = _weighted(h, jnp.asarray(scheme.b, h.dtype), slopes)
+    done = projection(numbers.inertia, system, x, system.group.retract(begin.q, x), begin.v + dv)
+    q, v = done.projected, done.v + done.d
+    vdot, lam = factorized_accelerations(numbers.inertia, system, q, v, numbers.t0 + (n + 1) * h)
+    return Step(_with(first, stages), done, State(q=q, v=v, vdot=vdot, lam=lam, a=vdot))
+
+
+def _rows(scheme: Coefficients, dtype):
+    """Number, weights and node of each stage but the first."""
+    return jnp.arange(1, len(scheme.b)), jnp.asarray(scheme.a[1:], dtype), jnp.asarray(scheme.c[1:], dtype)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def equal_steps(settings: Any, num_steps: int, numbers: Numbers, first: State) -> Step:
+    """All steps from the state `first` at t0, stacked; `settings.tableau` is that of the scheme, as diffrax has it."""
+    scheme = Coefficients.of(settings.tableau)
+
+    def step(begin, n):
+        found = _step(scheme, numbers, begin, n)
+        return found.end, found
+
+    return lax.scan(step, first, jnp.arange(num_steps, dtype=numbers.h.dtype))[1]
+
+
+class _Residuals(NamedTuple):
+    """ε of a step: of its stages (the first excepted), of the two projections and of its end."""
+
+    stages: Any
+    projections: Any
+    end: Any
+
+
+def _motion(inertia: Inertia, system, t, q, v, vdot, lam):
+    return equations_of_motion(system, q, v, vdot, lam, t)
+
+
+def _corrections(inertia: Inertia, system, q, projected, v, y, mu, d, nu):
+    """P and R; M y and M d only where the numbers vary."""
+    jacobian = system.constraint_jacobian(q)
+    return (
+        (inertia.mass @ y + mu @ jacobian, system.constraint(q) + jacobian @ y),
+        (inertia.mass @ d + nu @ jacobian, jacobian @ d + constraint_velocity(system, projected, v)),
+    )
+
+
+def _pseudo_loads(scheme: Coefficients, numbers: Numbers, dnumbers: Numbers, step: Step, n) -> _Residuals:
+    """ε: how the equations of one step change with the numbers alone."""
+    of_numbers = (numbers.inertia, numbers.system), (dnumbers.inertia, dnumbers.system)
+
+    def motion(point, node):
+        t, dt = (z.t0 + (n + node) * z.h for z in (numbers, dnumbers))
+        function = lambda inertia, system, t: _motion(inertia, system, t, *point)
+        return jax.jvp(function, (*of_numbers[0], t), (*of_numbers[1], dt))[1]
+
+    stages = jax.tree.map(lambda leaf: leaf[1:], step.stages)
+    nodes = jnp.asarray(scheme.c[1:], n.dtype)
+    p, end = step.projection, step.end
+    fixed = lambda inertia, system: _corrections(inertia, system, p.q, p.projected, p.v, p.y, p.mu, p.d, p.nu)
+    return _Residuals(
+        stages=jax.vmap(motion)((stages.q, stages.v, stages.vdot, stages.lam), nodes),
+        projections=jax.jvp(fixed, *of_numbers)[1],
+        end=motion((end.q, end.v, end.vdot, end.lam), jnp.ones((), n.dtype)),
+    )
+
+
+def _negative(*trees):
+    return jax.tree.map(lambda *leaves: -sum(leaves), *trees)
+
+
+def _varied_step(scheme: Coefficients, numbers: Numbers, dh, begin: State, dbegin: State, step: Step, load, n) -> Step:
+    """The tangent of `_step` at the step `step`, given ε."""
+    system, h = numbers.system, numbers.h
+    group = system.group
+    t = numbers.t0 + n * h
+    relative = dh / h
+
+    def accelerations(point, dq, dv, t, load):
+        q, v, vdot, lam = point
+        equations = lambda q, v: equations_of_motion(system, q, v, vdot, lam, t)
+        _, change = jax.jvp(equations, (q, v), (dq, dv))
+        kkt = ConstrainedInertia.of(numbers.inertia, system.constraint_jacobian(q))
+        return kkt.solve(*_negative(change, load))
+
+    def advanced(x, v, weights, slopes):
+        dx, change = _weighted(h, weights, slopes)
+        return dx + relative * x, dbegin.v + change + relative * (v - begin.v)
+
+    def stage(slopes, inputs):
+        (i, weights, node), (at, load) = inputs
+        dx, dv = advanced(at.x, at.v, weights, slopes)
+        _, (dq, rate) = jax.jvp(partial(_kinematics, group), (begin.q, at.x, at.v), (dbegin.q, dx, dv))
+        dvdot, dlam = accelerations((at.q, at.v, at.vdot, at.lam), dq, dv, t + node * h, load)
+        return _set(slopes, i, (rate, dvdot)), Stage(dx, dq, dv, dvdot, dlam)
+
+    first = Stage(jnp.zeros_like(begin.v), dbegin.q, dbegin.v, dbegin.vdot, dbegin.lam)
+    slopes = _slopes(len(scheme.b), (dbegin.v, dbegin.vdot))
+    later = jax.tree.map(lambda leaf: leaf[1:], step.stages)
+    slopes, stages = lax.scan(stage, slopes, (_rows(scheme, h.dtype), (later, load.stages)))
+
+    p, end = step.projection, step.end
+    dx, dv = advanced(p.x, p.v, jnp.asarray(scheme.b, h.dtype), slopes)
+    _, dq = jax.jvp(group.retract, (begin.q, p.x), (dbegin.q, dx))
+    if system.constraint_names:
+        kkt = ConstrainedInertia.of(numbers.inertia, system.constraint_jacobian(p.q))
+        of_first = lambda q: _corrections(numbers.inertia, system, q, p.projected, p.v, p.y, p.mu, p.d, p.nu)
+        _, (change_p, change_r) = jax.jvp(of_first, (p.q,), (dq,))
+        dy, dmu = kkt.solve(*_negative(change_p, load.projections[0]))
+        _, dprojected = jax.jvp(group.retract, (p.q, p.y), (dq, dy))
+        velocity = partial(constraint_velocity, system)
+        _, change = jax.jvp(velocity, (p.projected, p.v), (dprojected, dv))
+        dd, dnu = kkt.solve(*_negative(change_r, (jnp.zeros_like(dv), change), load.projections[1]))
+    else:
+        dy, dmu, dprojected, dd, dnu = jnp.zeros_like(p.y), p.mu, dq, jnp.zeros_like(p.d), p.nu
+    done = Projection(dx, dq, dv, dy, dmu, dd, dnu, dprojected)
+    dv = dv + dd
+    t = numbers.t0 + (n + 1) * h
+    dvdot, dlam = accelerations((end.q, end.v, end.vdot, end.lam), dprojected, dv, t, load.end)
+    dend = State(q=dprojected, v=dv, vdot=dvdot, lam=dlam, a=dvdot)
+    return Step(_with(first, stages), done, dend)
+
+
+@equal_steps.defjvp
+def _rule(settings, num_steps, primals, tangents):
+    (numbers, first), (dnumbers, dfirst) = primals, tangents
+    scheme = Coefficients.of(settings.tableau)
+    steps = equal_steps(settings, num_steps, numbers, first)
+    count = jnp.arange(num_steps, dtype=numbers.h.dtype)
+    begins = jax.tree.map(lambda leaf: leaf[:-1], _with(first, steps.end))
+    loads = jax.vmap(partial(_pseudo_loads, scheme, numbers, dnumbers))(steps, count)
+
+    # In reverse mode nothing is kept of a step but its stages.
+    @partial(jax.checkpoint, prevent_cse=False)
+    def varied(dbegin, dh, begin, step, load, n):
+        return _varied_step(scheme, numbers, dh, begin, dbegin, step, load, n)
+
+    def step(dbegin, inputs):
+        found = varied(dbegin, dnumbers.h, *inputs)
+        return found.end, found
+
+    return steps, lax.scan(step, dfirst, (begins, steps, loads, count))[1]
