@@ -33,7 +33,7 @@ class Topology:
         start = 0
         for ends in constraints:
             kept = np.asarray(ends.kept)
-            self.rows.append(np.where(kept, start + np.cumsum(kept).reshape(kept.shape) - 1, -1))
+            self.rows.append(np.where(kept, start + np.cumsum(kept).reshape(kept.shape) - 1, -1).astype(np.int32))
             start += int(kept.sum())
         self.num_constraints = start
         self.mass = Pattern(index, index)

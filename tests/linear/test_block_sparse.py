@@ -1,0 +1,223 @@
+"""Block elimination against NumPy, and simulations with it against those with a dense LU."""
+
+import dataclasses
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lgsens as lg
+from lgsens.dynamics import initial_state, is_redundant, tangents, times_tangent_operator
+from lgsens.examples import four_bar, spatial_chain
+from lgsens.integrate import factorize_iteration_matrix
+from lgsens.linear import LU, Inverse
+
+H = 1e-3
+
+
+def branched(links: int = 3) -> lg.Model:
+    """A planar trolley with pendulums of two links each, springs between their ends, one loop closed by a rod."""
+    body = lambda at, **more: lg.RigidBody(1.0, (0.02, 0.03, 0.04), position=at, **more)
+    bodies = {"trolley": body((0.0, 0.0, 0.0), free="x y rz")}
+    joints: dict = {}
+    forces: dict = {"gravity": lg.Gravity((0.0, 0.0, -9.81))}
+    for i in range(links):
+        x = 0.5 * i
+        bodies |= {
+            f"upper{i}": body((x, 0.0, -0.25)),
+            f"lower{i}": body((x, 0.0, -0.75), angular_velocity=(0.3, 0.5, 0.1)),
+        }
+        joints[f"hinge{i}"] = lg.RevoluteJoint("trolley", f"upper{i}", at=(x, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+        joints[f"ball{i}"] = lg.SphericalJoint(f"upper{i}", f"lower{i}", at=(x, 0.0, -0.5))
+        if i:
+            ends = {"at_a": (x - 0.5, 0.0, -1.0), "at_b": (x, 0.0, -1.0)}
+            forces[f"spring{i}"] = lg.SpringDamper(f"lower{i - 1}", f"lower{i}", stiffness=50.0, damping=1.0, **ends)
+    joints["rod"] = lg.DistanceJoint(
+        "lower0", f"lower{links - 1}", at_a=(0, 0, -1.0), at_b=(0.5 * links - 0.5, 0.1, -1.0)
+    )
+    return lg.Model(bodies, joints, forces)
+
+
+SCENES = {"chain": lambda: spatial_chain(9), "four_bar": four_bar, "branched": branched}
+
+
+def systems(name: str):
+    system = SCENES[name]().system()
+    return [dataclasses.replace(system, linear_solver=solver) for solver in (lg.DenseLU(), lg.BlockSparse())]
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def pair(request):
+    """A system, dense and sparse, and a point off its constraints."""
+    dense, sparse = systems(request.param)
+    assert dense.elimination is None
+    assert sparse.elimination.levels
+    rng = np.random.default_rng(0)
+    q, v = dense.reference()
+    k, m = len(v), len(dense.constraint_names)
+    q = dense.group.retract(q, jnp.asarray(0.1 * rng.normal(size=k)))
+    v, vdot, lam = (jnp.asarray(rng.normal(size=size)) for size in (k, k, m))
+    return dense, sparse, (q, v, vdot, lam, jnp.asarray(0.1))
+
+
+def close(actual, expected, *, ulps):
+    scale = max(float(np.abs(expected).max()), 1e-300)
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=ulps * np.finfo(float).eps * scale)
+
+
+def test_matrices_and_their_products(pair):
+    """M, K_t, C_t, B: as arrays, times vectors and columns from both sides, times T(x)."""
+    dense, sparse, point = pair
+    x = jnp.asarray(0.2 * np.random.default_rng(1).normal(size=len(point[1])))
+    found, expected = tangents(sparse, *point), tangents(dense, *point)
+    for matrix, array in (*zip(found, expected), (sparse.sparse_mass_matrix(), dense.mass_matrix())):
+        rng = np.random.default_rng(2)
+        right, left = (jnp.asarray(rng.normal(size=size)) for size in (array.shape[1], array.shape[0]))
+        # sums of up to 12 terms for each of a few elements
+        close(matrix.dense(), array, ulps=0)
+        close(matrix.to_numpy(), array, ulps=8)
+        close(matrix @ right, array @ right, ulps=64)
+        close(matrix @ jnp.stack([right, -right], axis=1), array @ jnp.stack([right, -right], axis=1), ulps=64)
+        close(left @ matrix, left @ array, ulps=64)
+        close(matrix.T @ left, array.T @ left, ulps=64)
+        close((2.0 * matrix + matrix).dense(), 3.0 * array, ulps=4)
+    close(sparse.sparse_mass_matrix().trace(), np.trace(dense.mass_matrix()), ulps=16)
+    turned = times_tangent_operator(sparse, x, (found.stiffness, found.constraint_jacobian))
+    for actual, wanted in zip(
+        turned, times_tangent_operator(dense, x, (expected.stiffness, expected.constraint_jacobian))
+    ):
+        close(actual.dense(), wanted, ulps=16)
+
+
+@pytest.mark.parametrize("kind", [LU, Inverse])
+def test_factors_solve_with_the_iteration_matrix_and_its_transpose(pair, kind):
+    dense, sparse, point = pair
+    scheme, rng = lg.GeneralizedAlpha(), np.random.default_rng(3)
+    x = jnp.asarray(0.1 * rng.normal(size=len(point[1])))
+    factors = [
+        factorize_iteration_matrix(scheme, system, tangents(system, *point), mass, x, H, kind)
+        for system, mass in ((dense, dense.mass_matrix()), (sparse, sparse.sparse_mass_matrix()))
+    ]
+    columns = [jnp.asarray(rng.normal(size=(size, 2))) for size in (len(point[1]), len(point[3]))]
+    for transposed in (False, True):
+        expected, actual = (np.concatenate(f.solve(*columns, transposed=transposed)) for f in factors)
+        # the scaled matrix has a condition below 1e5 in these scenes
+        close(actual, expected, ulps=1e5)
+        single = np.concatenate(factors[1].solve(*(c[:, 0] for c in columns), transposed=transposed))
+        close(single, actual[:, 0], ulps=1e4)
+
+
+def test_levels_grow_with_the_logarithm():
+    """Twice the links, one level more or two: random neighbours leave two fifths at least."""
+    plans = {n: spatial_chain(n).system().elimination for n in (32, 64, 128)}
+    depth = [len(plan.levels) for plan in plans.values()]
+    assert all(0 <= later - earlier <= 2 for earlier, later in itertools.pairwise(depth))
+    numbers = [plan.numbers - len(plan.rest) ** 2 for plan in plans.values()]
+    assert numbers[2] < 2.6 * numbers[1] < 2.6**2 * numbers[0]
+    assert all(len(plan.rest) < 130 for plan in plans.values())
+
+
+def test_everything_is_eliminated_once():
+    plan = systems("branched")[1].elimination
+    gone = np.concatenate([level.own.ravel() for level in plan.levels] + [plan.rest])
+    np.testing.assert_array_equal(np.sort(gone[gone < plan.size]), np.arange(plan.size))
+
+
+def objective(body: str):
+    def psi(system):
+        trajectory = lg.simulate(system, t1=0.02, num_steps=10)
+        motion = trajectory.body(body)
+        return lg.time_integral(trajectory.t, motion.acceleration[:, 2] ** 2 + motion.position[:, 0])
+
+    return psi
+
+
+@pytest.mark.parametrize(
+    ("name", "body"), [("chain", "link8"), pytest.param("branched", "lower1", marks=pytest.mark.slow)]
+)
+def test_gradient_of_every_number(name, body):
+    """Both solvers factorize the same matrices: value and gradient agree to round-off of the accelerations."""
+    dense, sparse = systems(name)
+    (value, gradient), (expected, wanted) = (
+        eqx.filter_jit(eqx.filter_value_and_grad(objective(body)))(system) for system in (sparse, dense)
+    )
+    # accelerations carry the round-off of constraints over βh²: 1e-16/1e-6 × about ten
+    np.testing.assert_allclose(value, expected, rtol=1e-8)
+    largest = max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(wanted) if leaf.size)
+    for actual, leaf in zip(jax.tree.leaves(gradient), jax.tree.leaves(wanted)):
+        np.testing.assert_allclose(actual, leaf, rtol=1e-7, atol=1e-8 * largest)
+
+
+@pytest.mark.slow
+def test_forward_and_reverse_mode_in_a_batch():
+    """jacfwd, jacrev and AdjointVariable of the same criterion, three designs at once."""
+
+    def psi(p, sensitivity=lg.DirectDifferentiation()):
+        model = spatial_chain(6, length=p[0], tilt=p[1])
+        system = dataclasses.replace(model.system(), linear_solver=lg.BlockSparse())
+        trajectory = lg.simulate(system, t1=0.02, num_steps=10, sensitivity=sensitivity)
+        return lg.time_integral(trajectory.t, trajectory.body("link5").position[:, 2])
+
+    designs = jnp.asarray([[0.3, 1.0], [0.25, 0.8], [0.4, 1.2]])
+    forward = jax.jit(jax.vmap(jax.jacfwd(psi)))(designs)
+    # round-off of the initial accelerations, through ten steps
+    near = {"rtol": 1e-9, "atol": 1e-9 * float(jnp.abs(forward).max())}
+    np.testing.assert_allclose(jax.jit(jax.vmap(jax.jacrev(psi)))(designs), forward, **near)
+    explicit = jax.jit(jax.vmap(jax.grad(lambda p: psi(p, lg.AdjointVariable()))))(designs)
+    np.testing.assert_allclose(explicit, forward, **near)
+    one = jax.jit(jax.grad(psi))(designs[1])
+    np.testing.assert_allclose(one, forward[1], **near)
+
+
+def test_nothing_dense_in_a_long_chain():
+    """No array of a simulation of 64 links, or of its gradient, has as many entries as K_t."""
+    system = spatial_chain(64).system()
+    k = system.group.dim
+    program = jax.make_jaxpr(eqx.filter_value_and_grad(objective("link63")))(system)
+    sizes = [
+        int(np.prod(variable.aval.shape))
+        for equation in equations(program.jaxpr)
+        for variable in equation.outvars
+        if hasattr(variable.aval, "shape")
+    ]
+    assert max(sizes) < k * k
+
+
+def equations(jaxpr):
+    for equation in jaxpr.eqns:
+        yield equation
+        for value in jax.tree.leaves(equation.params, is_leaf=lambda x: hasattr(x, "jaxpr") or hasattr(x, "eqns")):
+            inner = getattr(value, "jaxpr", value)
+            if hasattr(inner, "eqns"):
+                yield from equations(inner)
+
+
+def two_hinges(*, apart: bool) -> lg.Model:
+    """A door on two hinges with one axis, which repeat five equations of each other; or on one."""
+    hinges = {"low": lg.RevoluteJoint(None, "door", at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))}
+    if not apart:
+        hinges["high"] = lg.RevoluteJoint(None, "door", at=(0.0, 0.0, 2.0), axis=(0.0, 0.0, 1.0))
+    bodies = {"door": lg.RigidBody(20.0, (7.0, 8.0, 2.0), position=(0.5, 0.0, 1.0))}
+    chain = spatial_chain(4)
+    return lg.Model(chain.bodies | bodies, chain.joints | hinges, chain.forces, linear_solver=lg.BlockSparse())
+
+
+def test_redundant_constraints_are_found_and_named():
+    good, bad = (two_hinges(apart=apart).system() for apart in (True, False))
+    assert not is_redundant(good, good.sparse_constraint_jacobian(good.pose))
+    assert is_redundant(bad, bad.sparse_constraint_jacobian(bad.pose))
+    assert int(initial_state(good, jnp.asarray(0.0)).result) == lg.RESULTS.successful
+    with pytest.raises(ValueError, match=r"\['high', 'low'\]"):
+        lg.simulate(bad, t1=0.1, num_steps=10)
+
+
+def test_the_solver_is_chosen_by_size_and_can_be_given():
+    assert spatial_chain(3).system().elimination is None
+    assert spatial_chain(32).system().elimination is not None
+    chain = spatial_chain(32)
+    assert lg.Model(chain.bodies, chain.joints, linear_solver=lg.DenseLU()).system().elimination is None
+    with pytest.raises(ValueError, match=r"`linear_solver` must be DenseLU\(\), BlockSparse\(\) or None, got 'sparse'"):
+        lg.Model(chain.bodies, chain.joints, linear_solver="sparse")
