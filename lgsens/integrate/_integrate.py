@@ -226,12 +226,6 @@ def integrate_onward(
         x = increment(scheme, state, state.a, h)
         return factorize_iteration_matrix(scheme, system, at_state, constants.mass, x, h, Inverse)
 
-    def renewed(previous, n, carry):
-        # The barrier ties what is computed to the turn of the loop: XLA moves what does not depend on it out of the
-        # loop, and would compute it in every step.
-        due, previous, n = lax.optimization_barrier((carry[0], previous, n))
-        return ~due, inverse(previous, n)
-
     def step(carry, n):
         previous, guess, earlier, age, running = carry
         if earlier is not None:
@@ -240,7 +234,8 @@ def integrate_onward(
             # because `cond` would copy the inverse.
             due = (jnp.mod(n, scheme.factor_every) == 0) | ((guess.contraction >= _SLOW) & (age > 1))
             age = jnp.where(due, 0, age) + 1
-            _, earlier = lax.while_loop(lambda carry: carry[0], partial(renewed, previous, n), (due, earlier))
+            renewed = lambda carry: (jnp.zeros((), bool), inverse(previous, n))
+            _, earlier = lax.while_loop(lambda carry: carry[0], renewed, (due, earlier))
         t = t0 + (n + 1) * h
         state, guess, stats = take_step(scheme, system, constants, previous, guess, earlier, running, t, h)
         return (state, guess, earlier, age, stats.converged), (output(state, t), stats)
