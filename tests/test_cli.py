@@ -32,6 +32,7 @@ def optimized(tmp_path_factory):
     return status, out, json.loads((out / "result.json").read_text(encoding="utf-8"))
 
 
+@pytest.mark.slow
 def test_the_optimum_is_better_feasible_and_constrained(optimized):
     status, _, result = optimized
     assert status == 0
@@ -50,6 +51,7 @@ def test_the_optimum_is_better_feasible_and_constrained(optimized):
         assert design["lower"] < design["after"] < design["upper"]
 
 
+@pytest.mark.slow
 def test_the_report_is_complete(optimized):
     _, out, result = optimized
     assert sorted(path.name for path in out.iterdir()) == [
@@ -74,6 +76,7 @@ def test_the_report_is_complete(optimized):
     assert result["seconds"]["compilation"] > 0 and result["seconds"]["optimization"] > 0
 
 
+@pytest.mark.slow
 def test_an_existing_directory_is_left_alone(optimized, capsys):
     _, out, _ = optimized
     before = (out / "result.json").read_bytes()

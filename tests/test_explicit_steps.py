@@ -16,7 +16,9 @@ from lgsens.examples import four_bar, spinning_top
 STEPS = 3
 
 
-@pytest.mark.parametrize("model", [spinning_top(0.7), four_bar()], ids=["top", "four_bar"])
+@pytest.mark.parametrize(
+    "model", [spinning_top(0.7), pytest.param(four_bar(), marks=pytest.mark.slow)], ids=["top", "four_bar"]
+)
 def test_derivative_by_hand(model):
     """Every output of the steps, forwards and transposed, against JAX's derivative of the loop itself.
 

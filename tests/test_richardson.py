@@ -54,6 +54,7 @@ TOP = load("spinning_top_brulls")["value"]["l_1.0_reproduces_published_number"]
 TOP_SLOPE = load("spinning_top_brulls")["gradient"]["l_1.0_reproduces_published_number"]["alpha0"]
 
 
+@pytest.mark.slow
 def test_order_of_a_function():
     """Criterion and gradient against the independent reference: 16 times better with half the step, and the estimate.
 

@@ -123,6 +123,7 @@ def designs_of(single, count):
     return np.array([compiled(jax.tree.map(lambda leaf, i=i: leaf[i], own)) for i in range(count)])
 
 
+@pytest.mark.slow
 def test_two_processes(tmp_path, single):
     """Both get everything, the first one writes the folder; a part of it is there when they start."""
     with socket.socket() as found:
@@ -188,6 +189,7 @@ def test_trajectories_say_whether_they_succeeded():
     assert found.values.states.v.shape == (4, 4, 6)
 
 
+@pytest.mark.slow
 def test_gradients_and_models():
     """A stack of models as designs; the gradient is a stack of models. A list of models is the same."""
     angles = jnp.linspace(0.5, 0.9, 5)

@@ -47,6 +47,7 @@ def linkages():
     return scenes
 
 
+@pytest.mark.slow
 def test_planar_linkage_moves_as_in_space(linkages):
     space, plane, pivots = (simulate(linkages[k]) for k in (18, 9, 5))
     for name in ("crank", "coupler", "rocker"):
@@ -125,6 +126,7 @@ def cars():
     return [jax.jit(both, static_argnums=1)(CAR.spring.rate, chassis) for chassis in ("guided", "heave")]
 
 
+@pytest.mark.slow
 def test_heaving_chassis_is_the_guided_one(cars):
     guided, heave = cars
     # The same discrete equations. Steps are solved to round-off: 1e-16 m in positions and 1e-16/h² = 1e-12 m/s² in
@@ -185,6 +187,7 @@ def swinging(length, pivot, rate):
     return lg.Model(bodies, {"pin": lg.SphericalJoint("crank", "rod", at=pin)}, forces)
 
 
+@pytest.mark.slow
 def test_gradients_of_reduced_bodies():
     """DDM = AVM = central differences, also by the place of a pivot."""
     parameters = jnp.asarray(0.8), jnp.array([0.1, 0.0, 0.2]), jnp.asarray(12.0)

@@ -129,6 +129,7 @@ def measured(model, bodies, joints, forces):
     }
 
 
+@pytest.mark.slow
 def test_initial_state_is_the_same(scenes):
     """Velocities that are not those of one body are projected alike; accelerations and all forces follow."""
     every = lambda model: measured(model, model.bodies, model.joints, set(model.forces) - {"gravity"})

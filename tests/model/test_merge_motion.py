@@ -161,6 +161,7 @@ def test_gradients_by_every_number():
     assert np.isfinite(value)
 
 
+@pytest.mark.slow
 def test_equilibrium_preload_and_ground():
     """A bar of two parts, one of which a spring holds; its support and a weight on it are fixed to the ground."""
     bodies = {

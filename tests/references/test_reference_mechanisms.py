@@ -10,7 +10,12 @@ from lgsens.examples import PROBLEMS, four_bar, slider_crank
 
 
 @pytest.mark.parametrize(
-    "name", ["simple_pendulum_A01", pytest.param("slider_crank_sundials", marks=pytest.mark.slow), "four_bar_spring"]
+    "name",
+    [
+        "simple_pendulum_A01",
+        pytest.param("slider_crank_sundials", marks=pytest.mark.slow),
+        pytest.param("four_bar_spring", marks=pytest.mark.slow),
+    ],
 )
 def test_criteria_and_gradients(name):
     check_criteria(name)
@@ -64,6 +69,7 @@ def expect_slider_crank(state):
     return {name: np.array(state[name]) for name in ("q", "qd", "qdd", "lam")}
 
 
+@pytest.mark.slow
 def test_motion_of_the_slider_crank():
     states = document("slider_crank_sundials.json")["states"]
     check_states("slider_crank_sundials", states, observe_slider_crank, expect_slider_crank)

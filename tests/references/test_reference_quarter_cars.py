@@ -12,6 +12,7 @@ FIVE_LINK = [name for name in PROBLEMS if name.startswith("five_link_quarter_car
 
 
 @pytest.mark.parametrize("name", LINEAR)
+@pytest.mark.slow
 def test_criteria_and_gradients_of_the_linear_car(name):
     check_criteria(name)
 

@@ -123,6 +123,7 @@ def test_division(num_steps, checkpoints, every, expected):
 
 
 @pytest.mark.parametrize("kind", [DIRECT, ADJOINT])
+@pytest.mark.slow
 def test_memory_grows_as_the_root(kind):
     """What a longer run adds: its outputs and their cotangents, 8 bytes each per step, and √n states."""
     side = lambda s: s.body("top").position[0] ** 2

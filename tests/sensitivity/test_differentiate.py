@@ -8,7 +8,7 @@ from helpers import says
 
 import lgsens as lg
 from lgsens.examples import spinning_top
-from lgsens.integrate import Factors
+from lgsens.linear import LU
 from lgsens.sensitivity._blocks import Blocks
 
 SIDE = lg.Criterion(integrand=lambda s, p: s.body("top").position[0] ** 2)
@@ -117,15 +117,15 @@ def test_one_factorization_for_all_parameters_and_criteria(method, monkeypatch):
     """Factors in the program: as many for three parameters and criteria as for one of each, and not in a batch,
     except over the steps of a block."""
     made = []
-    block = (Blocks.of(SETTINGS["num_steps"], 9).length, 9, 9)
-    original = Factors.of.__func__
+    block = (Blocks.of(SETTINGS["num_steps"], 81).length, 9, 9)
+    original = LU.of.__func__
 
-    def counted(cls, dynamic, *rest):
-        factors = original(cls, dynamic, *rest)
+    def counted(cls, matrix):
+        factors = original(cls, matrix)
         made.append(factors.lu.shape)
         return factors
 
-    monkeypatch.setattr(Factors, "of", classmethod(counted))
+    monkeypatch.setattr(LU, "of", classmethod(counted))
 
     def factorizations(criteria, build, p):
         made.clear()

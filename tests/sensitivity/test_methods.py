@@ -33,7 +33,9 @@ def error(found, wanted):
     return np.abs(found - wanted).max(axis=1) / np.abs(wanted).max(axis=1)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "four_bar")) for name in SCENES]
+)
 def test_discrete_methods_are_the_derivative_of_the_scheme(name):
     """DDM on the fly, AVM, autodiff of the loops, and sixth-order differences: one derivative."""
     direct = gradients(name, lg.DirectDifferentiation(), 0.2)

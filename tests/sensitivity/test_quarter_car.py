@@ -124,6 +124,7 @@ def difference_step(name, leaf):
     return 3e-4  # points and lengths [m]
 
 
+@pytest.mark.slow
 def test_gradient_of_every_leaf():
     """Ψ₀ with respect to every number of the model: masses, inertias, hardpoints, axes, rates, road, initial state.
 
@@ -164,6 +165,7 @@ def test_gradient_of_every_leaf():
     assert silent == WITHOUT_EFFECT
 
 
+@pytest.mark.slow
 def test_forward_and_reverse_agree():
     """jacfwd, and grad through AdjointVariable, for k, c and the fifteen chassis hardpoints, the preload re-solved."""
     names = sorted(CAR.links)
@@ -186,6 +188,7 @@ def test_forward_and_reverse_agree():
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * float(jnp.abs(b).max()))
 
 
+@pytest.mark.slow
 def test_reverse_mode_keeps_states_only():
     """Temporary memory of the compiled gradient at 1000 steps: within 3 × the stored trajectory."""
     model = CAR.model()
