@@ -33,9 +33,7 @@ def error(found, wanted):
     return np.abs(found - wanted).max(axis=1) / np.abs(wanted).max(axis=1)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "four_bar")) for name in SCENES]
-)
+@pytest.mark.parametrize("name", [pytest.param("four_bar", marks=pytest.mark.slow), *SCENES[1:]])
 def test_discrete_methods_are_the_derivative_of_the_scheme(name):
     """DDM on the fly, AVM, autodiff of the loops, and sixth-order differences: one derivative."""
     direct = gradients(name, lg.DirectDifferentiation(), 0.2)
@@ -105,6 +103,7 @@ def top_gradient(method, num_steps, **settings):
     ).gradient
 
 
+@pytest.mark.slow
 def test_continuous_adjoint_on_the_papers_top():
     """Fig. 2: 1.2e-4, 2.9e-5, 7.3e-6 at h = 2e-3, 1e-3, 5e-4; all of it through π and ρ and the constraint's ν."""
     method = lg.ContinuousAdjoint(None)
