@@ -19,6 +19,7 @@ m³/3 instead of 2 (k + m)³/3 operations: an eighteenth on the quarter-car (k =
 diagonal, since the rows of B have different units.
 """
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -28,6 +29,7 @@ import jax.scipy.linalg as jsl
 from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens.dynamics._matrices import kkt_product
 from lgsens.dynamics._system import AbstractSystem
 
 
@@ -61,11 +63,6 @@ class ConstrainedInertia(eqx.Module):
         factor = jnp.linalg.cholesky(complement * scale[:, None] * scale[None, :], symmetrize_input=False)
         return cls(inertia, jacobian, factor, scale)
 
-    def _apply(self, unknown):
-        k = self.inertia.mass.shape[0]
-        x, mu = unknown[:k], unknown[k:]
-        return jnp.concatenate([self.inertia.mass @ x + mu @ self.jacobian, self.jacobian @ x])
-
     def _eliminate(self, rhs):
         inverse, jacobian = lax.stop_gradient((self.inertia.inverse, self.jacobian))
         f, c = rhs[: inverse.shape[0]], rhs[inverse.shape[0] :]
@@ -76,7 +73,8 @@ class ConstrainedInertia(eqx.Module):
     def solve(self, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
         """x and μ of A [x; μ] = [force; rate]; its own transpose, and differentiable through M and B."""
         rhs = jnp.concatenate([force, rate])
-        solution = lax.custom_linear_solve(self._apply, rhs, lambda _, rhs: self._eliminate(rhs), symmetric=True)
+        product = partial(kkt_product, self.inertia.mass, self.jacobian)
+        solution = lax.custom_linear_solve(product, rhs, lambda _, rhs: self._eliminate(rhs), symmetric=True)
         return solution[: force.shape[0]], solution[force.shape[0] :]
 
 

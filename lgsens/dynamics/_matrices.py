@@ -1,5 +1,6 @@
 """The matrices of a system as its linear solver wants them, sparse or dense, and the equations with M and B."""
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -75,6 +76,12 @@ def kkt_solve(mass, jacobian, force, rate) -> tuple[Float[Array, " k"], Float[Ar
     return solution[:k], scale * solution[k:]
 
 
+def kkt_product(mass: Matrix, jacobian: Matrix, unknown) -> Float[Array, " k+m"]:
+    """[[M, Bᵀ], [B, 0]] [x; μ]."""
+    x, mu = unknown[: mass.shape[0]], unknown[mass.shape[0] :]
+    return jnp.concatenate([mass @ x + mu @ jacobian, jacobian @ x])
+
+
 class ConstrainedMass(eqx.Module):
     """[[M, Bᵀ], [B, 0]]."""
 
@@ -95,11 +102,7 @@ class ConstrainedMass(eqx.Module):
         factors, k = self.factors, force.shape[0]
         if factors is None:
             return kkt_solve(self.mass, self.jacobian, force, rate)
-
-        def product(unknown):
-            x, mu = unknown[:k], unknown[k:]
-            return jnp.concatenate([self.mass @ x + mu @ self.jacobian, self.jacobian @ x])
-
+        product = partial(kkt_product, self.mass, self.jacobian)
         solve = lambda _, rhs: jnp.concatenate(factors.solve(rhs[:k], rhs[k:]))
         solution = lax.custom_linear_solve(product, jnp.concatenate([force, rate]), solve, symmetric=True)
         return solution[:k], solution[k:]

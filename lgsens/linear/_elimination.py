@@ -31,7 +31,7 @@ class Elimination:
     def __init__(self, levels: Sequence[Level], size: int):
         self.levels, self.size = tuple(levels), size
         gone = np.concatenate([level.own.ravel() for level in levels]) if levels else np.zeros(0, int)
-        self.rest = np.setdiff1d(np.arange(size), gone)
+        self.rest = np.setdiff1d(np.arange(size), gone).astype(np.int32)  # as in `Pattern`
 
     @cached_property
     def _starts(self) -> np.ndarray:

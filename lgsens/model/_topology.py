@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lgsens.liegroups import Poses
 from lgsens.linear import AbstractLinearSolver, Elimination, Pattern, elimination
 from lgsens.model._frames import ROTATION
 
@@ -85,9 +86,4 @@ def _join(near: list[set[int]], group: set[int]) -> None:
 
 @lru_cache(maxsize=64)
 def topology(free: tuple[tuple[int, ...], ...], constraints: tuple[Ends, ...], loads: tuple[Ends, ...]) -> Topology:
-    index = np.full((len(free), 6), -1, np.int32)
-    start = 0
-    for row, own in zip(index, free):
-        row[list(own)] = start + np.arange(len(own))
-        start += len(own)
-    return Topology(index, constraints, loads)
+    return Topology(Poses(free).index.astype(np.int32), constraints, loads)

@@ -11,6 +11,7 @@ import pytest
 
 import lgsens as lg
 from lgsens.dynamics import initial_state, is_redundant, tangents, times_tangent_operator
+from lgsens.dynamics._matrices import ConstrainedMass
 from lgsens.examples import four_bar, spatial_chain
 from lgsens.integrate import factorize_iteration_matrix
 from lgsens.linear import LU, Inverse
@@ -221,3 +222,19 @@ def test_the_solver_is_chosen_by_size_and_can_be_given():
     assert lg.Model(chain.bodies, chain.joints, linear_solver=lg.DenseLU()).system().elimination is None
     with pytest.raises(ValueError, match=r"`linear_solver` must be DenseLU\(\), BlockSparse\(\) or None, got 'sparse'"):
         lg.Model(chain.bodies, chain.joints, linear_solver="sparse")
+
+
+def test_single_precision_after_double():
+    """What is kept of a topology serves both: the factors of each solve to their own round-off."""
+    for enabled in (True, False):
+        with jax.enable_x64(enabled):
+            system = dataclasses.replace(spatial_chain(9).system(), linear_solver=lg.BlockSparse())
+            q, v = system.reference()
+            jacobian = system.sparse_constraint_jacobian(q)
+            mass = system.sparse_mass_matrix()
+            ones, none = jnp.ones_like(v), jnp.zeros(jacobian.shape[0], v.dtype)
+            x, mu = ConstrainedMass.of(system, q).solve(mass @ ones, none)
+            left = mass @ x + mu @ jacobian - mass @ ones
+            # a sum of a dozen terms, through a condition below 1e3
+            assert float(jnp.abs(left).max()) < 1e3 * float(jnp.finfo(v.dtype).eps) * float(jnp.abs(mass @ ones).max())
+            assert v.dtype == (jnp.float64 if enabled else jnp.float32)
