@@ -1,23 +1,27 @@
 """How a step, its gradient, compilation and memory grow with the length of a chain.
 
     python benchmarks/chain.py [--links 8 64 512] [--solvers auto dense] [--out benchmarks/results]
+    python benchmarks/chain.py --readme   # the table of chain.json, into benchmarks/README.md; measures nothing
 
 The spatial chain of hinged links, 6 N coordinates and 5 N constraints, h = 1 ms, its end no faster than 8 m/s. Time per
-step is the difference of runs of 20 and 100 steps over the 80 between them, medians of `--repeats` calls after one that
-compiles, so that the initial state does not count; "gradient" is that of Ψ, the integral of the square of the last
-link's height, by all numbers of the assembled system, in reverse mode. "auto" is the linear solver that the model
-chooses. The slope is that of log time over log N between the last two lengths. Writes chain.json and prints a table.
+step is the difference of runs of 20 and 100 steps over the 80 between them, so that the initial state does not count:
+medians of at least `--repeats` rounds of all four programs after one that compiles. "gradient" is that of Ψ, the
+integral of the square of the last link's height, by all numbers of the assembled system, in reverse mode. "auto" is the
+linear solver that the model chooses. The slope is that of log time over log N between two lengths. Writes chain.json
+and prints a table.
 """
 
-import argparse
 import dataclasses
 import itertools
 import json
 import math
 import os
-import platform
+import statistics
 import time
 from pathlib import Path
+
+from benchmark import SINGLE_THREAD, circumstances, environment, interleaved, options, write
+from rival_tables import put_into
 
 STEPS = (20, 100)
 H = 1e-3
@@ -28,7 +32,6 @@ def measure(links: int, solver: str, repeats: int) -> dict:
     import jax
 
     import lgsens as lg
-    from lgsens._cost import median_seconds
     from lgsens.examples import spatial_chain
 
     started = time.perf_counter()
@@ -39,7 +42,7 @@ def measure(links: int, solver: str, repeats: int) -> dict:
     plan = system.elimination
     found["levels"] = [] if plan is None else [[*level.own.shape, level.boundary.shape[1]] for level in plan.levels]
     found["dense_rest"] = len(system.constraint_names) + system.group.dim if plan is None else len(plan.rest)
-    seconds: dict = {}
+    calls: dict = {}
     for steps in STEPS:
 
         def psi(system, steps=steps):
@@ -52,11 +55,17 @@ def measure(links: int, solver: str, repeats: int) -> dict:
             compiled = eqx.filter_jit(function).lower(system).compile()
             found[f"{name}_compile_s"] = time.perf_counter() - started
             found[f"{name}_temporary_mb"] = compiled.compiled.memory_analysis().temp_size_in_bytes / 1e6
-            seconds[name, steps] = median_seconds(lambda compiled=compiled: compiled(system), repeats)
-            jax.clear_caches()
+            calls[name, steps] = lambda compiled=compiled: jax.block_until_ready(compiled(system))
+            calls[name, steps]()
+    times = interleaved(calls, repeats, seconds=5.0)
     for name in ("simulate", "gradient"):
-        few, many = (seconds[name, steps] for steps in STEPS)
-        found[f"{name}_us_per_step"] = (many - few) / (STEPS[1] - STEPS[0]) * 1e6
+        for kind in ("wall", "cpu"):
+            few, many = (getattr(times[name, steps], kind) for steps in STEPS)
+            taken = statistics.median(long - short for short, long in zip(few, many))
+            found[f"{name}_us_per_step" if kind == "wall" else f"{name}_cpu_us_per_step"] = (
+                taken / (STEPS[1] - STEPS[0]) * 1e6
+            )
+    jax.clear_caches()
     return found
 
 
@@ -74,20 +83,23 @@ def slopes(rows: list[dict]) -> list[dict]:
     return found
 
 
-def table(rows: list[dict], found: list[dict]) -> str:
+def table(document: dict) -> str:
     lines = [
+        f"{circumstances(document['environment'])} Processor time in brackets.",
+        "",
         "| links | solver | simulate [µs/step] | with gradient [µs/step] | compile: simulate, gradient [s] "
         "| temporary memory of the gradient [MB] | levels | dense rest |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for row in rows:
+    for row in document["rows"]:
         lines.append(
             f"| {row['links']} | {row['solver']} "
-            f"| {row['simulate_us_per_step']:.0f} | {row['gradient_us_per_step']:.0f} "
+            f"| {row['simulate_us_per_step']:.0f} ({row['simulate_cpu_us_per_step']:.0f}) "
+            f"| {row['gradient_us_per_step']:.0f} ({row['gradient_cpu_us_per_step']:.0f}) "
             f"| {row['simulate_compile_s']:.1f}, {row['gradient_compile_s']:.1f} | {row['gradient_temporary_mb']:.1f} "
             f"| {len(row['levels'])} | {row['dense_rest']} |"
         )
-    for one in found:
+    for one in document["slopes"]:
         lines.append(
             f"\n{one['solver']}: slope from {one['from']} to {one['to']} links: simulate {one['simulate']:.2f}, "
             f"with gradient {one['gradient']:.2f}."
@@ -96,29 +108,27 @@ def table(rows: list[dict], found: list[dict]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder (default: %(default)s)")
+    parser = options(__doc__)
     parser.add_argument("--links", nargs="+", type=int, default=[8, 64, 512])
     parser.add_argument("--solvers", nargs="+", choices=("auto", "dense"), default=["auto"])
-    parser.add_argument("--repeats", type=int, default=5, help="timed calls, at least 5 (default: %(default)s)")
+    parser.add_argument("--readme", action="store_true", help="put the table of chain.json into benchmarks/README.md")
     arguments = parser.parse_args()
-    if arguments.repeats < 5:
-        parser.error("--repeats must be at least 5")
-    import jax
+    path = arguments.out / "chain.json"
+    if not arguments.readme:
+        os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
+        import jax
 
-    jax.config.update("jax_enable_x64", True)
-    load = os.getloadavg()[0]
-    rows = []
-    for solver in arguments.solvers:
-        for links in arguments.links:
-            rows.append(measure(links, solver, arguments.repeats))
-            print(rows[-1], flush=True)
-    found = slopes(rows)
-    machine = {"python": platform.python_version(), "jax": jax.__version__, "cores": os.cpu_count(), "load": load}
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    text = json.dumps({"machine": machine, "rows": rows, "slopes": found}, indent=1)
-    (arguments.out / "chain.json").write_text(text + "\n", encoding="utf-8")
-    print(table(rows, found))
+        jax.config.update("jax_enable_x64", True)
+        found, rows = environment(SINGLE_THREAD), []
+        for solver in arguments.solvers:
+            for links in arguments.links:
+                rows.append(measure(links, solver, arguments.repeats))
+                print(rows[-1], flush=True)
+        write(path, {"environment": found, "rows": rows, "slopes": slopes(rows)})
+    text = table(json.loads(path.read_text(encoding="utf-8")))
+    if arguments.readme:
+        put_into(Path(__file__).parent / "README.md", text, "chains")
+    print(text)
 
 
 if __name__ == "__main__":

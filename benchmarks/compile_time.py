@@ -10,7 +10,6 @@ acceleration, by all numbers of the model. Processor time stands beside wall tim
 least. "trace" is what no cache saves: Python that makes the program. Writes compile_time.json.
 """
 
-import argparse
 import json
 import os
 import subprocess
@@ -18,6 +17,8 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+
+from benchmark import circumstances, environment, options, write
 
 SCENES = ("top", "four_bar", "quarter_car", "chain_2", "chain_8", "chain_32")
 PROGRAMS = ("simulate", "value_and_grad")
@@ -85,11 +86,8 @@ def measure(scene: str) -> dict:
 
 
 def markdown(document: dict) -> str:
-    environment = document["environment"]
-    versions = ", ".join(f"{package} {version}" for package, version in environment["versions"].items())
     lines = [
-        f"{environment['date']}, {environment['machine']['architecture']}, {environment['machine']['cores']} cores, "
-        f"load average {environment['load_average']}; {versions}.",
+        circumstances(document["environment"]),
         "",
         "| scene | program | compile [s] (CPU) | of it trace [s] | cached [s] (CPU) | ratio | cache [MB] |",
         "|---|---|---|---|---|---|---|",
@@ -111,8 +109,7 @@ def markdown(document: dict) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder (default: %(default)s)")
+    parser = options(__doc__, repeats=False)
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
     parser.add_argument("--table", action="store_true", help="print the table of compile_time.json, measure nothing")
     parser.add_argument("--readme", action="store_true", help="as --table, and put it into benchmarks/README.md")
@@ -124,13 +121,10 @@ def main() -> None:
     path = arguments.out / "compile_time.json"
     document = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"scenes": {}}
     if not (arguments.table or arguments.readme):
-        from rival_run import environment
-
-        arguments.out.mkdir(parents=True, exist_ok=True)
         for scene in arguments.scenes:
             document["scenes"][scene] = measure(scene)
-            document["environment"] = environment({})
-            path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+            document["environment"] = environment()
+            write(path, document)
     text = markdown(document)
     if arguments.readme:
         from rival_tables import put_into

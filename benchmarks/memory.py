@@ -1,19 +1,20 @@
 """What a gradient in reverse mode keeps over a long run of the top, with and without checkpoints.
 
     python benchmarks/memory.py [--steps 1000 10000 100000] [--out benchmarks/results]
+    python benchmarks/memory.py --readme   # the table of memory.json, into benchmarks/README.md; measures nothing
 
 The gradient of the mean of x² with respect to the initial angle, h = 1 ms, through `simulate(…, save=…)`. Memory is
 what the compiled program says of its temporaries; times are medians of `--repeats` calls after one that compiles, the
 programs of a length in turns, in simulations of the same length. Writes memory.json and prints a table.
 """
 
-import argparse
 import json
 import os
-import platform
 import statistics
-import time
 from pathlib import Path
+
+from benchmark import SINGLE_THREAD, circumstances, environment, interleaved, options, write
+from rival_tables import put_into
 
 
 def measure(steps: int, repeats: int) -> list[dict]:
@@ -43,13 +44,8 @@ def measure(steps: int, repeats: int) -> list[dict]:
         function = lambda angle, method=method: mean(angle, method or lg.DirectDifferentiation())
         programs[name] = jax.jit(function if method is None else jax.grad(function)).lower(0.7).compile()
         jax.block_until_ready(programs[name](0.7))
-    taken: dict[str, list[float]] = {name: [] for name in methods}
-    for _ in range(repeats):
-        for name, program in programs.items():
-            started = time.perf_counter()
-            jax.block_until_ready(program(0.7))
-            taken[name].append(time.perf_counter() - started)
-    medians = {name: statistics.median(times) for name, times in taken.items()}
+    calls = {name: lambda run=run: jax.block_until_ready(run(0.7)) for name, run in programs.items()}
+    medians = {name: statistics.median(times.wall) for name, times in interleaved(calls, repeats).items()}
     for name, program in programs.items():
         memory = program.memory_analysis().temp_size_in_bytes / 1e6
         ratio = medians[name] / medians["simulate"]
@@ -57,26 +53,38 @@ def measure(steps: int, repeats: int) -> list[dict]:
     return rows
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder (default: %(default)s)")
-    parser.add_argument("--steps", nargs="+", type=int, default=[1_000, 10_000, 100_000])
-    parser.add_argument("--repeats", type=int, default=5, help="timed calls, at least 5 (default: %(default)s)")
-    arguments = parser.parse_args()
-    if arguments.repeats < 5:
-        parser.error("--repeats must be at least 5")
-    import jax
+def table(document: dict) -> str:
+    lines = [
+        circumstances(document["environment"]),
+        "",
+        "| steps | program | ms | in simulations | temporary memory [MB] |",
+        "|---|---|---|---|---|",
+    ]
+    for row in document["rows"]:
+        lines.append(
+            f"| {row['steps']} | `{row['program']}` | {row['ms']:.1f} | {row['simulations']:.2f} | {row['mb']:.2f} |"
+        )
+    return "\n".join(lines)
 
-    jax.config.update("jax_enable_x64", True)
-    load = os.getloadavg()[0]
-    rows = [row for steps in arguments.steps for row in measure(steps, arguments.repeats)]
-    print("| steps | program | ms | in simulations | temporary memory [MB] |\n|---|---|---|---|---|")
-    for row in rows:
-        print(f"| {row['steps']} | `{row['program']}` | {row['ms']:.1f} | {row['simulations']:.2f} | {row['mb']:.2f} |")
-    machine = {"python": platform.python_version(), "jax": jax.__version__, "cores": os.cpu_count(), "load": load}
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    text = json.dumps({"machine": machine, "rows": rows}, indent=1)
-    (arguments.out / "memory.json").write_text(text + "\n", encoding="utf-8")
+
+def main() -> None:
+    parser = options(__doc__)
+    parser.add_argument("--steps", nargs="+", type=int, default=[1_000, 10_000, 100_000])
+    parser.add_argument("--readme", action="store_true", help="put the table of memory.json into benchmarks/README.md")
+    arguments = parser.parse_args()
+    path = arguments.out / "memory.json"
+    if not arguments.readme:
+        os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+        found = environment(SINGLE_THREAD)
+        rows = [row for steps in arguments.steps for row in measure(steps, arguments.repeats)]
+        write(path, {"environment": found, "rows": rows})
+    text = table(json.loads(path.read_text(encoding="utf-8")))
+    if arguments.readme:
+        put_into(Path(__file__).parent / "README.md", text, "memory")
+    print(text)
 
 
 if __name__ == "__main__":

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import rival_casadi
 import rival_diffrax
 import rival_sundials
-from rival_run import difference, environment
+from benchmark import SINGLE_THREAD, environment, write
+from rival_run import difference
 from rival_scenes import SCENES, Scene
 from rival_timing import Program, compiled, measure
-from rivals import SINGLE_THREAD
 
 import lgsens as lg
 
@@ -185,4 +185,4 @@ def run(scenes: Iterable[str], chosen: Sequence[str] | None, repeats: int, path:
             "programs": records,
             "environment": environment(SINGLE_THREAD),
         }
-        path.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        write(path, document)

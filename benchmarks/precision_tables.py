@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+from benchmark import circumstances
+
 COLUMNS = (
     "error at most",
     "family",
@@ -52,16 +54,13 @@ def markdown(document: dict[str, Any]) -> str:
     """All scenes, a table for each."""
     blocks = []
     for name, found in document["scenes"].items():
-        environment = found["environment"]
-        versions = ", ".join(f"{package} {version}" for package, version in environment["versions"].items())
         blocks.append(
             "\n".join(
                 [
                     f"### {name}",
                     "",
-                    f"Gradient with respect to {found['parameters']} parameters. {environment['date']}, "
-                    f"{environment['machine']['architecture']}, {environment['machine']['cores']} cores, load average "
-                    f"{environment['load_average']}, one thread, medians of {found['repeats']} rounds; {versions}.",
+                    f"Gradient with respect to {found['parameters']} parameters. Medians of {found['repeats']} rounds; "
+                    f"{circumstances(found['environment'])}",
                     "",
                     f"![error against time](results/work_precision_{name}.png)",
                     "",

@@ -1,23 +1,20 @@
 """One run of the benchmark: builds the programs of a scene, measures them together, compares, and writes the JSON."""
 
-import datetime
 import importlib
 import importlib.metadata
 import importlib.util
 import json
-import os
-import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 import rival_lgsens
+from benchmark import SINGLE_THREAD, environment, write
 from rival_scenes import SCENES, Scene
 from rival_timing import measure
 
-PACKAGES = ("lgsens", "jax", "jaxlib", "numpy", "diffrax", "exudyn", "casadi", "mujoco")
 NEEDS = {"exudyn": "exudyn", "casadi": "casadi", "mujoco": "mujoco"}
 
 
@@ -25,10 +22,6 @@ def _read(path: Path) -> dict[str, Any]:
     what = "lgsens beside its rivals: one run of each scene, programs in turns, medians in seconds"
     empty = {"what": what, "references": {}, "scenes": {}}
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else empty
-
-
-def _write(path: Path, document: dict[str, Any]) -> None:
-    path.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def find_references(scenes: Iterable[str], path: Path) -> None:
@@ -39,7 +32,7 @@ def find_references(scenes: Iterable[str], path: Path) -> None:
         value, gradient = rival_lgsens.reference(scene)
         document = _read(path)
         document["references"][name] = {"p": scene.start.tolist(), "value": value, "gradient": gradient}
-        _write(path, document)
+        write(path, document)
 
 
 def run(
@@ -48,7 +41,6 @@ def run(
     kinds: Sequence[str] | None,
     repeats: int,
     path: Path,
-    settings: Mapping[str, str],
 ) -> None:
     """Measure the scenes and write them to `path`, each as soon as it is done. `kinds`: None for all."""
     jax.config.update("jax_enable_x64", True)
@@ -56,28 +48,11 @@ def run(
     for name in scenes:
         scene = SCENES[name]()
         found = _scene(scene, present, kinds, repeats)
-        found["environment"] = environment(settings)
+        found["environment"] = environment(SINGLE_THREAD)
         document = _read(path)
         document["scenes"][name] = found
-        _write(path, document)
+        write(path, document)
         jax.clear_caches()
-
-
-def environment(settings: Mapping[str, str]) -> dict[str, Any]:
-    """When and where, with the versions of all packages."""
-    versions = {"python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return {
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "versions": versions,
-        "machine": {"architecture": platform.machine(), "system": platform.system(), "cores": os.cpu_count()},
-        "threads": dict(settings),
-        "load_average": round(os.getloadavg()[0], 1),
-    }
 
 
 def _scene(scene: Scene, rivals: Iterable[str], kinds: Sequence[str] | None, repeats: int) -> dict[str, Any]:
@@ -149,4 +124,4 @@ def compare_again(path: Path) -> None:
     document = _read(path)
     for name, found in document["scenes"].items():
         _compare(SCENES[name](), found["programs"], document["references"].get(name))
-    _write(path, document)
+    write(path, document)

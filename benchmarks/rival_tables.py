@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+from benchmark import circumstances
+
 COLUMNS = (
     "rival",
     "program",
@@ -80,15 +82,11 @@ def _summary(found: dict[str, Any]) -> list[str]:
 
 
 def _scene(name: str, found: dict[str, Any]) -> list[str]:
-    environment = found["environment"]
-    versions = ", ".join(f"{package} {version}" for package, version in environment["versions"].items())
-    machine = environment["machine"]
     lines = [
         f"### {name}",
         "",
         f"{found['bodies']} bodies, t = 0 … {found['t1']:g} s, Ψ = {found['criterion']}, p: {len(found['parameters'])} "
-        f"parameters. {environment['date']}, {machine['architecture']}, {machine['cores']} cores, load average "
-        f"{environment['load_average']}, one thread, medians of {found['repeats']} rounds; {versions}.",
+        f"parameters. Medians of {found['repeats']} rounds; {circumstances(found['environment'])}",
     ]
     if found["failed"]:
         lines += ["", "Failed: " + ", ".join(f"{rival} ({error})" for rival, error in found["failed"].items()) + "."]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from benchmark import interleaved
 
 
 @dataclasses.dataclass
@@ -66,17 +67,10 @@ def measure(programs: Sequence[Program], repeats: int) -> list[dict[str, Any]]:
 
     Wall time, and the processor time of the process, which other load on the machine changes less.
     """
-    shown, taken, busy = [], [[] for _ in programs], [[] for _ in programs]
-    for program in programs:
-        shown.append(program.show(program.call()))
-    for _ in range(repeats):
-        for program, times, cpu_times in zip(programs, taken, busy):
-            started, cpu_started = time.perf_counter(), time.process_time()
-            program.call()
-            times.append(time.perf_counter() - started)
-            cpu_times.append(time.process_time() - cpu_started)
+    shown = [program.show(program.call()) for program in programs]
+    taken = interleaved({index: program.call for index, program in enumerate(programs)}, repeats)
     records = []
-    for program, times, cpu_times, (value, gradient) in zip(programs, taken, busy, shown):
+    for program, (times, cpu_times), (value, gradient) in zip(programs, taken.values(), shown):
         seconds = statistics.median(times)
         records.append(
             {

@@ -13,45 +13,35 @@ numbers there) and prints the tables.
 "equal step": the step of lgsens. "equal accuracy": steps that reach at least lgsens's accuracy in Ψ.
 """
 
-import argparse
 import importlib
 import json
 import os
 from pathlib import Path
 
+from benchmark import SINGLE_THREAD, options
+
 SCENES = ("top", "quarter_car", *(f"chain_{n}" for n in (2, 8, 32, 128, 512)))
 RIVALS = ("plain_jax", "exudyn", "casadi", "diffrax", "mujoco")
-SINGLE_THREAD = {
-    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
-    "OPENBLAS_NUM_THREADS": "1",
-    "OMP_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder (default: %(default)s)")
+    parser = options(__doc__)
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=["top", "quarter_car"])
     parser.add_argument("--rivals", nargs="*", choices=RIVALS, default=list(RIVALS))
     parser.add_argument("--kinds", nargs="+", help="only this work, e.g. forward 'gradient, p' (default: all)")
-    parser.add_argument("--repeats", type=int, default=5, help="rounds, at least 5 (default: %(default)s)")
     parser.add_argument("--references", action="store_true", help="compute the references of the scenes and compare")
     parser.add_argument("--table", action="store_true", help="print the tables of rivals.json, measure nothing")
     parser.add_argument("--readme", action="store_true", help="as --table, and put them into benchmarks/README.md")
     arguments = parser.parse_args()
-    if arguments.repeats < 5:
-        parser.error("--repeats must be at least 5")
     path = arguments.out / "rivals.json"
     os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
     tables = importlib.import_module("rival_tables")
     if not (arguments.table or arguments.readme):
-        arguments.out.mkdir(parents=True, exist_ok=True)
         run = importlib.import_module("rival_run")
         if arguments.references:
             run.find_references(arguments.scenes, path)
         else:
-            run.run(arguments.scenes, arguments.rivals, arguments.kinds, arguments.repeats, path, SINGLE_THREAD)
+            run.run(arguments.scenes, arguments.rivals, arguments.kinds, arguments.repeats, path)
         run.compare_again(path)
     text = tables.markdown(json.loads(path.read_text(encoding="utf-8")))
     if arguments.readme:

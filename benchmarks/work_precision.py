@@ -12,33 +12,27 @@ thread and take turns, `--repeats` rounds; medians count, compilation apart. Com
 keeps compiled programs in a folder, so that a run that was ended goes on.
 """
 
-import argparse
 import importlib
 import json
 import os
 from pathlib import Path
 
-from rivals import SINGLE_THREAD
+from benchmark import SINGLE_THREAD, options
 
 SCENES = ("quarter_car",)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder (default: %(default)s)")
+    parser = options(__doc__)
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
     parser.add_argument("--families", nargs="+", help="only these families of programs, lgsens's always (default: all)")
-    parser.add_argument("--repeats", type=int, default=5, help="rounds, at least 5 (default: %(default)s)")
     parser.add_argument("--cache", help="folder for compiled programs (default: none)")
     parser.add_argument("--table", action="store_true", help="print the table, draw the plot, measure nothing")
     parser.add_argument("--readme", action="store_true", help="as --table, and put the table into benchmarks/README.md")
     arguments = parser.parse_args()
-    if arguments.repeats < 5:
-        parser.error("--repeats must be at least 5")
     path = arguments.out / "work_precision.json"
     os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
     if not (arguments.table or arguments.readme):
-        arguments.out.mkdir(parents=True, exist_ok=True)
         run = importlib.import_module("precision_run")
         run.run(arguments.scenes, arguments.families, arguments.repeats, path, arguments.cache)
     tables = importlib.import_module("precision_tables")

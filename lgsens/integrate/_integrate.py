@@ -6,7 +6,8 @@ it takes three or four to round-off, each a tenth of a full one. Motion and mult
 chain contracts by 0.3 and by 1e-4 alternately: what counts is κ² = d_i/d_{i−2}, with d_i the increments. The next
 iteration leaves an error of about κ² d_i. Where that is the square of the tolerance, or a fraction of round-off
 (the errors of a thousand steps add up), the next iteration is the last: to ask for smaller increments instead would be
-to ask for what the round-off of the constraints does not allow.
+to ask for what the round-off of the constraints does not allow. That round-off grows with the scene (a hundred ε in a
+chain of 512 links), so an iteration is also the last where increments of that size no longer fall as they did.
 """
 
 from collections.abc import Callable
@@ -26,6 +27,7 @@ _MODIFIED_LIMIT = 12  # iterations; more cost as much as a full one
 _SLOW = 0.1  # the contraction from which on a new matrix pays, in the next step
 _STALLED = 0.3  # that from which on two full iterations cost less
 _FASTEST = 0.02  # contractions measured close to round-off are no better than this
+_ROUGH = 4096  # round-offs: increments below say nothing of the contraction, and one that falls slower than it is noise
 
 
 class Stats(NamedTuple):
@@ -117,10 +119,11 @@ def take_step(
             solver = factors
         du, dlam = solver.solve(residual, violation)
         size = jnp.max(jnp.abs(du) * (scheme.beta * h**2) / scale)
-        measured = (iterate.iterations > 1) & (iterate.before > 64 * eps)  # increments below are round-off
+        measured = (iterate.iterations > 1) & (iterate.before > _ROUGH * eps)
         ratio = jnp.sqrt(size / jnp.where(measured, iterate.before, 1.0))
         contraction = jnp.where(measured, jnp.maximum(ratio, _FASTEST), iterate.contraction)
-        settled = iterate.increment * iterate.contraction**2 <= target
+        rough = (size <= _ROUGH * eps) & (size > 4.0 * contraction**2 * iterate.before)
+        settled = (iterate.increment * iterate.contraction**2 <= target) | rough
         largest, count = jnp.max(jnp.abs(residual)), iterate.iterations + 1
         return _Iterate(
             iterate.u - du, iterate.lam - dlam, size, iterate.increment, contraction, largest, count, settled

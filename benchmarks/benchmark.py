@@ -1,0 +1,94 @@
+"""What the benchmarks share: their options, how calls are timed, what is written beside the figures."""
+
+import argparse
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+PACKAGES = ("lgsens", "jax", "jaxlib", "numpy", "diffrax", "exudyn", "casadi", "mujoco")
+
+
+def options(description: str | None, *, repeats: bool = True) -> argparse.ArgumentParser:
+    """A parser with `--out` and, where something is timed in rounds, `--repeats`."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder (default: %(default)s)")
+    if repeats:
+        parser.add_argument("--repeats", type=_rounds, default=5, help="rounds, at least 5 (default: %(default)s)")
+    return parser
+
+
+def _rounds(text: str) -> int:
+    if (count := int(text)) < 5:
+        raise argparse.ArgumentTypeError(f"must be at least 5, got {count}")
+    return count
+
+
+# before jax and numpy are imported
+SINGLE_THREAD = {
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+}
+
+
+class Times(NamedTuple):
+    """Of each call the wall time and the processor time of the process, which other load changes less, in s."""
+
+    wall: list[float]
+    cpu: list[float]
+
+
+def interleaved(calls: Mapping[Any, Callable[[], Any]], repeats: int, *, seconds: float = 0.0) -> dict[Any, Times]:
+    """The times of calls that block and that have run before, in rounds in which each is called once.
+
+    `seconds`: more rounds than `repeats`, until this time has passed.
+    """
+    found = {name: Times([], []) for name in calls}
+    begun, rounds = time.perf_counter(), 0
+    while rounds < repeats or time.perf_counter() - begun < seconds:
+        for name, call in calls.items():
+            started, cpu_started = time.perf_counter(), time.process_time()
+            call()
+            found[name].wall.append(time.perf_counter() - started)
+            found[name].cpu.append(time.process_time() - cpu_started)
+        rounds += 1
+    return found
+
+
+def environment(threads: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """When and where, with the versions of all packages."""
+    versions = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return {
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "versions": versions,
+        "machine": {"architecture": platform.machine(), "system": platform.system(), "cores": os.cpu_count()},
+        "threads": dict(threads or {}),
+        "load_average": round(os.getloadavg()[0], 1),
+    }
+
+
+def circumstances(found: Mapping[str, Any]) -> str:
+    """A line of what `environment` found."""
+    versions = ", ".join(f"{package} {version}" for package, version in found["versions"].items())
+    machine = found["machine"]
+    return (
+        f"{found['date']}, {machine['architecture']}, {machine['cores']} cores, load average "
+        f"{found['load_average']}{', one thread' if found['threads'] else ''}; {versions}."
+    )
+
+
+def write(path: Path, document: Mapping[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
