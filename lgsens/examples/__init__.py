@@ -14,7 +14,7 @@ from lgsens.examples._problems import (
     Problem as Problem,
     Reference as Reference,
 )
-from lgsens.examples._quarter_car import QuarterCar as QuarterCar
+from lgsens.examples._quarter_car import QuarterCar as QuarterCar, stiff_quarter_car as stiff_quarter_car
 from lgsens.examples._quarter_car_design import (
     PARAMETERS as PARAMETERS,
     DesignLimits as DesignLimits,

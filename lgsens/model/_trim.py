@@ -1,16 +1,20 @@
 """Preloads that hold a model at rest in its reference configuration."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, suggestion
-from lgsens.model._forces import SpringDamper, TyreSpring
+from lgsens.model._forces import AbstractForce, Bushing, SpringDamper, TyreSpring
 from lgsens.model._model import Model
 from lgsens.model._system import MultibodySystem
+
+_SPRINGS = SpringDamper | TyreSpring | Bushing
 
 
 def static_preload(model: Model, forces: Sequence[str], *, t0=0.0) -> tuple[Model, Float[Array, ""]]:
@@ -21,16 +25,16 @@ def static_preload(model: Model, forces: Sequence[str], *, t0=0.0) -> tuple[Mode
 
     Arguments:
         model: the scene.
-        forces: names of `SpringDamper` or `TyreSpring` elements, as many as the mechanism has degrees of freedom that
-            weight or other forces move.
+        forces: names of `SpringDamper`, `TyreSpring` or `Bushing` elements, as many as the mechanism has degrees of
+            freedom that weight or other forces move; a bushing counts for three.
         t0: the time at which time-dependent forces are taken [s].
 
     Returns the model and the largest force [N] or moment [N m] that remains unbalanced. Differentiable: a gradient
     through it keeps the static equilibrium. Raises `ValueError` for a name that is not a spring.
     """
     for name in forces:
-        if not isinstance(model.forces.get(name), SpringDamper | TyreSpring):
-            springs = [n for n, f in model.forces.items() if isinstance(f, SpringDamper | TyreSpring)]
+        if not isinstance(model.forces.get(name), _SPRINGS):
+            springs = [n for n, f in model.forces.items() if isinstance(f, _SPRINGS)]
             raise ValueError(f"`static_preload`: {suggestion(name, springs)}.")
 
     values, unbalanced = _solve(model, tuple(forces), as_float(t0, (), "`t0`"))
@@ -40,16 +44,16 @@ def static_preload(model: Model, forces: Sequence[str], *, t0=0.0) -> tuple[Mode
 def _preloaded(model: Model, forces: Sequence[str], values) -> Model:
     members = dict(model.forces)
     for name, value in zip(forces, values):
-        spring = members[name]
-        assert isinstance(spring, SpringDamper | TyreSpring)  # checked by the caller
-        members[name] = _with_preload(spring, value)
+        members[name] = _with_preload(members[name], value)
     return eqx.tree_at(lambda m: m.forces, model, members)
 
 
 @eqx.filter_jit  # outside a jit the many small operations would be compiled one by one: 17 s instead of 2
 def _solve(model: Model, forces: tuple[str, ...], t):
     """The preloads, and the largest force or moment they leave unbalanced."""
-    rest = _preloaded(model, forces, jnp.zeros(len(forces), t.dtype)).system()
+    none = [jnp.zeros(3 if isinstance(model.forces[name], Bushing) else (), t.dtype) for name in forces]
+    no_preload, each = ravel_pytree(none)
+    rest = _preloaded(model, forces, none).system()
     where = [_place(rest, name) for name in forces]
     q, v = rest.reference()
     zero = jnp.zeros_like(v)
@@ -59,18 +63,18 @@ def _solve(model: Model, forces: tuple[str, ...], t):
     def residual(values):
         # the preloads are set in the assembled system: assembling it anew would be compiled for each of them
         system = rest
-        for (stack, element), value in zip(where, values):
-            leaf = lambda s, stack=stack: s.loads[stack].elements.preload
-            system = eqx.tree_at(leaf, system, leaf(system).at[element].set(value))
+        for (stack, element), name, value in zip(where, forces, each(values)):
+            (attached,) = _with_preload(model.forces[name], value).loads(model.bodies)
+            leaf = lambda s, stack=stack: _own(s.loads[stack].elements).preload
+            system = eqx.tree_at(leaf, system, leaf(system).at[element].set(_own(attached.load).preload))
         return system.residual(q, zero, zero, lam, t)
 
-    no_preload = jnp.zeros(len(forces), v.dtype)
     unbalanced, by_preload = residual(no_preload), jax.jacfwd(residual)(no_preload)
     a = jnp.concatenate([jacobian.T, by_preload], axis=1)
     k, n = a.shape
     matrix = jnp.block([[jnp.eye(k, dtype=v.dtype), a], [a.T, jnp.zeros((n, n), v.dtype)]])
     solution = jnp.linalg.solve(matrix, jnp.concatenate([-unbalanced, jnp.zeros(n, v.dtype)]))
-    return solution[k + len(lam) :], jnp.max(jnp.abs(solution[:k]))
+    return each(solution[k + len(lam) :]), jnp.max(jnp.abs(solution[:k]))
 
 
 def _place(system: MultibodySystem, force: str) -> tuple[int, int]:
@@ -79,8 +83,16 @@ def _place(system: MultibodySystem, force: str) -> tuple[int, int]:
     return found[0]
 
 
-def _with_preload(force: SpringDamper | TyreSpring, value):
+def _own(load: Any) -> Any:
+    """The load on a part of a merged body, or the load itself."""
+    return getattr(load, "element", load)
+
+
+def _with_preload(force: AbstractForce, value) -> AbstractForce:
     """The same spring, with a preload in place of its free length or radius."""
+    assert isinstance(force, _SPRINGS)  # checked by the caller
+    if isinstance(force, Bushing):
+        return eqx.tree_at(lambda bushing: bushing.preload, force, value)
     if isinstance(force, SpringDamper):
         return SpringDamper(
             force.a,
