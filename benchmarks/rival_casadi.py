@@ -39,7 +39,7 @@ def _leaves(numbers: Numbers) -> list[tuple[str, Any]]:
     """The numbers of the equations of motion, in the order of θ; inertias with their inverses."""
     found = [("mass", numbers.mass), ("inertia", numbers.inertia), ("inverse", jnp.linalg.inv(numbers.inertia))]
     found.append(("gravity", numbers.gravity))
-    for name in ("coincident", "orthogonal", "in_plane", "springs", "tyre"):
+    for name in ("coincident", "orthogonal", "in_plane", "springs", "tyre", "bushings"):
         found += [(f"{name}{i}", leaf) for i, leaf in enumerate(getattr(numbers, name))]
     return found
 
@@ -146,6 +146,15 @@ class Equations:
             for body, point, sign in ((a, points[0], 1.0), (b, points[1], -1.0)):
                 force[body] = force[body] + sign * pull
                 moment[body] = moment[body] + sign * ca.cross(point, self.r[body].T @ pull)
+        for i, (a, b) in enumerate(topology.bushings):
+            pa, pb, stiffness, damping, preload = (self.vector(f"bushings{j}", i) for j in range(5))
+            back = self.r[a].T
+            place = back @ (self.x[b] + self.r[b] @ pb - self.x[a])
+            speed = self.v[6 * b : 6 * b + 3] + self.r[b] @ ca.cross(spins[b], pb) - self.v[6 * a : 6 * a + 3]
+            pull = preload + stiffness * (place - pa) + damping * (back @ speed + ca.cross(place, spins[a]))
+            force[a], force[b] = force[a] + self.r[a] @ pull, force[b] - self.r[a] @ pull
+            moment[a] = moment[a] + ca.cross(place, pull)
+            moment[b] = moment[b] - ca.cross(pb, self.r[b].T @ (self.r[a] @ pull))
         if topology.wheel is not None:
             stiffness, radius, preload, height, duration = (self.number(f"tyre{j}") for j in range(5))
             phase = self.t / duration

@@ -112,6 +112,18 @@ def _spring_force(xa, ra, xb, rb, va, vb, pa, pb, stiffness, damping, free_lengt
     return (preload + stiffness * (length - free_length) + damping * (along @ jnp.concatenate([va, vb]))) * along
 
 
+def bushing_gradient(xa, ra, xb, rb, pb):
+    """The point of b in the frame of a, and its gradient, (3, 12)."""
+    r = ra.T @ (xb + rb @ pb - xa)
+    return r, ra.T @ _point_rows(ra, rb, r, pb)
+
+
+def _bushing_force(xa, ra, xb, rb, va, vb, pa, pb, stiffness, damping, preload):
+    """What springs and dampers along the axes of a add to the residual, (12,)."""
+    r, rows = bushing_gradient(xa, ra, xb, rb, pb)
+    return (preload + stiffness * (r - pa) + damping * (rows @ jnp.concatenate([va, vb]))) @ rows
+
+
 def bump(tyre, t):
     """The height of the road at t."""
     phase = t / tyre[4]
@@ -125,10 +137,8 @@ def forces(numbers, topology, position, rotation, v, t):
     turning = jnp.cross(spin, jnp.einsum("nij,nj->ni", numbers.inertia, spin))
     found = jnp.concatenate([-numbers.mass[:, None] * numbers.gravity, turning], axis=1)
     found = jnp.concatenate([found.ravel(), jnp.zeros(DIM)])
-    if len(topology.springs):
-        found = found.at[_coordinates(topology.springs)].add(
-            jax.vmap(_spring_force)(*_spring_arguments(numbers, topology, position, rotation, v))
-        )
+    for force, ends, arguments in _force_elements(numbers, topology, position, rotation, v):
+        found = found.at[_coordinates(ends)].add(jax.vmap(force)(*arguments))
     if topology.wheel is not None:
         stiffness, radius, preload, *_ = numbers.tyre
         push = preload + stiffness * (bump(numbers.tyre, t) + radius - position[topology.wheel, 2])
@@ -136,10 +146,15 @@ def forces(numbers, topology, position, rotation, v, t):
     return found[: n * DIM]
 
 
-def _spring_arguments(numbers, topology, position, rotation, v):
-    a, b = topology.springs[:, 0], topology.springs[:, 1]
+def _force_elements(numbers, topology, position, rotation, v):
+    """(force, ends, arguments of all elements) of each kind of force between bodies that the scene has."""
     twist = jnp.concatenate([v.reshape(-1, DIM), jnp.zeros((1, DIM))])
-    return position[a], rotation[a], position[b], rotation[b], twist[a], twist[b], *numbers.springs
+    for name, force in (("springs", _spring_force), ("bushings", _bushing_force)):
+        ends = getattr(topology, name)
+        if len(ends):
+            a, b = ends[:, 0], ends[:, 1]
+            own = getattr(numbers, name)
+            yield force, ends, (position[a], rotation[a], position[b], rotation[b], twist[a], twist[b], *own)
 
 
 def tangents(numbers, topology, position, rotation, v, lam):
@@ -155,19 +170,18 @@ def tangents(numbers, topology, position, rotation, v, lam):
         where = _coordinates(ends)
         stiffness = stiffness.at[where[:, :, None], where[:, None, :]].add(block)
         start += r * len(ends)
-    if len(topology.springs):
-        where = _coordinates(topology.springs)
+    for force, ends, arguments in _force_elements(numbers, topology, position, rotation, v):
+        where = _coordinates(ends)
         zero = jnp.zeros(2 * DIM)
 
-        def of_position(xa, ra, xb, rb, *rest):
-            force = lambda w: _spring_force(*_moved(xa, ra, w[:DIM]), *_moved(xb, rb, w[DIM:]), *rest)
-            return jax.jacfwd(force)(zero)
+        def of_position(xa, ra, xb, rb, *rest, force=force, zero=zero):
+            moved = lambda w: force(*_moved(xa, ra, w[:DIM]), *_moved(xb, rb, w[DIM:]), *rest)
+            return jax.jacfwd(moved)(zero)
 
-        def of_velocity(xa, ra, xb, rb, va, vb, *rest):
-            force = lambda w: _spring_force(xa, ra, xb, rb, va + w[:DIM], vb + w[DIM:], *rest)
-            return jax.jacfwd(force)(zero)
+        def of_velocity(xa, ra, xb, rb, va, vb, *rest, force=force, zero=zero):
+            moving = lambda w: force(xa, ra, xb, rb, va + w[:DIM], vb + w[DIM:], *rest)
+            return jax.jacfwd(moving)(zero)
 
-        arguments = _spring_arguments(numbers, topology, position, rotation, v)
         stiffness = stiffness.at[where[:, :, None], where[:, None, :]].add(jax.vmap(of_position)(*arguments))
         damping = damping.at[where[:, :, None], where[:, None, :]].add(jax.vmap(of_velocity)(*arguments))
     if topology.wheel is not None:

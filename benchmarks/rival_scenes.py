@@ -5,7 +5,7 @@ mechanism without lgsens: bodies, the basic constraints of the joints stacked by
 traced, so every program differentiates the same function of p. Only the data file of the suspension is shared.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -33,6 +33,10 @@ class Numbers(NamedTuple):
     in_plane: Any  # (points on a, points on b, axes in a), (i, 3) each: the line between the points ⟂ the axis
     springs: Any  # (points on a, points on b, stiffness, damping, free length, preload), (s, 3) and (s,)
     tyre: Any  # (stiffness, free radius, preload, bump height, bump duration), () each; () if there is none
+    bushings: Any = ()  # (points on a, points on b, stiffness, damping, preload along the axes of a), (b, 3) each
+
+
+_NO_ELEMENTS = np.zeros((0, 2), int)
 
 
 class Topology(NamedTuple):
@@ -43,6 +47,7 @@ class Topology(NamedTuple):
     in_plane: np.ndarray
     springs: np.ndarray
     wheel: int | None  # the body on whose centre of mass the tyre acts
+    bushings: np.ndarray = _NO_ELEMENTS
 
 
 class Scene(NamedTuple):
@@ -79,9 +84,6 @@ def _none(width: int) -> tuple:
 
 def _no_springs() -> tuple:
     return (*_none(2), *(jnp.zeros(0) for _ in range(4)))
-
-
-_NO_ELEMENTS = np.zeros((0, 2), int)
 
 
 def top() -> Scene:
@@ -127,11 +129,12 @@ def _normals(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return unit, first, np.cross(unit, first)
 
 
-def quarter_car() -> Scene:
+def quarter_car(bushings: Sequence[str] = ()) -> Scene:
     """The five-link quarter-car, wheel locked: 48 coordinates, 46 constraints; Ψ₀ = ∫ z̈² dt of the chassis.
 
     p: stiffness, damping, the chassis ends and the knuckle ends of the five links. Spring and tyre are preloaded so
-    that the car rests at the design position, whatever p.
+    that the car rests at the design position, whatever p. `bushings`: the links held by one at the knuckle, of
+    1e8 N/m and 1e4 N s/m in every direction, preloaded like the spring.
     """
     car = QuarterCar.load()
     links = sorted(car.links)
@@ -142,10 +145,13 @@ def quarter_car() -> Scene:
     number = {name: i for i, name in enumerate(bodies)}
     # hub; the links at the chassis; the links at the knuckle
     arms = [number[n] for n in links]
-    coincident = np.array([[knuckle, wheel], *([chassis, i] for i in arms), *([knuckle, i] for i in arms)])
+    soft = [n in bushings for n in links]
+    firm = [i for i, is_soft in zip(arms, soft) if not is_soft]
+    rubber = np.array([[knuckle, i] for i, is_soft in zip(arms, soft) if is_soft]).reshape(-1, 2)
+    coincident = np.array([[knuckle, wheel], *([chassis, i] for i in arms), *([knuckle, i] for i in firm)])
     orthogonal = np.array([[ground, chassis]] * 3 + [[knuckle, wheel]] * 3 + [[chassis, i] for i in arms])
     struts = np.array([[number[strut.link], chassis] for strut in (car.spring, car.damper)])
-    topology = Topology(coincident, orthogonal, np.array([[ground, chassis]] * 2), struts, wheel)
+    topology = Topology(coincident, orthogonal, np.array([[ground, chassis]] * 2), struts, wheel, rubber)
     up, side, across = _normals(np.array([0.0, 0.0, 1.0]))
     x, y, z = np.eye(3)
     parts = [getattr(car, name) for name in bodies[:3]]
@@ -153,7 +159,7 @@ def quarter_car() -> Scene:
     def model(p):
         ends = lambda c: [getattr(c.links[n], end) for end in ("chassis", "knuckle") for n in links]
         where = lambda c: [c.spring.rate, c.damper.rate, *ends(c)]
-        return eqx.tree_at(where, car, [p[0], p[1], *p[2:].reshape(10, 3)]).model(wheel="locked")
+        return eqx.tree_at(where, car, [p[0], p[1], *p[2:].reshape(10, 3)]).model(wheel="locked", bushings=bushings)
 
     def numbers(p):
         inner, outer = p[2:17].reshape(5, 3), p[17:].reshape(5, 3)
@@ -171,7 +177,9 @@ def quarter_car() -> Scene:
         def local(points, pairs):
             return tuple(points[i] - position_of[pairs[:, i]] for i in (0, 1))
 
-        joints = jnp.concatenate([car.bearing[None], inner, outer])
+        held = outer[np.array(soft)]
+        joints = jnp.concatenate([car.bearing[None], inner, outer[~np.array(soft)]])
+        every_way = jnp.ones((len(rubber), 3))
         arm = jnp.cross(x, along)
         arm = arm - (arm @ x)[:, None] * x
         arm = arm / jnp.linalg.norm(arm, axis=1, keepdims=True)
@@ -198,11 +206,14 @@ def quarter_car() -> Scene:
                 jnp.zeros(2),
             ),
             tyre=(car.tyre_stiffness, car.wheel.centre[2], jnp.zeros(()), car.bump_height, car.bump_duration),
+            bushings=(
+                (*local((held, held), rubber), 1e8 * every_way, 1e4 * every_way, 0.0 * every_way) if bushings else ()
+            ),
         )
         return preloaded(found, topology)
 
     return Scene(
-        name="quarter_car",
+        name="stiff_quarter_car" if bushings else "quarter_car",
         t1=1.0,
         num_steps=1000,
         start=start,
@@ -222,8 +233,8 @@ def quarter_car() -> Scene:
 
 
 def preloaded(numbers: Numbers, topology: Topology) -> Numbers:
-    """The first spring and the tyre hold the mechanism at rest: A [λ; F] = weight, in the sense of least squares."""
-    from rival_equations import constraint_jacobian, separation_rows
+    """The first spring, the tyre and the bushings hold the mechanism at rest: A [λ; F] = weight, by least squares."""
+    from rival_equations import bushing_gradient, constraint_jacobian, separation_rows
 
     n = numbers.mass.shape[0]
     eye = jnp.broadcast_to(jnp.eye(3), (n + 1, 3, 3))
@@ -235,11 +246,18 @@ def preloaded(numbers: Numbers, topology: Topology) -> Numbers:
     columns = (ends[0][:, None] * 6 + np.arange(6)).ravel()
     spring = jnp.zeros(6 * (n + 1)).at[columns].add(pull)[: 6 * n]
     tyre = jnp.zeros(6 * n).at[6 * topology.wheel + 2].add(-1.0)
-    a = jnp.concatenate([jacobian.T, spring[:, None], tyre[:, None]], axis=1)
+    pulls = [spring[:, None], tyre[:, None]]
+    for i, (body_a, body_b) in enumerate(topology.bushings):
+        _, rows = bushing_gradient(position[body_a], eye[body_a], position[body_b], eye[body_b], numbers.bushings[1][i])
+        columns = np.concatenate([body * 6 + np.arange(6) for body in (body_a, body_b)])
+        pulls.append(jnp.zeros((6 * (n + 1), 3)).at[columns].add(rows.T)[: 6 * n])
+    a = jnp.concatenate([jacobian.T, *pulls], axis=1)
     weight = jnp.zeros((n, 6)).at[:, :3].set(numbers.mass[:, None] * numbers.gravity).ravel()
     m = a.shape[1]
     matrix = jnp.block([[jnp.eye(6 * n), a], [a.T, jnp.zeros((m, m))]])
-    force = jnp.linalg.solve(matrix, jnp.concatenate([weight, jnp.zeros(m)]))[-2:]
+    force = jnp.linalg.solve(matrix, jnp.concatenate([weight, jnp.zeros(m)]))[6 * n + jacobian.shape[0] :]
+    if numbers.bushings:
+        numbers = numbers._replace(bushings=(*numbers.bushings[:4], force[2:].reshape(-1, 3)))
     springs = (*numbers.springs[:5], jnp.stack([force[0], jnp.zeros(())]))
     return numbers._replace(springs=springs, tyre=(*numbers.tyre[:2], force[1], *numbers.tyre[3:]))
 
@@ -288,6 +306,8 @@ def chain(num_links: int) -> Scene:
     )
 
 
-SCENES: dict[str, Callable[[], Scene]] = {"top": top, "quarter_car": quarter_car} | {
-    f"chain_{n}": (lambda n=n: chain(n)) for n in (2, 8, 32, 128, 512)
-}
+SCENES: dict[str, Callable[[], Scene]] = {
+    "top": top,
+    "quarter_car": quarter_car,
+    "stiff_quarter_car": lambda: quarter_car(("wishbone", "guide_link")),
+} | {f"chain_{n}": (lambda n=n: chain(n)) for n in (2, 8, 32, 128, 512)}
