@@ -1,0 +1,134 @@
+"""Simulations with steps of different sizes: given ones, and those of error control."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lgsens._start import Begin, begin
+from lgsens._trajectory import Trajectory
+from lgsens._validate import as_float, is_concrete, require
+from lgsens.dynamics import RESULTS, AbstractSystem, Initial, State
+from lgsens.integrate import AdaptiveSteps, FirstState, GeneralizedAlpha, Stats, integrate_controlled
+from lgsens.sensitivity import AdjointVariable, DirectDifferentiation, Parameters, times
+
+
+class GivenSteps(eqx.Module):
+    """Generalized-α with steps of given sizes: an integrator of `simulate`.
+
+        t_{n+1} = t_n + (t1 − t0) f_n,   f = fractions/Σ fractions
+
+    Arguments:
+        fractions: the sizes of the steps, relative to each other, shape (num_steps,), not negative, the first positive.
+            A step of size 0 repeats the state.
+        integrator: the scheme, a `GeneralizedAlpha`.
+
+    `GivenSteps.of(trajectory)` has those of a trajectory: the grid that error control found for one design serves
+    those nearby, and what is computed on it is as smooth in the parameters as on equal steps. The trajectory is of
+    second order where sizes change smoothly; where they jump by a factor r, multipliers are off by O(r² − 1) h for some
+    steps. Derivatives are exact, those by `fractions`, t0 and t1 too.
+
+    Raises `ValueError` for fractions of another shape or sign.
+    """
+
+    fractions: Float[Array, " n"]
+    integrator: GeneralizedAlpha = eqx.field(static=True, default=GeneralizedAlpha())
+
+    def __init__(self, fractions, integrator: GeneralizedAlpha = GeneralizedAlpha()):
+        self.fractions = as_float(fractions, None, "GivenSteps: `fractions`")
+        self.integrator = integrator
+        if self.fractions.ndim != 1 or not self.fractions.size:
+            raise ValueError(f"GivenSteps: `fractions` must have shape (num_steps,), got {self.fractions.shape}.")
+        if not isinstance(integrator, GeneralizedAlpha):
+            raise ValueError(f"GivenSteps: `integrator` must be a GeneralizedAlpha, got {integrator!r}.")
+        require(
+            lambda sizes: np.all(np.isfinite(sizes)) and np.all(sizes >= 0.0) and sizes[0] > 0.0,
+            "GivenSteps: `fractions` must be finite, not negative, and the first one positive.",
+            self.fractions,
+        )
+
+    @classmethod
+    def of(cls, trajectory: Trajectory, integrator: GeneralizedAlpha = GeneralizedAlpha()) -> "GivenSteps":
+        """The steps of a trajectory; those of size 0 are left out, unless it is traced."""
+        sizes = jax.lax.stop_gradient(jnp.diff(trajectory.t))
+        if is_concrete(sizes):
+            sizes = np.asarray(sizes)[np.asarray(sizes) > 0.0]
+        return cls(sizes, integrator)
+
+    @property
+    def num_steps(self) -> int:
+        return self.fractions.shape[0]
+
+
+UnevenIntegrator = AdaptiveSteps | GivenSteps
+
+
+def check_uneven(integrator: UnevenIntegrator, num_steps: int, sensitivity, save) -> None:
+    """Raise `ValueError` for what does not go together with steps of different sizes."""
+    name = type(integrator).__name__
+    if isinstance(integrator, GivenSteps) and integrator.num_steps != num_steps:
+        raise ValueError(
+            f"`num_steps` = {num_steps}, but GivenSteps has {integrator.num_steps}; give `integrator.num_steps`."
+        )
+    if not isinstance(sensitivity, DirectDifferentiation | AdjointVariable):
+        raise ValueError(
+            f"`sensitivity` = {sensitivity!r} needs equal steps; with {name} DirectDifferentiation() or "
+            "AdjointVariable()."
+        )
+    if save is not None:
+        raise ValueError(f"`save` needs equal steps: leave it out, {name} returns a trajectory.")
+
+
+def run_uneven(
+    integrator: UnevenIntegrator, system: AbstractSystem, state0: State | None, initial: Initial | None, t0, t1,
+    num_steps: int, sensitivity,
+):  # fmt: skip
+    """The trajectory, and what the message of a failure needs."""
+    scheme, mean = integrator.integrator, (t1 - t0) / num_steps
+    if isinstance(integrator, GivenSteps):
+        h = (t1 - t0) * (integrator.fractions / jnp.sum(integrator.fractions))
+        start = begin(scheme, system, t0, h[0], state0, initial)
+        parameters = Parameters(system, t0, h)
+        states, stats = sensitivity.trajectory(scheme, num_steps, start.state, parameters)
+        return _finished(scheme, start, parameters, t1, states, stats, stats, jnp.ones((), bool))
+
+    # What error control decides has no derivative: its sizes, as parts of the interval, are constants of the run.
+    frozen = jax.lax.stop_gradient((system, state0, initial, t0, mean))
+    found = integrate_controlled(integrator, num_steps, frozen[0], _first(scheme, *frozen), *frozen[3:])
+    found = jax.lax.stop_gradient(found)
+    parameters = Parameters(system, t0, found.h / frozen[4] * mean)
+    start = begin(scheme, system, t0, parameters.h[0], state0, initial)
+    known = (found.states, Stats(*found.stats[:4]))
+    states, newton = sensitivity.trajectory(scheme, num_steps, start.state, parameters, known)
+    return _finished(scheme, start, parameters, t1, states, newton, found.stats, found.finished)
+
+
+def _first(scheme: GeneralizedAlpha, system, state0, initial, t0, h) -> FirstState:
+    """The starting values as they depend on the size of the first step, v₀ + h² v_2 and a₀ + h a_1."""
+    zero, one = (begin(scheme, system, t0, size, state0, initial).state for size in (h * 0.0, jnp.ones_like(h)))
+    return FirstState(zero, one.v - zero.v, one.a - zero.a)
+
+
+def _finished(scheme, start: Begin, parameters: Parameters, t1, states, newton: Stats, stats: Any, reached):
+    t = times(newton.converged.shape[0], parameters)
+    failed = jnp.argmin(newton.converged)  # the first step that did not converge, 0 if all did
+    unfinished = jnp.where(reached, RESULTS.successful, RESULTS.steps_exhausted)
+    own = jnp.where(jnp.all(newton.converged), unfinished, RESULTS.newton_failed)
+    result = jnp.where(start.result == RESULTS.successful, own, start.result).astype(jnp.int32)
+    details = {
+        "violation": start.violation,
+        "jacobian": start.jacobian,
+        "step": failed + 1,
+        "num_steps": jnp.asarray(newton.converged.shape[0]),
+        "time": jnp.where(result == RESULTS.newton_failed, t[failed + 1], t[-1]),
+        "t1": t1,
+        "iterations": newton.iterations[failed],
+        "increment": newton.increment[failed],
+        "residual": newton.residual[failed],
+        "tolerance": jnp.asarray(scheme.tolerance),
+    }
+    trajectory = Trajectory(t=t, states=states, result=result, stats=stats, system=parameters.system)
+    return trajectory, jax.lax.stop_gradient(details)
