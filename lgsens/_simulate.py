@@ -210,7 +210,7 @@ def check_integrator(integrator: GeneralizedAlpha) -> None:
     advice = ""
     if isinstance(integrator, Richardson):
         advice = " Extrapolate what it finds: `richardson(lambda n: differentiate(…, num_steps=n)[:2], num_steps)`."
-    elif isinstance(integrator, IndexReducedODE):
+    elif isinstance(integrator, IndexReducedODE | AdaptiveSteps | GivenSteps):
         advice = " `jax.grad` and `jax.jacfwd` of a criterion of `simulate` differentiate this one."
     raise ValueError(f"`integrator` must be a GeneralizedAlpha, got {integrator!r}.{advice}")
 

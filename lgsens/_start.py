@@ -47,9 +47,9 @@ def _started(integrator: GeneralizedAlpha, system: AbstractSystem, initial: Init
     """The starting values of the scheme; see `GeneralizedAlpha.second_order_start`.
 
     With exact values, and a_n = v̇(t_n + Δ h), Δ = α_m − α_f, the increment (27) misses the true one by h³ c
-    (`missed_increment`). The constraint at t_{n+1} takes B c h³ out again, through the velocity once the scheme is under way: B v_n = −h² B c
-    there. Started with B v_0 = 0 it must do so through the first accelerations, and λ is off by O(h) for some steps.
-    So v_0 receives h² P c, P the M-orthogonal projection on the constraint directions.
+    (`missed_increment`). The constraint at t_{n+1} takes B c h³ out again, through the velocity once the scheme is
+    under way: B v_n = −h² B c there. Started with B v_0 = 0 it must do so through the first accelerations, and λ is
+    off by O(h) for some steps. So v_0 receives h² P c, P the M-orthogonal projection on the constraint directions.
     """
     if not integrator.second_order_start:
         return initial.state

@@ -95,21 +95,25 @@ def run_uneven(
         states, stats = sensitivity.trajectory(scheme, num_steps, start.state, parameters)
         return _finished(scheme, start, parameters, t1, states, stats, stats, jnp.ones((), bool))
 
+    # As it depends on the size of the first step.
+    start = begin(scheme, system, t0, jnp.ones_like(mean), state0, initial)
+    first = _first_state(start, given=state0 is not None)
     # What error control decides has no derivative: its sizes, as parts of the interval, are constants of the run.
-    frozen = jax.lax.stop_gradient((system, state0, initial, t0, mean))
-    found = integrate_controlled(integrator, num_steps, frozen[0], _first(scheme, *frozen), *frozen[3:])
-    found = jax.lax.stop_gradient(found)
-    parameters = Parameters(system, t0, found.h / frozen[4] * mean)
-    start = begin(scheme, system, t0, parameters.h[0], state0, initial)
+    frozen = jax.lax.stop_gradient((system, first, t0, mean))
+    found = jax.lax.stop_gradient(integrate_controlled(integrator, num_steps, *frozen))
+    parameters = Parameters(system, t0, found.h / frozen[3] * mean)
     known = (found.states, Stats(*found.stats[:4]))
-    states, newton = sensitivity.trajectory(scheme, num_steps, start.state, parameters, known)
+    states, newton = sensitivity.trajectory(scheme, num_steps, first.at(parameters.h[0]), parameters, known)
     return _finished(scheme, start, parameters, t1, states, newton, found.stats, found.finished)
 
 
-def _first(scheme: GeneralizedAlpha, system, state0, initial, t0, h) -> FirstState:
-    """The starting values as they depend on the size of the first step, v₀ + h² v_2 and a₀ + h a_1."""
-    zero, one = (begin(scheme, system, t0, size, state0, initial).state for size in (h * 0.0, jnp.ones_like(h)))
-    return FirstState(zero, one.v - zero.v, one.a - zero.a)
+def _first_state(start: Begin, *, given: bool) -> FirstState:
+    """From the starting values for h = 1. The a of a state that is given belongs to the first step, of any size."""
+    state = start.state
+    if given:
+        return FirstState(state, jnp.zeros_like(state.v), jnp.zeros_like(state.a))
+    base = State(state.q, start.consistent_v, state.vdot, state.lam, state.vdot)
+    return FirstState(base, state.v - start.consistent_v, state.a - state.vdot)
 
 
 def _finished(scheme, start: Begin, parameters: Parameters, t1, states, newton: Stats, stats: Any, reached):

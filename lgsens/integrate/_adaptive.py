@@ -16,9 +16,9 @@ belongs to the step size (see `_start.py`), and multipliers are off by O(r² −
 
 The states and sizes found are data: the derivative is that of the scheme on this grid.
 
-Sources: Géradin & Cardona, Flexible Multibody Dynamics (2001), §11; Söderlind, ACM Transactions on Mathematical Software
-29 (2003), doi:10.1145/641876.641877 (filter PI.4.2); Söderlind & Wang, Journal of Computational and Applied Mathematics
-185 (2006), doi:10.1016/j.cam.2005.03.008 (limiter).
+Sources: Géradin & Cardona, Flexible Multibody Dynamics (2001), §11; Söderlind, ACM Transactions on Mathematical
+Software 29 (2003), doi:10.1145/641876.641877 (filter PI.4.2); Söderlind & Wang, Journal of Computational and Applied
+Mathematics 185 (2006), doi:10.1016/j.cam.2005.03.008 (limiter).
 """
 
 import math
@@ -35,21 +35,35 @@ from lgsens.integrate._integrate import Stats
 from lgsens.integrate._scheme import GeneralizedAlpha, missed_increment
 from lgsens.integrate._uneven import Attempt, Progress, UnevenSteps, chosen, moved
 
-_AIM = 0.5  # θ
-_LIMIT = 1.0  # κ
-_ATTEMPTS = 30
+_AIM = 0.5  # θ: few steps are rejected
+_LIMIT = 1.0  # κ: no step is more than 2.6 times as long as the one before
+_ATTEMPTS = 20  # at one step
 _LEAST = 1e-6  # errors below this fraction of the tolerance count as so large
 
 
 class AdaptiveSteps(eqx.Module):
     """Generalized-α with steps under error control: an integrator of `simulate`.
 
+        h³ |c_i| ≤ tolerance s_i,     c = (1/6 − β − Δ/2) v̈ + ad(v) v̇/12,  Δ = α_m − α_f
+
+    with c the part of the increment (27) that the scheme misses, v̈ ≈ (a_{n+1} − a_n)/h, s = 1 rad or the length of the
+    scene.
+
     Arguments:
         integrator: the scheme, a `GeneralizedAlpha`.
         tolerance: the error that a step may add to a configuration, relative to 1 rad or the length of the scene.
-            Global errors are of the order of tolerance^(2/3).
-        longest: the longest step, as a fraction of the interval t1 − t0. What happens within one step at rest is not
-            seen: no longer than the shortest event ahead, the bump of a road.
+            Global errors fall as tolerance^(2/3): a thousandth of it, a hundredth of them, in ten times the steps.
+        longest: the longest step, as a fraction of the interval t1 − t0. A system at rest does not see ahead: no longer
+            than half the shortest event that comes then, the bump of a road.
+
+    `num_steps` of `simulate` is the largest number of steps. The trajectory has so many rows; those after the last step
+    repeat t1 and the state there, so that integrals and `state(-1)` are right, and its `stats` are `ControlledStats`.
+    Their sweep costs the derivative as much as a step: leave little room, or give the grid found to `GivenSteps`.
+
+    The derivative is that of the numerical solution on the grid found, exactly, in both modes; under `vmap` each lane
+    has its own. The sizes themselves change a little with the parameters, which the derivative leaves out: finite
+    differences agree with it on the same grid (`GivenSteps.of`). Steps are chosen for the motion alone; the scheme is
+    stable at every step size for the motion and so for its linearization.
 
     All static and hashable. Raises `ValueError` for settings out of range.
     """
@@ -146,9 +160,7 @@ def integrate_controlled(
 
         def begins(h) -> Progress:
             """A first step begins with the state that belongs to its size."""
-            return ready._replace(
-                state=chosen(n == 0, first.at(h), ready.state), h=jnp.where(n == 0, h, ready.h)
-            )
+            return ready._replace(state=chosen(n == 0, first.at(h), ready.state), h=jnp.where(n == 0, h, ready.h))
 
         def attempt(trial: _Trial) -> _Trial:
             progress = begins(trial.h)
@@ -187,7 +199,7 @@ def integrate_controlled(
     expected = relative(first.state.v, first.state.vdot, jerk, h)
     guess = h * jnp.minimum(1.0, (_AIM / jnp.maximum(expected, _LEAST)) ** (1.0 / 3.0))
     begin = (steps.first(first.at(guess), t0, guess), guess, jnp.full((), _AIM, h.dtype), h * 0.0)
-    (progress, _, _, elapsed), (sizes, later, newton, errors, rejected) = lax.scan(step, begin, jnp.arange(num_steps))
+    (_, _, _, elapsed), (sizes, later, newton, errors, rejected) = lax.scan(step, begin, jnp.arange(num_steps))
     begun = first.at(sizes[0])
     states = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), begun, later)
     taken = jnp.sum((sizes > 0.0) & newton.converged).astype(jnp.int32)

@@ -100,7 +100,7 @@ def adjoint_sweep(scheme: GeneralizedAlpha, states: State, parameters: Parameter
         loads = lambda system, t: jax.vmap(lambda state, t: pseudo_load_function(state)(system, t))(step.state, t)
         _, pull_back = jax.vjp(loads, system, step.t)
         bar_system, bar_t = pull_back((-mu.a, -mu.lam / (scheme.beta * h**2)))
-        if single is not None:
+        if bar_ratio is not None:
             rates = prepared.rates.x * mu_x + prepared.rates.v * mu.v
             bar = bar._replace(system=jax.tree.map(jnp.add, bar.system, bar_system))
             return (c, bar), (solved, Grid(bar_t, bar_t + jnp.sum(rates, axis=1), bar_ratio))
