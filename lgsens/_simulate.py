@@ -228,7 +228,7 @@ def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, sa
     if isinstance(integrator, IndexReducedODE):
         return _run_ode(system, state0, initial, t0, (t1 - t0) / num_steps, num_steps, integrator)
     if isinstance(integrator, AdaptiveSteps | GivenSteps):
-        return run_uneven(integrator, system, state0, initial, t0, t1, num_steps, sensitivity)
+        return _run_uneven(integrator, system, state0, initial, t0, t1, num_steps, sensitivity)
 
     def started(scheme, num_steps):
         return begin(scheme, system, t0, (t1 - t0) / num_steps, state0, initial)
@@ -284,6 +284,18 @@ def run(system: AbstractSystem, start: Begin, t0, t1, num_steps: int, integrator
     result, details = outcome(integrator, start, stats, t0, parameters.h)
     t = times(num_steps, parameters)
     return Trajectory(t=t, states=states, result=result, stats=stats, system=system), details
+
+
+def _run_uneven(integrator: AdaptiveSteps | GivenSteps, system, state0, initial, t0, t1, num_steps: int, sensitivity):
+    """`run` with steps of different sizes."""
+    found = run_uneven(integrator, system, state0, initial, t0, t1, num_steps, sensitivity)
+    result, details = outcome(integrator.integrator, found.start, found.newton, t0, (t1 - t0) / num_steps)
+    stopped = ~found.reached & (result == RESULTS.successful)
+    result = jnp.where(stopped, RESULTS.steps_exhausted, result).astype(jnp.int32)
+    time = jnp.where(stopped, found.t[-1], found.t[details["step"]])
+    details |= jax.lax.stop_gradient({"time": time, "t1": t1})
+    trajectory = Trajectory(t=found.t, states=found.states, result=result, stats=found.stats, system=system)
+    return trajectory, details
 
 
 def _run_saved(system, start: Begin, t0, t1, num_steps: int, integrator, sensitivity, save: Save):

@@ -1,17 +1,17 @@
 """Simulations with steps of different sizes: given ones, and those of error control."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from lgsens._start import Begin, begin
 from lgsens._trajectory import Trajectory
 from lgsens._validate import as_float, is_concrete, require
-from lgsens.dynamics import RESULTS, AbstractSystem, Initial, State
+from lgsens.dynamics import AbstractSystem, Initial, State
 from lgsens.integrate import AdaptiveSteps, FirstState, GeneralizedAlpha, Stats, integrate_controlled
 from lgsens.sensitivity import AdjointVariable, DirectDifferentiation, Parameters, times
 
@@ -82,18 +82,29 @@ def check_uneven(integrator: UnevenIntegrator, num_steps: int, sensitivity, save
         raise ValueError(f"`save` needs equal steps: leave it out, {name} returns a trajectory.")
 
 
+class UnevenRun(NamedTuple):
+    """A run with steps of different sizes, and whether it came to the end."""
+
+    start: Begin
+    t: Float[Array, " n+1"]
+    states: State
+    newton: Stats
+    stats: Any  # what the trajectory shows
+    reached: Bool[Array, ""]
+
+
 def run_uneven(
     integrator: UnevenIntegrator, system: AbstractSystem, state0: State | None, initial: Initial | None, t0, t1,
     num_steps: int, sensitivity,
-):  # fmt: skip
-    """The trajectory, and what the message of a failure needs."""
+) -> UnevenRun:  # fmt: skip
+    """The states on the grid that is given, or that error control finds."""
     scheme, mean = integrator.integrator, (t1 - t0) / num_steps
     if isinstance(integrator, GivenSteps):
         h = (t1 - t0) * (integrator.fractions / jnp.sum(integrator.fractions))
         start = begin(scheme, system, t0, h[0], state0, initial)
         parameters = Parameters(system, t0, h)
         states, stats = sensitivity.trajectory(scheme, num_steps, start.state, parameters)
-        return _finished(scheme, start, parameters, t1, states, stats, stats, jnp.ones((), bool))
+        return UnevenRun(start, times(num_steps, parameters), states, stats, stats, jnp.ones((), bool))
 
     # As it depends on the size of the first step.
     start = begin(scheme, system, t0, jnp.ones_like(mean), state0, initial)
@@ -104,7 +115,7 @@ def run_uneven(
     parameters = Parameters(system, t0, found.h / frozen[3] * mean)
     known = (found.states, Stats(*found.stats[:4]))
     states, newton = sensitivity.trajectory(scheme, num_steps, first.at(parameters.h[0]), parameters, known)
-    return _finished(scheme, start, parameters, t1, states, newton, found.stats, found.finished)
+    return UnevenRun(start, times(num_steps, parameters), states, newton, found.stats, found.finished)
 
 
 def _first_state(start: Begin, *, given: bool) -> FirstState:
@@ -114,25 +125,3 @@ def _first_state(start: Begin, *, given: bool) -> FirstState:
         return FirstState(state, jnp.zeros_like(state.v), jnp.zeros_like(state.a))
     base = State(state.q, start.consistent_v, state.vdot, state.lam, state.vdot)
     return FirstState(base, state.v - start.consistent_v, state.a - state.vdot)
-
-
-def _finished(scheme, start: Begin, parameters: Parameters, t1, states, newton: Stats, stats: Any, reached):
-    t = times(newton.converged.shape[0], parameters)
-    failed = jnp.argmin(newton.converged)  # the first step that did not converge, 0 if all did
-    unfinished = jnp.where(reached, RESULTS.successful, RESULTS.steps_exhausted)
-    own = jnp.where(jnp.all(newton.converged), unfinished, RESULTS.newton_failed)
-    result = jnp.where(start.result == RESULTS.successful, own, start.result).astype(jnp.int32)
-    details = {
-        "violation": start.violation,
-        "jacobian": start.jacobian,
-        "step": failed + 1,
-        "num_steps": jnp.asarray(newton.converged.shape[0]),
-        "time": jnp.where(result == RESULTS.newton_failed, t[failed + 1], t[-1]),
-        "t1": t1,
-        "iterations": newton.iterations[failed],
-        "increment": newton.increment[failed],
-        "residual": newton.residual[failed],
-        "tolerance": jnp.asarray(scheme.tolerance),
-    }
-    trajectory = Trajectory(t=t, states=states, result=result, stats=stats, system=parameters.system)
-    return trajectory, jax.lax.stop_gradient(details)

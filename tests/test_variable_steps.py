@@ -1,6 +1,8 @@
 """Steps of different sizes, given or under error control: accuracy, derivatives on the frozen grid, failures."""
 
 import functools
+import json
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -13,9 +15,12 @@ from jaxtyping import Array, Float
 
 import lgsens as lg
 from lgsens.dynamics import Tangents
+from lgsens.examples import PROBLEMS
 from lgsens.liegroups import Rn
 
 SCHEME = lg.GeneralizedAlpha(rho_inf=0.8)
+DATA = Path(__file__).parent / "data"
+CARS = [("quarter_car_linear", 1e-5, 200), ("five_link_quarter_car", 1e-5, 400)]
 P = (1.3, 0.8, 40.0, 0.5)
 
 
@@ -148,57 +153,72 @@ def test_second_derivatives_on_a_given_grid():
 
 
 def test_error_control():
-    """Grid, statistics, and what repeats after the last step; a hundredth of the tolerance is more accurate."""
-    p = jnp.array(P)
-    run = adaptive()(p)
-    steps = int(run.stats.steps)
-    sizes = np.diff(run.t)
+    """Grid, statistics, and what repeats after the last step."""
+    run = adaptive()(jnp.array(P))
+    steps, sizes = int(run.stats.steps), np.diff(run.t)
     assert run.result == lg.RESULTS.successful and 50 <= steps < 200
     assert np.all(sizes[:steps] > 0) and np.all(sizes[steps:] == 0)
+    assert sizes.max() <= 0.02 * (1 + 1e-12)  # `longest`
     np.testing.assert_allclose(run.t[-1], 1.2, rtol=1e-14)
     assert np.all(run.stats.error <= 1e-5) and np.all(run.stats.error[steps:] == 0)
     assert np.all(run.stats.converged) and np.all((run.stats.iterations > 0) == (sizes > 0))
     assert run.stats.rejected.shape == (200,) and np.all(run.stats.rejected[steps:] == 0)
-    for leaf in jax.tree.leaves(run.states):
-        assert np.all(np.isfinite(leaf)) and np.all(np.asarray(leaf)[steps:] == np.asarray(leaf)[steps])
-    finer = adaptive(1e-7, 800)(p)
+    for leaf in map(np.asarray, jax.tree.leaves(run.states)):
+        assert np.all(np.isfinite(leaf)) and np.all(leaf[steps:] == leaf[steps])
+
+
+@pytest.mark.slow
+def test_errors_fall_with_the_tolerance():
+    p = jnp.array(P)
     exact = observed(lg.simulate(make(p), t0=0.2, t1=1.2, num_steps=4000, integrator=SCHEME))
-    errors = [abs(float(observed(each) - exact)) for each in (run, finer)]
+    errors = [abs(float(observed(adaptive(tolerance, n)(p)) - exact)) for tolerance, n in ((1e-5, 200), (1e-7, 800))]
     assert errors[1] < errors[0] / 10, errors  # tolerance^(2/3): 21
+
+
+def differentiated(p):
+    """Value and gradient, and the trajectory."""
+
+    def evaluate(p):
+        run = adaptive()(p)
+        return observed(run), run
+
+    return jax.value_and_grad(evaluate, has_aux=True)(p)
+
+
+DIFFERENTIATED = jax.jit(differentiated)
 
 
 def test_derivative_is_that_on_the_frozen_grid():
     """The grid that was found, given: the same run, and its differences."""
     p = jnp.array(P)
-    run = adaptive()(p)
+    (found, run), slopes = DIFFERENTIATED(p)
     grid = lg.GivenSteps.of(run, SCHEME)
     assert grid.num_steps == int(run.stats.steps)
     again = jax.jit(lambda p: observed(lg.simulate(make(p), t0=0.2, t1=1.2, num_steps=grid.num_steps, integrator=grid)))
-    np.testing.assert_allclose(again(p), observed(run), rtol=1e-12)  # what Newton leaves in λ
-    slopes = jax.jit(jax.jacfwd(lambda p: observed(adaptive()(p))))(p) * p
+    np.testing.assert_allclose(again(p), found, rtol=1e-12)  # what Newton leaves in λ
     expected = [central(lambda s, e=e: again(p + s * e * p), 1e-3) for e in jnp.eye(4)]
-    np.testing.assert_allclose(slopes, expected, rtol=1e-8)  # as on equal steps, test_own_system.py
-    for method in (lg.DirectDifferentiation(), lg.AdjointVariable()):
-        reverse = jax.jit(jax.grad(lambda p, m=method: observed(adaptive(sensitivity=m)(p))))(p)
-        np.testing.assert_allclose(reverse * p, slopes, rtol=1e-10)  # other order of round-off
+    np.testing.assert_allclose(slopes * p, expected, rtol=1e-8)  # as on equal steps, test_own_system.py
+
+
+@pytest.mark.slow
+def test_forward_mode_and_the_explicit_adjoint_agree():
+    p = jnp.array(P)
+    _, slopes = DIFFERENTIATED(p)
+    forward = jax.jit(jax.jacfwd(lambda p: observed(adaptive()(p))))(p)
+    adjoint = jax.jit(jax.grad(lambda p: observed(adaptive(sensitivity=lg.AdjointVariable())(p))))(p)
+    for other in (forward, adjoint):
+        np.testing.assert_allclose(other, slopes, rtol=1e-10)  # other order of round-off
 
 
 def test_lanes_have_grids_of_their_own():
-    fast, slow = jnp.array(P).at[2].set(100.0), jnp.array(P)
-    evaluate = jax.value_and_grad(lambda p: (lambda run: (observed(run), run.t))(adaptive()(p)), has_aux=True)
-    (values, times), slopes = jax.jit(jax.vmap(evaluate))(jnp.stack([fast, slow]))
-    assert np.sum(np.diff(times[0]) > 0) > np.sum(np.diff(times[1]) > 0) + 5
-    for lane, p in enumerate((fast, slow)):
-        (one, t), slope = jax.jit(evaluate)(p)
-        np.testing.assert_allclose(times[lane], t, rtol=1e-9)  # sizes follow from errors that carry round-off/h²
+    stiff, soft = jnp.array(P).at[2].set(100.0), jnp.array(P)
+    (values, runs), slopes = jax.jit(jax.vmap(differentiated))(jnp.stack([stiff, soft]))
+    assert runs.stats.steps[0] > runs.stats.steps[1] + 5
+    for lane, p in enumerate((stiff, soft)):
+        (one, run), slope = DIFFERENTIATED(p)
+        np.testing.assert_allclose(runs.t[lane], run.t, rtol=1e-9)  # sizes follow from errors that carry round-off/h²
         np.testing.assert_allclose(values[lane], one, rtol=1e-9)
         np.testing.assert_allclose(slopes[lane], slope, rtol=1e-7)
-
-
-def test_longest_step():
-    run = adaptive(1e-2, longest=0.03)(jnp.array(P))
-    sizes = np.diff(run.t)
-    assert np.isclose(sizes.max(), 0.03, rtol=1e-12) and run.result == lg.RESULTS.successful
 
 
 EXHAUSTED = says("needs more steps", "`num_steps`", "`tolerance`", "t = 0.", "of 1.2 s in 30 steps", "`throw=False`")
@@ -239,3 +259,26 @@ def test_bad_input():
         run(lg.AdaptiveSteps(), num_steps=3, sensitivity=lg.Autodiff())
     with pytest.raises(ValueError, match=says("checkpoints")):
         run(given, num_steps=2, sensitivity=lg.DirectDifferentiation(checkpoints="sqrt"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "tolerance", "capacity"), CARS)
+def test_half_the_steps_on_the_bump(name, tolerance, capacity):
+    """Twice as many equal steps are less accurate, in Ψ₀ and in its gradient, against independent numbers."""
+    problem = PROBLEMS[name]
+    exact = problem.reference(json.loads((DATA / problem.file).read_text()))["Psi0"]
+    parameters = {key: jnp.asarray(number) for key, number in problem.parameters.items()}
+
+    def errors(num_steps, integrator):
+        def evaluate(p):
+            run = problem.simulate(p, num_steps=num_steps, integrator=integrator)
+            return problem.criteria["Psi0"](run, p), run.stats
+
+        (found, stats), gradient = jax.jit(jax.value_and_grad(evaluate, has_aux=True))(parameters)
+        slopes = np.array([[gradient[key], exact.gradient[key]] for key in exact.gradient]).T
+        slopes *= np.array([problem.parameters[key] for key in exact.gradient])
+        return abs(found / exact.value - 1), np.abs(slopes[0] - slopes[1]).max() / np.abs(slopes[1]).max(), stats
+
+    *controlled, stats = errors(capacity, lg.AdaptiveSteps(lg.GeneralizedAlpha(0.9), tolerance=tolerance))
+    *equal, _ = errors(2 * int(stats.steps), lg.GeneralizedAlpha(0.9))
+    assert controlled[0] < equal[0] and controlled[1] < equal[1], (controlled, equal)
