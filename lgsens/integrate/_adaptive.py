@@ -5,16 +5,16 @@ With v̈ ≈ (a_{n+1} − a_n)/h, a_n that of this step, the increment of eq. (2
 
     |e_i|/s_i,     s = 1 rad or the length of the scene,
 
-and kept below the tolerance. To leave the least number of steps for a given sum of h |c| h², as global errors
-add up, the local error should be the same in all of them: so it is the error of a step that is controlled, not of a
-unit of time. The size of the next step follows from the errors of the last two, E = |e|/tolerance, by the filter
+and kept below the tolerance. It is that of a step and not of a unit of time: local errors add up to ∫ h² |c| dt, in
+∫ dt/h steps, and for a given sum the steps are fewest where h³ |c| is the same in all. The size of the next one follows
+from the errors of the last two, E = |e|/tolerance, by the filter
 
     ρ = (θ/E_n)^{3/(5·3)} (θ/E_{n−1})^{−1/(5·3)},      h ← h (1 + κ arctan((ρ − 1)/κ)).
 
 Sizes so chosen change smoothly, which matters: in the constraint directions the velocity carries an error of O(h²) that
-belongs to the step size (see `_start.py`), and multipliers are off by O(r² − 1) h where this changes by a factor r.
+belongs to the step size (see `_start.py`), and where this changes by a factor r multipliers are off by O(r² − 1) h.
 
-The states and sizes found are data: the derivative is that of the scheme on this grid.
+The derivative is that of the scheme on the grid found, so nothing here is differentiated.
 
 Sources: Géradin & Cardona, Flexible Multibody Dynamics (2001), §11; Söderlind, ACM Transactions on Mathematical
 Software 29 (2003), doi:10.1145/641876.641877 (filter PI.4.2); Söderlind & Wang, Journal of Computational and Applied

@@ -20,7 +20,9 @@ The columns of step n then receive, from the same equations,
     c_n.w += Dᵀ μ.w,    c_n.v += h Tᵀ μ.w + μ.v,    c_n.a += h² (½ − β) Tᵀ μ.w + h (1 − γ) μ.v + α_m/(1 − α_f) μ.vdot,
     c_n.vdot += −α_f/(1 − α_f) μ.vdot,    p̄ += −r_pᵀ μ.a − Φ_pᵀ μ.lam/(βh²),    h̄ += x_hᵀ Tᵀ μ.w + v_hᵀ μ.v,
 
-and p̄ of t0 and h through t_{n+1} = t0 + (n+1) h. What is kept is the states; nothing of the paper's Ḃ, Ḟ_λ or
+and p̄ of t0 and h through t_{n+1} = t0 + (n+1) h. With steps of different sizes c_n.a is so that of a_n*, say c*, and
+what a_n, v̇_n and r_n receive of it is r_n c*, (1 − r_n) c* and (a_n − v̇_n)ᵀ c*; an empty step has μ = c_{n+1}, and adds
+that to c_n. What is kept is the states; nothing of the paper's Ḃ, Ḟ_λ or
 d²F_M/dt² is needed, because accelerations and multipliers are unknowns here like the others.
 """
 
