@@ -2,7 +2,7 @@
 
     python benchmarks/variable_steps.py [--out benchmarks/results] [--seconds 2]
 
-The gradient is that by stiffness, damping, height of the bump and the 30 coordinates of hardpoints, in reverse mode. All
+The gradient is that by stiffness, damping, height of the bump and 30 coordinates of hardpoints, in reverse mode. All
 errors are relative to an independent integrator (index-reduced equations, Dopri8, 800 steps): that of Ψ₀; the largest
 of p dΨ₀/dp of the first three, relative to the largest; the largest of dΨ₀/dp of the hardpoints, relative to the
 largest. Prints the table and writes variable_steps.json. With JAX_COMPILATION_CACHE_DIR a second run compiles nothing.
@@ -97,9 +97,7 @@ def main() -> None:
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     exact = evaluate(*REFERENCE, arguments.seconds)
-    print(
-        "| steps | number | rejected | Newton's iterations | error of Ψ₀ | of its gradient by rates | by hardpoints | ms |"
-    )
+    print("| steps | number | rejected | iterations | error of Ψ₀ | of its gradient by rates | by hardpoints | ms |")
     print("|---|---|---|---|---|---|---|---|", flush=True)
     rows = []
     for label, integrator, num_steps in CASES:
