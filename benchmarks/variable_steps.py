@@ -46,11 +46,11 @@ def parameters(car: QuarterCar) -> dict:
 
 def build(car: QuarterCar, p: dict) -> lg.Model:
     def leaves(car):
-        links = [[getattr(car.links[name], end) for name in car.links] for end in ("chassis", "knuckle")]
-        return [car.spring.rate, car.damper.rate, car.bump_height, links]
+        ends = [getattr(link, end) for end in ("chassis", "knuckle") for link in car.links.values()]
+        return [car.spring.rate, car.damper.rate, car.bump_height, *ends]
 
-    ends = [[p["points"][end][name] for name in car.links] for end in ("chassis", "knuckle")]
-    return eqx.tree_at(leaves, car, [*(p[name] for name in RATES), ends]).model()
+    ends = [p["points"][end][name] for end in ("chassis", "knuckle") for name in car.links]
+    return eqx.tree_at(leaves, car, [*(p[name] for name in RATES), *ends]).model()
 
 
 def evaluate(integrator, num_steps: int, seconds: float) -> dict:
