@@ -45,11 +45,13 @@ def parameters(car: QuarterCar) -> dict:
 
 
 def build(car: QuarterCar, p: dict) -> lg.Model:
+    names = sorted(car.links)
+
     def leaves(car):
-        ends = [getattr(link, end) for end in ("chassis", "knuckle") for link in car.links.values()]
+        ends = [getattr(car.links[name], end) for end in ("chassis", "knuckle") for name in names]
         return [car.spring.rate, car.damper.rate, car.bump_height, *ends]
 
-    ends = [p["points"][end][name] for end in ("chassis", "knuckle") for name in car.links]
+    ends = [p["points"][end][name] for end in ("chassis", "knuckle") for name in names]
     return eqx.tree_at(leaves, car, [*(p[name] for name in RATES), *ends]).model()
 
 
