@@ -29,9 +29,10 @@ from lgsens._trajectory import (
     StateError as StateError,
     Trajectory as Trajectory,
 )
+from lgsens._uneven_runs import GivenSteps as GivenSteps
 from lgsens.criteria import Criterion as Criterion, time_integral as time_integral
 from lgsens.dynamics import RESULTS as RESULTS, AbstractSystem as AbstractSystem, State as State
-from lgsens.integrate import GeneralizedAlpha as GeneralizedAlpha
+from lgsens.integrate import AdaptiveSteps as AdaptiveSteps, GeneralizedAlpha as GeneralizedAlpha
 from lgsens.linear import BlockSparse as BlockSparse, DenseLU as DenseLU
 from lgsens.model import (
     AppliedForce as AppliedForce,

@@ -65,6 +65,11 @@ def describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> st
             f"{np.array2string(details['values'], precision=6)}. Left over: |Φ| = {violation[worst]:.3g}, largest in "
             f"joint {names[worst]!r}."
         )
+    if code is RESULTS.steps_exhausted:
+        return (
+            f"{code.message} It came to t = {details['time']:.6g} s of {details['t1']:.6g} s in "
+            f"{int(details['num_steps'])} steps. `throw=False` returns these."
+        )
     if code is RESULTS.integration_failed:
         return (
             f"{code.message} It failed in interval {int(details['step'])} of {int(details['num_steps'])}, from "

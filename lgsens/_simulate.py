@@ -13,6 +13,7 @@ from lgsens._index_reduced_ode import IndexReducedODE, integrate_ode, ode_failur
 from lgsens._richardson import Richardson, extrapolate_runs
 from lgsens._start import Begin, begin
 from lgsens._trajectory import Instant, Saved, Trajectory
+from lgsens._uneven_runs import GivenSteps, check_uneven, run_uneven
 from lgsens._validate import as_count, as_float, require
 from lgsens.dynamics import (
     RESULTS,
@@ -22,7 +23,7 @@ from lgsens.dynamics import (
     equilibrium as _equilibrium,
     initial_state as _initial,
 )
-from lgsens.integrate import GeneralizedAlpha, Stats
+from lgsens.integrate import AdaptiveSteps, GeneralizedAlpha, Stats
 from lgsens.model import Model
 from lgsens.sensitivity import AbstractSensitivity, DirectDifferentiation, Parameters, saved_run, times
 
@@ -101,7 +102,7 @@ def _checked(system: AbstractSystem, initial: Initial, throw: bool) -> State:
     return throw_if_failed(initial.state, initial.result, details, system.constraint_names)
 
 
-Integrator = GeneralizedAlpha | Richardson | IndexReducedODE
+Integrator = GeneralizedAlpha | Richardson | IndexReducedODE | AdaptiveSteps | GivenSteps
 Save = Callable[[Instant], Any]
 
 
@@ -152,9 +153,11 @@ def simulate(
     Arguments:
         model: the scene, or an `AbstractSystem`.
         t0, t1: initial and final time [s], shape (); t1 > t0.
-        num_steps: number of steps of equal size h = (t1 − t0)/num_steps; a Python int.
+        num_steps: number of steps of equal size h = (t1 − t0)/num_steps; a Python int. With `AdaptiveSteps` the
+            largest number of steps.
         integrator: the scheme and its Newton settings, `GeneralizedAlpha`. `Richardson` extrapolates two such runs,
             of n and 2n steps, to nearly fourth order. `IndexReducedODE`: an explicit Runge–Kutta scheme of high order.
+            `AdaptiveSteps`: generalized-α under error control; `GivenSteps`: with steps of given sizes.
         sensitivity: how the trajectory is differentiated. `DirectDifferentiation` supports every JAX
             transformation; `AdjointVariable` is reverse mode only.
         state0: the state at t0, used as it is: one of `equilibrium`, or `Trajectory.state` to continue. None: the
@@ -175,7 +178,7 @@ def simulate(
     """
     system = as_system(model)
     warn_of_single_precision(system)
-    if not isinstance(integrator, Richardson | IndexReducedODE):
+    if not isinstance(integrator, Richardson | IndexReducedODE | AdaptiveSteps | GivenSteps):
         check_integrator(integrator)
     if isinstance(integrator, IndexReducedODE) and sensitivity != DirectDifferentiation():
         raise ValueError(
@@ -186,12 +189,14 @@ def simulate(
             "`sensitivity` must be DirectDifferentiation(), AdjointVariable(), ContinuousDirect() or Autodiff(), got "
             f"{sensitivity!r}; ContinuousAdjoint() needs a Criterion, see `differentiate`."
         )
+    num_steps = as_count(num_steps, "num_steps", " (it is static)")
+    if isinstance(integrator, AdaptiveSteps | GivenSteps):
+        check_uneven(integrator, num_steps, sensitivity, save)
     if save is not None and not (callable(save) and isinstance(integrator, GeneralizedAlpha)):
         raise ValueError(
             f"`save` must be a function of an Instant, with a GeneralizedAlpha as `integrator`; got {save!r} and "
             f"{integrator!r}. Leave `save` out to have the trajectory."
         )
-    num_steps = as_count(num_steps, "num_steps", " (it is static)")
     t0, t1 = interval(t0, t1)
     found, details = _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, save)
     if throw:
@@ -205,7 +210,7 @@ def check_integrator(integrator: GeneralizedAlpha) -> None:
     advice = ""
     if isinstance(integrator, Richardson):
         advice = " Extrapolate what it finds: `richardson(lambda n: differentiate(…, num_steps=n)[:2], num_steps)`."
-    elif isinstance(integrator, IndexReducedODE):
+    elif isinstance(integrator, IndexReducedODE | AdaptiveSteps | GivenSteps):
         advice = " `jax.grad` and `jax.jacfwd` of a criterion of `simulate` differentiate this one."
     raise ValueError(f"`integrator` must be a GeneralizedAlpha, got {integrator!r}.{advice}")
 
@@ -222,6 +227,8 @@ def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, sa
     initial = None if state0 is not None else _initial(system, t0)
     if isinstance(integrator, IndexReducedODE):
         return _run_ode(system, state0, initial, t0, (t1 - t0) / num_steps, num_steps, integrator)
+    if isinstance(integrator, AdaptiveSteps | GivenSteps):
+        return _run_uneven(integrator, system, state0, initial, t0, t1, num_steps, sensitivity)
 
     def started(scheme, num_steps):
         return begin(scheme, system, t0, (t1 - t0) / num_steps, state0, initial)
@@ -277,6 +284,18 @@ def run(system: AbstractSystem, start: Begin, t0, t1, num_steps: int, integrator
     result, details = outcome(integrator, start, stats, t0, parameters.h)
     t = times(num_steps, parameters)
     return Trajectory(t=t, states=states, result=result, stats=stats, system=system), details
+
+
+def _run_uneven(integrator: AdaptiveSteps | GivenSteps, system, state0, initial, t0, t1, num_steps: int, sensitivity):
+    """`run` with steps of different sizes."""
+    found = run_uneven(integrator, system, state0, initial, t0, t1, num_steps, sensitivity)
+    result, details = outcome(integrator.integrator, found.start, found.newton, t0, (t1 - t0) / num_steps)
+    stopped = ~found.reached & (result == RESULTS.successful)
+    result = jnp.where(stopped, RESULTS.steps_exhausted, result).astype(jnp.int32)
+    time = jnp.where(stopped, found.t[-1], found.t[details["step"]])
+    details |= jax.lax.stop_gradient({"time": time, "t1": t1})
+    trajectory = Trajectory(t=found.t, states=found.states, result=result, stats=found.stats, system=system)
+    return trajectory, details
 
 
 def _run_saved(system, start: Begin, t0, t1, num_steps: int, integrator, sensitivity, save: Save):

@@ -15,7 +15,7 @@ from lgsens.dynamics import (
     initial_state,
     split_velocity,
 )
-from lgsens.integrate import GeneralizedAlpha
+from lgsens.integrate import GeneralizedAlpha, missed_increment
 from lgsens.linear import Matrix
 
 
@@ -46,21 +46,16 @@ def begin(
 def _started(integrator: GeneralizedAlpha, system: AbstractSystem, initial: Initial, h) -> State:
     """The starting values of the scheme; see `GeneralizedAlpha.second_order_start`.
 
-    With exact values, and a_n = v̇(t_n + Δ h), Δ = α_m − α_f, the increment (27) misses the true one,
-    h v + h²/2 v̇ + h³ (v̈/6 + ad(v) v̇/12) (from ẋ = T⁻¹(x) v, T⁻¹ = I + ½ ad(x) + …), by h³ c with
-
-        c = (1/6 − β − Δ/2) v̈ + ad(v) v̇/12.
-
-    The constraint at t_{n+1} takes B c h³ out again, through the velocity once the scheme is under way: B v_n = −h² B c
-    there. Started with B v_0 = 0 it must do so through the first accelerations, and λ is off by O(h) for some steps.
-    So v_0 receives h² P c, P the M-orthogonal projection on the constraint directions.
+    With exact values, and a_n = v̇(t_n + Δ h), Δ = α_m − α_f, the increment (27) misses the true one by h³ c
+    (`missed_increment`). The constraint at t_{n+1} takes B c h³ out again, through the velocity once the scheme is
+    under way: B v_n = −h² B c there. Started with B v_0 = 0 it must do so through the first accelerations, and λ is
+    off by O(h) for some steps. So v_0 receives h² P c, P the M-orthogonal projection on the constraint directions.
     """
     if not integrator.second_order_start:
         return initial.state
     state = initial.state
     delta = integrator.alpha_m - integrator.alpha_f
-    missed = (1.0 / 6.0 - integrator.beta - delta / 2.0) * initial.jerk
-    missed = missed + system.group.ad_mv(state.v, state.vdot) / 12.0
+    missed = missed_increment(integrator, system, state.v, state.vdot, initial.jerk)
     _, normal = split_velocity(system, state.q, missed)
     return State(
         q=state.q,

@@ -128,7 +128,7 @@ class Trajectory(AbstractMotion):
     """A simulated motion, a pytree like every other: criteria of it are differentiated as usual.
 
     Attributes:
-        t: the times t0 + n h [s], shape (n+1,).
+        t: the times t0 + n h [s], or those that the integrator chose, shape (n+1,).
         states: the states, stacked along a leading axis.
         result: a value of `RESULTS`, shape (), int32; 0 is success.
         stats: Newton's iterations, increments and residuals; what the integrator says of its steps.

@@ -13,6 +13,7 @@ class RESULTS(IntEnum):
     equilibrium_failed = 4
     integration_failed = 5
     position_failed = 6
+    steps_exhausted = 7
 
     @property
     def message(self) -> str:
@@ -47,5 +48,8 @@ _MESSAGES = {
         "No position satisfies the joints for these values of the driven ones: they are out of reach, or the mechanism "
         "passes a dead centre, where the driven values do not determine it. Ask for values within reach, drive another "
         "coordinate, or come there in smaller steps."
+    ),
+    RESULTS.steps_exhausted: (
+        "Error control needs more steps than `num_steps` allows. Try more `num_steps` or a looser `tolerance`."
     ),
 }

@@ -1,5 +1,11 @@
 """The Lie-group generalized-α integrator (paper, §4)."""
 
+from lgsens.integrate._adaptive import (
+    AdaptiveSteps as AdaptiveSteps,
+    ControlledStats as ControlledStats,
+    FirstState as FirstState,
+    integrate_controlled as integrate_controlled,
+)
 from lgsens.integrate._integrate import (
     Constants as Constants,
     Guess as Guess,
@@ -15,4 +21,6 @@ from lgsens.integrate._scheme import (
     advance as advance,
     factorize_iteration_matrix as factorize_iteration_matrix,
     increment as increment,
+    missed_increment as missed_increment,
 )
+from lgsens.integrate._uneven import integrate_uneven as integrate_uneven, moved as moved

@@ -24,7 +24,7 @@ from lgsens.integrate._scheme import GeneralizedAlpha, advance, factorize_iterat
 from lgsens.linear import Factors, Inverse, Matrix
 
 _MODIFIED_LIMIT = 12  # iterations; more cost as much as a full one
-_SLOW = 0.1  # the contraction from which on a new matrix pays, in the next step
+SLOW = 0.1  # the contraction from which on a new matrix pays, in the next step
 _STALLED = 0.3  # that from which on two full iterations cost less
 _FASTEST = 0.02  # contractions measured close to round-off are no better than this
 _ROUGH = 4096  # round-offs: increments below say nothing of the contraction, and one that falls slower than it is noise
@@ -64,6 +64,7 @@ class Guess(NamedTuple):
     a: tuple[Float[Array, " k"], Float[Array, " k"]]  # a_n, a_{n-1}
     lam: tuple[Float[Array, " m"], Float[Array, " m"]]
     contraction: Float[Array, ""]
+    start: tuple[Float[Array, " k"], Float[Array, " m"]] | None = None  # u and λ, where steps are not equal
 
     @classmethod
     def first(cls, state0: State) -> "Guess":
@@ -71,6 +72,8 @@ class Guess(NamedTuple):
 
     def extrapolated(self, state: State):
         """u and λ: 3 x_n − 3 x_{n−1} + x_{n−2}."""
+        if self.start is not None:
+            return self.start
         return tuple(3.0 * (x - last) + before for x, (last, before) in ((state.a, self.a), (state.lam, self.lam)))
 
     def after(self, state: State, contraction) -> "Guess":
@@ -169,6 +172,25 @@ def take_step(
     return state, guess.after(previous, contraction), stats
 
 
+def inverse_at(scheme: GeneralizedAlpha, system: AbstractSystem, constants: Constants, state: State, t, h) -> Factors:
+    """The inverse of the iteration matrix of a step of size h from here, for modified Newton."""
+    at_state = tangents(system, state.q, state.v, state.vdot, state.lam, t)
+    x = increment(scheme, state, state.a, h)
+    return factorize_iteration_matrix(scheme, system, at_state, constants.mass, x, h, Inverse)
+
+
+def no_inverse(inverse: Callable[..., Factors], *arguments) -> Factors:
+    """Zeros of the shapes that `inverse(*arguments)` has, to begin with."""
+    shape = jax.eval_shape(inverse, *arguments)
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
+
+
+def renewed_where(due, inverse: Callable[[], Factors], earlier: Factors) -> Factors:
+    """`inverse()` where it is due. A loop of no or one turn, because `cond` would copy the inverse."""
+    renewed = lambda carry: (jnp.zeros((), bool), inverse())
+    return lax.while_loop(lambda carry: carry[0], renewed, (due, earlier))[1]
+
+
 def integrate(
     scheme: GeneralizedAlpha, num_steps: int, system: AbstractSystem, state0: State, t0, h
 ) -> tuple[State, Stats]:
@@ -225,20 +247,16 @@ def integrate_onward(
     constants = Constants.of(system)
 
     def inverse(state: State, n) -> Factors:
-        at_state = tangents(system, state.q, state.v, state.vdot, state.lam, t0 + n * h)
-        x = increment(scheme, state, state.a, h)
-        return factorize_iteration_matrix(scheme, system, at_state, constants.mass, x, h, Inverse)
+        return inverse_at(scheme, system, constants, state, t0 + n * h, h)
 
     def step(carry, n):
         previous, guess, earlier, age, running = carry
         if earlier is not None:
             # A matrix that contracts slowly is renewed, unless it was new: then full Newton takes over. In a batch
-            # every lane pays for the slowest; for its full iterations it would pay more. A loop of no or one turn,
-            # because `cond` would copy the inverse.
-            due = (jnp.mod(n, scheme.factor_every) == 0) | ((guess.contraction >= _SLOW) & (age > 1))
+            # every lane pays for the slowest; for its full iterations it would pay more.
+            due = (jnp.mod(n, scheme.factor_every) == 0) | ((guess.contraction >= SLOW) & (age > 1))
             age = jnp.where(due, 0, age) + 1
-            renewed = lambda carry: (jnp.zeros((), bool), inverse(previous, n))
-            _, earlier = lax.while_loop(lambda carry: carry[0], renewed, (due, earlier))
+            earlier = renewed_where(due, partial(inverse, previous, n), earlier)
         t = t0 + (n + 1) * h
         state, guess, stats = take_step(scheme, system, constants, previous, guess, earlier, running, t, h)
         return (state, guess, earlier, age, stats.converged), (output(state, t), stats)
@@ -246,8 +264,7 @@ def integrate_onward(
     count = mark.n + jnp.arange(num_steps, dtype=constants.scale.dtype)
     earlier = None
     if scheme.factor_every:
-        shape = jax.eval_shape(inverse, mark.state, count[0])
-        earlier = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
+        earlier = no_inverse(inverse, mark.state, count[0])
     start = (mark.state, mark.guess, earlier, jnp.zeros((), jnp.int32), mark.running)
     (state, guess, _, _, running), (outputs, stats) = lax.scan(step, start, count)
     return outputs, Mark(mark.n + num_steps, state, guess, running), stats

@@ -126,6 +126,16 @@ def advance(scheme: GeneralizedAlpha, system: AbstractSystem, previous: State, u
     return Motion(x, system.group.retract(previous.q, x), v, vdot)
 
 
+def missed_increment(scheme: GeneralizedAlpha, system: AbstractSystem, v, vdot, jerk) -> Float[Array, " k"]:
+    """c: with exact values and a_n = v̇(t_n + Δ h), Δ = α_m − α_f, the increment (27) misses the true one by h³ c.
+
+    The true one is h v + h²/2 v̇ + h³ (v̈/6 + ad(v) v̇/12), from ẋ = T⁻¹(x) v and T⁻¹ = I + ½ ad(x) + …; hence
+    c = (1/6 − β − Δ/2) v̈ + ad(v) v̇/12.
+    """
+    delta = scheme.alpha_m - scheme.alpha_f
+    return (1.0 / 6.0 - scheme.beta - delta / 2.0) * jerk + system.group.ad_mv(v, vdot) / 12.0
+
+
 def factorize_iteration_matrix(
     scheme: GeneralizedAlpha, system: AbstractSystem, tangents: Tangents, mass, x, h, kind: Any = LU
 ) -> Factors:

@@ -12,8 +12,6 @@ parameters (under `vmap` over right-hand sides S stays unbatched). The steps aft
 computed and dropped.
 """
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -24,9 +22,12 @@ from lgsens.sensitivity._blocks import Blocks, padded, sweep_blocks
 from lgsens.sensitivity._linearization import (
     Linearized,
     Parameters,
+    SingleStep,
     Variation,
+    grid_tangent,
     kinematics,
     linearized,
+    own,
     pseudo_loads,
     steps,
 )
@@ -68,19 +69,27 @@ def direct_sweep(scheme: GeneralizedAlpha, states: State, parameters: Parameters
     blocks = Blocks.of(states.v.shape[0] - 1, factor_size(parameters.system))
 
     def one(previous: Variation, inputs):
-        step, loads, row = inputs
-        current = direct_step(scheme, parameters, mass, step, loads, previous, row, d.h)
+        step, loads, row, single, d_grid = inputs
+        if single is None:
+            current = direct_step(scheme, parameters, mass, step, loads, previous, row, d.h)
+            return current, current
+        begun, one_step = single.begun(previous, d_grid), own(parameters, single.grid)
+        current = direct_step(scheme, one_step, mass, step, loads, begun, row, d_grid.h)
+        current = single.unless_empty(current, jax.tree.map(jnp.add, previous, row))
         return current, current
 
+    def prepare(step, single, d_grid):
+        one_step = own(parameters, single and single.grid)
+        return linearized(scheme, one_step, mass, step), pseudo_loads(step, one_step, own(d, d_grid))
+
     def block(previous: Variation, inputs):
-        step, rows = inputs
-        prepared = jax.vmap(partial(linearized, scheme, parameters, mass))(step)
-        loads = jax.vmap(lambda step: pseudo_loads(step, parameters, d))(step)
-        return lax.scan(one, previous, (prepared, loads, rows))
+        step, rows, *grid = inputs
+        return lax.scan(one, previous, (*jax.vmap(prepare)(step, *grid), rows, *grid))
 
     first = jax.tree.map(lambda leaf: leaf[0], b)
     rows = jax.tree.map(lambda leaf: leaf[1:], b)
-    inputs = padded((steps(states, parameters), rows), blocks.padding, repeat=True)
+    grid = SingleStep.of(states, parameters), grid_tangent(parameters, d)
+    inputs = padded((steps(states, parameters), rows, *grid), blocks.padding, repeat=True)
     _, later = sweep_blocks(blocks, block, first, inputs)
     num_steps = states.v.shape[0] - 1
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest[:num_steps]]), first, later), d

@@ -13,6 +13,13 @@ the numbers of the system, t0 and h. Differentiating the step (eqs. 24–29, §6
 
 Row 0 is δ_0 = b_0 and the last row p' = b.p. L is block lower bidiagonal with a border for p. A derivative has b_0 and
 b.p only (all other rows zero); derivatives of derivatives fill the other rows too.
+With steps of different sizes h_n, each step is a run of one step from t_n, and begins with the algorithmic acceleration
+a_n* = v̇_n + r_n (a_n − v̇_n), r_n = h_n/h_{n−1} (`moved`), in place of a_n:
+
+    a*'_n = v̇'_n + r_n (a'_n − v̇'_n) + r'_n (a_n − v̇_n)
+
+while a step of size 0 has the equations δ_{n+1} − δ_n = b.
+
 Forward substitution with L is the direct differentiation method (`_direct.py`), back substitution with Lᵀ the
 discrete adjoint variable method (`_adjoint.py`). Both solve with the exact iteration matrix of eq. (30).
 """
@@ -21,10 +28,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from lgsens.dynamics import AbstractSystem, State, Tangents, mass_matrix, tangents
-from lgsens.integrate import GeneralizedAlpha, factorize_iteration_matrix, increment
+from lgsens.integrate import GeneralizedAlpha, factorize_iteration_matrix, increment, moved
 from lgsens.linear import Factors
 
 
@@ -33,7 +40,7 @@ class Parameters(NamedTuple):
 
     system: AbstractSystem
     t0: Float[Array, ""]
-    h: Float[Array, ""]
+    h: Float[Array, "*n"]  # shape (), or (n,): steps of different sizes
 
 
 class Variation(NamedTuple):
@@ -63,16 +70,81 @@ class Step(NamedTuple):
 
 def steps(states: State, parameters: Parameters) -> Step:
     """All steps of a trajectory, stacked."""
+    previous = jax.tree.map(lambda leaf: leaf[:-1], states)
     return Step(
-        previous=jax.tree.map(lambda leaf: leaf[:-1], states),
+        previous=previous if parameters.h.ndim == 0 else jax.vmap(moved)(previous, _grid(*parameters[1:]).ratio),
         state=jax.tree.map(lambda leaf: leaf[1:], states),
         t=times(states.v.shape[0] - 1, parameters)[1:],
     )
 
 
 def times(num_steps: int, parameters: Parameters) -> Float[Array, " n+1"]:
-    """t0 + n h."""
+    """t0 + n h, or t0 + Σ h."""
+    if parameters.h.ndim:
+        return parameters.t0 + jnp.concatenate([jnp.zeros_like(parameters.h[:1]), jnp.cumsum(parameters.h)])
     return parameters.t0 + jnp.arange(num_steps + 1, dtype=parameters.h.dtype) * parameters.h
+
+
+class Grid(NamedTuple):
+    """Where each step begins, its size and the ratio to the one before; or tangents or cotangents of these."""
+
+    t: Float[Array, "*n"]
+    h: Float[Array, "*n"]
+    ratio: Float[Array, "*n"]
+
+
+def _grid(t0, h) -> Grid:
+    """Of the steps of sizes h, shape (n,). Empty ones get the size before them, which can be divided by."""
+    size = h[jax.lax.cummax(jnp.where(h != 0.0, jnp.arange(h.shape[0]), 0))]
+    t = t0 + jnp.cumsum(h) - h
+    return Grid(t, size, size / jnp.concatenate([size[:1], size[:-1]]))
+
+
+class SingleStep(NamedTuple):
+    """One step of a grid as a run of its own; stacked, all of them."""
+
+    grid: Grid
+    empty: Bool[Array, "*n"]
+    offset: Float[Array, "*n k"]  # a_n − v̇_n
+
+    @classmethod
+    def of(cls, states: State, parameters: Parameters) -> "SingleStep | None":
+        """All steps, stacked; None where they are equal."""
+        if parameters.h.ndim == 0:
+            return None
+        offset = (states.a - states.vdot)[:-1]
+        return cls(_grid(*parameters[1:]), parameters.h == 0.0, offset)
+
+    def begun(self, previous: Variation, d: Grid) -> Variation:
+        """The variation with that of a_n*."""
+        offset = previous.a - previous.vdot
+        return previous._replace(a=previous.vdot + self.grid.ratio * offset + d.ratio * self.offset)
+
+    def begun_transposed(self, begun: Variation, earlier: Variation) -> tuple[Variation, Float[Array, ""]]:
+        """The cotangents of δ_n and of r_n, from `begun`, that with a_n* in place of a_n, added to `earlier`."""
+        of_a = begun.a - earlier.a
+        ratio = self.grid.ratio
+        back = begun._replace(vdot=begun.vdot + (1.0 - ratio) * of_a, a=earlier.a + ratio * of_a)
+        return back, jnp.where(self.empty, 0.0, jnp.dot(of_a, self.offset))
+
+    def unless_empty(self, rows: Any, otherwise: Any) -> Any:
+        """`rows`, or, of an empty step, `otherwise`."""
+        return jax.tree.map(lambda row, other: jnp.where(self.empty, other, row), rows, otherwise)
+
+
+def grid_tangent(parameters: Parameters, d: Parameters) -> Grid | None:
+    """The tangent of the grid; None where steps are equal."""
+    return None if parameters.h.ndim == 0 else jax.jvp(_grid, parameters[1:], d[1:])[1]
+
+
+def grid_cotangent(parameters: Parameters, bar: Grid) -> tuple[Float[Array, ""], Float[Array, " n"]]:
+    """The cotangents of t0 and h from that of the grid."""
+    return jax.vjp(_grid, *parameters[1:])[1](bar)
+
+
+def own(parameters: Parameters, grid: Grid | None) -> Parameters:
+    """The parameters (or their tangent) of one step as a run of its own."""
+    return parameters if grid is None else Parameters(parameters.system, grid.t, grid.h)
 
 
 def step_increment(scheme: GeneralizedAlpha, step: Step, h) -> tuple[Float[Array, " k"], Rates]:
@@ -137,9 +209,18 @@ def pseudo_loads(step: Step, parameters: Parameters, d: Parameters):
 def matvec(scheme: GeneralizedAlpha, states: State, parameters: Parameters, delta: Variation, d: Parameters):
     """L (δ, p'), all steps at once: the equations above, written out. What JAX differentiates a second time."""
     mass = mass_matrix(parameters.system)
-    group, h = parameters.system.group, parameters.h
+    group = parameters.system.group
 
-    def rows(step: Step, previous: Variation, current: Variation) -> Variation:
+    def rows(step: Step, previous: Variation, current: Variation, single: SingleStep | None, d_grid) -> Variation:
+        if single is None:
+            return equations(step, previous, current, parameters, d)
+        own_equations = equations(
+            step, single.begun(previous, d_grid), current, own(parameters, single.grid), own(d, d_grid)
+        )
+        return single.unless_empty(own_equations, jax.tree.map(jnp.subtract, current, previous))
+
+    def equations(step: Step, previous: Variation, current: Variation, parameters: Parameters, d) -> Variation:
+        h = parameters.h
         x, rates = step_increment(scheme, step, h)
         w, v, vdot = kinematics(scheme, group, x, rates, h, previous, current.a, d.h)
         k_t, c_t, b = step_tangents(parameters.system, step)
@@ -154,7 +235,9 @@ def matvec(scheme: GeneralizedAlpha, states: State, parameters: Parameters, delt
 
     previous = jax.tree.map(lambda leaf: leaf[:-1], delta)
     current = jax.tree.map(lambda leaf: leaf[1:], delta)
-    later = jax.vmap(rows)(steps(states, parameters), previous, current)
+    later = jax.vmap(rows)(
+        steps(states, parameters), previous, current, SingleStep.of(states, parameters), grid_tangent(parameters, d)
+    )
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[:1], rest]), delta, later), d
 
 

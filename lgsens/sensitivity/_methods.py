@@ -14,7 +14,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from lgsens.dynamics import State
-from lgsens.integrate import GeneralizedAlpha, Stats, integrate
+from lgsens.integrate import GeneralizedAlpha, Stats, integrate, integrate_uneven
 from lgsens.sensitivity._adjoint import adjoint_sweep
 from lgsens.sensitivity._continuous_direct import continuous_direct_sweep
 from lgsens.sensitivity._direct import direct_sweep
@@ -60,9 +60,9 @@ class DirectDifferentiation(AbstractSensitivity):
     def __check_init__(self):
         _check_checkpoints(self)
 
-    def trajectory(self, scheme, num_steps, state0, parameters):
+    def trajectory(self, scheme, num_steps, state0, parameters, found=None):
         _refuse_checkpoints(self)
-        return _decoded(_direct_trajectory(scheme, num_steps, state0, parameters))
+        return _decoded(_direct_trajectory(scheme, num_steps, state0, parameters, found))
 
 
 class AdjointVariable(AbstractSensitivity):
@@ -82,9 +82,9 @@ class AdjointVariable(AbstractSensitivity):
     def __check_init__(self):
         _check_checkpoints(self)
 
-    def trajectory(self, scheme, num_steps, state0, parameters):
+    def trajectory(self, scheme, num_steps, state0, parameters, found=None):
         _refuse_checkpoints(self)
-        return _decoded(_adjoint_trajectory(scheme, num_steps, state0, parameters))
+        return _decoded(_adjoint_trajectory(scheme, num_steps, state0, parameters, found))
 
 
 def _check_checkpoints(method: DirectDifferentiation | AdjointVariable) -> None:
@@ -133,8 +133,15 @@ class Autodiff(AbstractSensitivity):
 # derivative (`jnp.all`) with a tangent, and JAX refuses.
 
 
-def _run(scheme, num_steps, state0, parameters):
-    states, stats = integrate(scheme, num_steps, parameters.system, state0, parameters.t0, parameters.h)
+def _run(scheme, num_steps, state0, parameters, found=None):
+    """`found`: the states and statistics of this very run, if they are known already."""
+    system, t0, h = parameters
+    if found is not None:
+        states, stats = found
+    elif h.ndim:
+        states, stats = integrate_uneven(scheme, system, state0, t0, h)
+    else:
+        states, stats = integrate(scheme, num_steps, system, state0, t0, h)
     return states, encoded(stats, states.v.dtype)
 
 
@@ -158,15 +165,15 @@ def _decoded(run) -> tuple[State, Stats]:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _direct_trajectory(scheme, num_steps, state0, parameters):
-    return _run(scheme, num_steps, state0, parameters)
+def _direct_trajectory(scheme, num_steps, state0, parameters, found):
+    return _run(scheme, num_steps, state0, parameters, found)
 
 
 @_direct_trajectory.defjvp
 def _direct_rule(scheme, num_steps, primals, tangents):
-    state0, parameters = primals
-    d_state0, d_parameters = tangents
-    states, stats = _direct_trajectory(scheme, num_steps, state0, parameters)
+    state0, parameters, _ = primals
+    d_state0, d_parameters, _ = tangents
+    states, stats = _direct_trajectory(scheme, num_steps, *primals)
     group = parameters.system.group
     first = to_algebra(group, state0, d_state0)
     b = jax.tree.map(lambda zeros, leaf: zeros.at[0].set(leaf), zeros_like_trajectory(states), first)
@@ -208,12 +215,12 @@ def _continuous_rule(scheme, num_steps, primals, tangents):
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _adjoint_trajectory(scheme, num_steps, state0, parameters):
-    return _run(scheme, num_steps, state0, parameters)
+def _adjoint_trajectory(scheme, num_steps, state0, parameters, found):
+    return _run(scheme, num_steps, state0, parameters, found)
 
 
-def _adjoint_forward(scheme, num_steps, state0, parameters):
-    states, stats = _run(scheme, num_steps, state0, parameters)
+def _adjoint_forward(scheme, num_steps, state0, parameters, found):
+    states, stats = _run(scheme, num_steps, state0, parameters, found)
     return (states, stats), (states, parameters)
 
 
@@ -224,7 +231,7 @@ def _adjoint_backward(scheme, num_steps, kept, cotangents):
     mu, bar = adjoint_sweep(scheme, states, parameters, c, jax.tree.map(jnp.zeros_like, parameters))
     state0 = jax.tree.map(lambda leaf: leaf[0], states)
     first = Variation(*[leaf[0] for leaf in mu])
-    return cotangent_to_ambient(group, state0, first), bar
+    return cotangent_to_ambient(group, state0, first), bar, None
 
 
 _adjoint_trajectory.defvjp(_adjoint_forward, _adjoint_backward)

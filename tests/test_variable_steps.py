@@ -1,0 +1,284 @@
+"""Steps of different sizes, given or under error control: accuracy, derivatives on the frozen grid, failures."""
+
+import functools
+import json
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from differences import central
+from helpers import says
+from jaxtyping import Array, Float
+
+import lgsens as lg
+from lgsens.dynamics import Tangents
+from lgsens.examples import PROBLEMS
+from lgsens.liegroups import Rn
+
+SCHEME = lg.GeneralizedAlpha(rho_inf=0.8)
+DATA = Path(__file__).parent / "data"
+CARS = [("quarter_car_linear", 1e-5, 200), ("five_link_quarter_car", 1e-5, 400)]
+P = (1.3, 0.8, 40.0, 0.5)
+
+
+class Pendulum(lg.AbstractSystem):
+    """A mass point on a rod in the plane, Φ = (x² − l²)/2, on a spring to a point that moves: programs compile fast."""
+
+    mass: Float[Array, ""]
+    length: Float[Array, ""]
+    stiffness: Float[Array, ""]
+    damping: Float[Array, ""]
+    assembled: bool = eqx.field(static=True, default=True)
+
+    @property
+    def group(self):
+        return Rn(2)
+
+    @property
+    def constraint_names(self):
+        return ("rod",)
+
+    def reference(self):
+        return jnp.stack([self.length, jnp.zeros_like(self.length)]), jnp.array([0.0, 1.0])
+
+    def coordinate_scale(self):
+        return jnp.ones(2)
+
+    def mass_matrix(self):
+        return self.mass * jnp.eye(2)
+
+    def residual(self, q, v, vdot, lam, t):
+        away = q - jnp.stack([jnp.cos(3.0 * t), jnp.exp(-((5.0 * (t - 0.6)) ** 2))])
+        return self.mass * vdot + self.damping * v + self.stiffness * away + lam @ q[None]
+
+    def constraint(self, q):
+        return (q @ q - self.length**2)[None] / 2.0
+
+    def constraint_jacobian(self, q):
+        return q[None]
+
+    def tangents(self, q, v, vdot, lam, t):
+        eye = jnp.eye(2)
+        return Tangents((self.stiffness + lam[0]) * eye, self.damping * eye, q[None])
+
+
+def make(p):
+    return Pendulum(*p)
+
+
+def observed(trajectory):
+    """What shows every part of the state."""
+    states = trajectory.states
+    integrand = states.q[:, 0] ** 2 + 0.01 * states.vdot[:, 1] ** 2
+    return lg.time_integral(trajectory.t, integrand) + states.v[-1, 1] + 0.01 * states.lam[-1, 0]
+
+
+def value(p, t0, t1, fractions):
+    integrator = lg.GivenSteps(fractions, SCHEME)
+    return observed(lg.simulate(make(p), t0=t0, t1=t1, num_steps=fractions.shape[0], integrator=integrator))
+
+
+def uneven(n):
+    """Sizes that change smoothly, by a factor of e in all."""
+    return np.exp(0.5 * np.sin(7.0 * (np.arange(n) + 0.5) / n))
+
+
+@functools.cache
+def adaptive(tolerance=1e-5, capacity=200, sensitivity=lg.DirectDifferentiation(), **settings):
+    """One program for all values of the parameters."""
+    integrator = lg.AdaptiveSteps(SCHEME, tolerance=tolerance, **settings)
+    settings = {"num_steps": capacity, "integrator": integrator, "sensitivity": sensitivity}
+    return jax.jit(lambda p: lg.simulate(make(p), t0=0.2, t1=1.2, **settings))
+
+
+def test_equal_fractions_are_equal_steps():
+    settings = {"t1": 1.0, "num_steps": 40}
+    p = jnp.array(P)
+    equal = lg.simulate(make(p), integrator=SCHEME, **settings)
+    given = lg.simulate(make(p), integrator=lg.GivenSteps(jnp.full(40, 3.0), SCHEME), **settings)
+    assert given.result == lg.RESULTS.successful
+    np.testing.assert_allclose(given.t, equal.t, rtol=1e-15)
+    for one, other in zip(jax.tree.leaves(given.states), jax.tree.leaves(equal.states), strict=True):
+        # what Newton leaves in accelerations: round-off/(βh²) = 2e-16/1e-4
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_order():
+    """Second order in every part of the state where sizes change smoothly, against another integrator."""
+    p = jnp.array(P)
+    exact = lg.simulate(make(p), t1=1.0, num_steps=200, integrator=lg.IndexReducedODE()).state(-1)
+    errors = []
+    for n in (80, 160, 320):
+        last = lg.simulate(make(p), t1=1.0, num_steps=n, integrator=lg.GivenSteps(uneven(n), SCHEME)).state(-1)
+        pairs = ((last.q, exact.q), (last.v, exact.v), (last.vdot, exact.vdot), (last.lam, exact.lam))
+        errors.append([np.abs(one - other).max() for one, other in pairs])
+    orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+    assert np.all(np.abs(orders[-1] - 2.0) < 0.1), orders  # the next term of the error is a step of 3e-3 smaller
+
+
+def test_derivatives_on_a_given_grid():
+    """By parameters, times and sizes, with empty steps in the middle and at the end: both modes, differences."""
+    sizes = uneven(24)
+    sizes[[9, 10, 22, 23]] = 0.0
+    point = (jnp.array(P), jnp.asarray(0.1), jnp.asarray(1.1), jnp.asarray(sizes))
+    rng = np.random.default_rng(0)
+    forward = jax.jit(jax.jacfwd(value, argnums=(0, 1, 2, 3)))(*point)
+    both = jax.jit(jax.value_and_grad(value, argnums=(0, 1, 2, 3)))
+    for one, other in zip(both(*point)[1], forward, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-12)  # other order of round-off
+    for i, leaf in enumerate(point):
+        direction = jnp.asarray(rng.normal(size=leaf.shape)) * leaf  # an empty step stays empty
+        shifted = lambda s, i=i, d=direction: both(*(x + s * d if j == i else x for j, x in enumerate(point)))[0]
+        # differences: δ⁶ = 1e-18 × seventh derivative; λ carries round-off/(βh²)/δ = 1e-12/1e-3 of its weight 0.01
+        np.testing.assert_allclose(jnp.sum(forward[i] * direction), central(shifted, 1e-3), rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_second_derivatives_on_a_given_grid():
+    sizes = jnp.asarray(np.append(uneven(12), 0.0))
+    of = lambda p, t1: value(p, jnp.asarray(0.1), t1, sizes)
+    p, t1 = jnp.array(P), jnp.asarray(0.9)
+    (pp, pt), (_, tt) = jax.jit(jax.hessian(of, argnums=(0, 1)))(p, t1)
+    slope = jax.jit(jax.grad(of, argnums=(0, 1)))
+    e = jnp.eye(4)[1]
+    columns = [central(lambda s, i=i: slope(p + s * e, t1)[i], 1e-3) for i in (0, 1)]
+    # differences of a gradient whose round-off is 1e-12, over 1e-3
+    np.testing.assert_allclose(pp[1], columns[0], rtol=1e-7)
+    np.testing.assert_allclose(pt[1], columns[1], rtol=1e-7)
+    np.testing.assert_allclose(tt, central(lambda s: slope(p, t1 + s)[1], 1e-3), rtol=1e-7)
+
+
+def test_error_control():
+    """Grid, statistics, and what repeats after the last step."""
+    run = adaptive()(jnp.array(P))
+    steps, sizes = int(run.stats.steps), np.diff(run.t)
+    assert run.result == lg.RESULTS.successful and 50 <= steps < 200
+    assert np.all(sizes[:steps] > 0) and np.all(sizes[steps:] == 0)
+    assert sizes.max() <= 0.02 * (1 + 1e-12)  # `longest`
+    np.testing.assert_allclose(run.t[-1], 1.2, rtol=1e-14)
+    assert np.all(run.stats.error <= 1e-5) and np.all(run.stats.error[steps:] == 0)
+    assert np.all(run.stats.converged) and np.all((run.stats.iterations > 0) == (sizes > 0))
+    assert run.stats.rejected.shape == (200,) and np.all(run.stats.rejected[steps:] == 0)
+    for leaf in map(np.asarray, jax.tree.leaves(run.states)):
+        assert np.all(np.isfinite(leaf)) and np.all(leaf[steps:] == leaf[steps])
+
+
+@pytest.mark.slow
+def test_errors_fall_with_the_tolerance():
+    p = jnp.array(P)
+    exact = observed(lg.simulate(make(p), t0=0.2, t1=1.2, num_steps=4000, integrator=SCHEME))
+    errors = [abs(float(observed(adaptive(tolerance, n)(p)) - exact)) for tolerance, n in ((1e-5, 200), (1e-7, 800))]
+    assert errors[1] < errors[0] / 10, errors  # tolerance^(2/3): 21
+
+
+def differentiated(p):
+    """Value and gradient, and the trajectory."""
+
+    def evaluate(p):
+        run = adaptive()(p)
+        return observed(run), run
+
+    return jax.value_and_grad(evaluate, has_aux=True)(p)
+
+
+DIFFERENTIATED = jax.jit(differentiated)
+
+
+def test_derivative_is_that_on_the_frozen_grid():
+    """The grid that was found, given: the same run, and its differences."""
+    p = jnp.array(P)
+    (found, run), slopes = DIFFERENTIATED(p)
+    grid = lg.GivenSteps.of(run, SCHEME)
+    assert grid.num_steps == int(run.stats.steps)
+    again = jax.jit(lambda p: observed(lg.simulate(make(p), t0=0.2, t1=1.2, num_steps=grid.num_steps, integrator=grid)))
+    np.testing.assert_allclose(again(p), found, rtol=1e-12)  # what Newton leaves in λ
+    expected = [central(lambda s, e=e: again(p + s * e * p), 1e-3) for e in jnp.eye(4)]
+    np.testing.assert_allclose(slopes * p, expected, rtol=1e-8)  # as on equal steps, test_own_system.py
+
+
+@pytest.mark.slow
+def test_forward_mode_and_the_explicit_adjoint_agree():
+    p = jnp.array(P)
+    _, slopes = DIFFERENTIATED(p)
+    forward = jax.jit(jax.jacfwd(lambda p: observed(adaptive()(p))))(p)
+    adjoint = jax.jit(jax.grad(lambda p: observed(adaptive(sensitivity=lg.AdjointVariable())(p))))(p)
+    for other in (forward, adjoint):
+        np.testing.assert_allclose(other, slopes, rtol=1e-10)  # other order of round-off
+
+
+def test_lanes_have_grids_of_their_own():
+    stiff, soft = jnp.array(P).at[2].set(100.0), jnp.array(P)
+    (values, runs), slopes = jax.jit(jax.vmap(differentiated))(jnp.stack([stiff, soft]))
+    assert runs.stats.steps[0] > runs.stats.steps[1] + 5
+    for lane, p in enumerate((stiff, soft)):
+        (one, run), slope = DIFFERENTIATED(p)
+        np.testing.assert_allclose(runs.t[lane], run.t, rtol=1e-9)  # sizes follow from errors that carry round-off/h²
+        np.testing.assert_allclose(values[lane], one, rtol=1e-9)
+        np.testing.assert_allclose(slopes[lane], slope, rtol=1e-7)
+
+
+EXHAUSTED = says("needs more steps", "`num_steps`", "`tolerance`", "t = 0.", "of 1.2 s in 30 steps", "`throw=False`")
+
+
+def test_steps_exhausted():
+    settings = {"t0": 0.2, "t1": 1.2, "num_steps": 30, "integrator": lg.AdaptiveSteps(SCHEME, tolerance=1e-5)}
+    with pytest.raises(lg.SimulationError, match=EXHAUSTED):
+        lg.simulate(make(jnp.array(P)), **settings)
+    run = lg.simulate(make(jnp.array(P)), throw=False, **settings)
+    assert run.result == lg.RESULTS.steps_exhausted and run.stats.steps == 30 and 0.2 < run.t[-1] < 1.2
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(run.states))
+
+
+def test_bad_input():
+    run = lambda integrator, **settings: lg.simulate(make(jnp.array(P)), t1=1.0, integrator=integrator, **settings)
+    for wrong in (0.0, -1.0, float("nan"), "1e-6"):
+        with pytest.raises(ValueError, match=says("AdaptiveSteps", "`tolerance`", repr(wrong))):
+            lg.AdaptiveSteps(tolerance=wrong)
+    for wrong in (0.0, 1.5):
+        with pytest.raises(ValueError, match=says("AdaptiveSteps", "`longest`", repr(wrong))):
+            lg.AdaptiveSteps(longest=wrong)
+    for kind in (lg.AdaptiveSteps, functools.partial(lg.GivenSteps, [1.0])):
+        with pytest.raises(ValueError, match=says("`integrator`", "GeneralizedAlpha", "Richardson")):
+            kind(lg.Richardson())
+    for wrong in ([[1.0]], []):
+        with pytest.raises(ValueError, match=says("`fractions`", "shape")):
+            lg.GivenSteps(wrong)
+    for wrong in ([0.0, 1.0], [1.0, -1.0], [1.0, float("inf")]):
+        with pytest.raises(ValueError, match=says("`fractions`", "first one positive")):
+            lg.GivenSteps(wrong)
+    given = lg.GivenSteps([1.0, 2.0])
+    with pytest.raises(ValueError, match=says("`num_steps` = 3", "has 2")):
+        run(given, num_steps=3)
+    with pytest.raises(ValueError, match=says("`save`", "equal steps", "GivenSteps")):
+        run(given, num_steps=2, save=lambda s: s.t)
+    with pytest.raises(ValueError, match=says("`sensitivity`", "equal steps", "AdaptiveSteps")):
+        run(lg.AdaptiveSteps(), num_steps=3, sensitivity=lg.Autodiff())
+    with pytest.raises(ValueError, match=says("checkpoints")):
+        run(given, num_steps=2, sensitivity=lg.DirectDifferentiation(checkpoints="sqrt"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "tolerance", "capacity"), CARS)
+def test_half_the_steps_on_the_bump(name, tolerance, capacity):
+    """Twice as many equal steps are less accurate, in Ψ₀ and in its gradient, against independent numbers."""
+    problem = PROBLEMS[name]
+    exact = problem.reference(json.loads((DATA / problem.file).read_text()))["Psi0"]
+    parameters = {key: jnp.asarray(number) for key, number in problem.parameters.items()}
+
+    def errors(num_steps, integrator):
+        def evaluate(p):
+            run = problem.simulate(p, num_steps=num_steps, integrator=integrator)
+            return problem.criteria["Psi0"](run, p), run.stats
+
+        (found, stats), gradient = jax.jit(jax.value_and_grad(evaluate, has_aux=True))(parameters)
+        slopes = np.array([[gradient[key], exact.gradient[key]] for key in exact.gradient]).T
+        slopes *= np.array([problem.parameters[key] for key in exact.gradient])
+        return abs(found / exact.value - 1), np.abs(slopes[0] - slopes[1]).max() / np.abs(slopes[1]).max(), stats
+
+    *controlled, stats = errors(capacity, lg.AdaptiveSteps(lg.GeneralizedAlpha(0.9), tolerance=tolerance))
+    *equal, _ = errors(2 * int(stats.steps), lg.GeneralizedAlpha(0.9))
+    assert controlled[0] < equal[0] and controlled[1] < equal[1], (controlled, equal)
