@@ -29,7 +29,8 @@ _MESSAGES = {
     RESULTS.redundant_constraints: (
         "The joints constrain the same motion twice, so the multipliers are not unique. Replace one of the "
         "joints named by one with fewer equations (a revolute by a spherical or a cylindrical joint, say), or "
-        "remove it where the `free` coordinates of its bodies satisfy it anyway."
+        "remove it where the `free` coordinates of its bodies satisfy it anyway. Or keep them and take the multipliers "
+        "of least norm: Model(…, redundant='minimum_norm')."
     ),
     RESULTS.newton_failed: (
         "Newton's iteration did not converge. Try a smaller step (more `num_steps`), more "

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from lgsens.dynamics import AbstractSystem, State, mass_matrix, tangents
+from lgsens.dynamics import AbstractSystem, State, mass_matrix, softness, tangents
 from lgsens.integrate._scheme import GeneralizedAlpha, advance, factorize_iteration_matrix, increment
 from lgsens.linear import Factors, Inverse, Matrix
 
@@ -49,10 +49,11 @@ class Constants(NamedTuple):
 
     mass: Matrix  # M, (k, k)
     scale: Float[Array, " k"]
+    softness: Float[Array, " m"] | None  # c; None: no constraint may be redundant
 
     @classmethod
     def of(cls, system: AbstractSystem) -> "Constants":
-        return cls(mass_matrix(system), system.coordinate_scale())
+        return cls(mass_matrix(system), system.coordinate_scale(), softness(system))
 
 
 class Guess(NamedTuple):
@@ -101,7 +102,7 @@ def take_step(
 
     `earlier` solves with the iteration matrix of an earlier step, for modified Newton; None: full Newton only.
     """
-    mass, scale = constants
+    mass, scale, soft = constants
     eps = float(jnp.finfo(scale.dtype).eps)
     tolerance = max(scheme.tolerance, 64 * eps)
     target = max(tolerance**2, 0.04 * eps)
@@ -111,6 +112,8 @@ def take_step(
         point = (motion.q, motion.v, motion.vdot, iterate.lam, t)
         residual = system.residual(*point)
         violation = system.constraint(motion.q) / (scheme.beta * h**2)
+        if soft is not None:
+            violation = violation - soft * iterate.lam
         if factors is None:
             solver = factorize_iteration_matrix(scheme, system, tangents(system, *point), mass, motion.x, h)
         else:

@@ -21,6 +21,8 @@ from lgsens.model._stack import stacked
 from lgsens.model._summary import Summary, summarize
 from lgsens.model._system import MultibodySystem
 
+_REDUNDANT = ("refuse", "minimum_norm")
+
 
 class Model(eqx.Module):
     """A scene of rigid bodies connected by joints and forces; a pytree whose numbers are all float leaves.
@@ -55,6 +57,7 @@ class Model(eqx.Module):
     forces: dict[str, AbstractForce]
     linear_solver: AbstractLinearSolver | None = eqx.field(static=True)
     merge_fixed: bool = eqx.field(static=True)
+    redundant: str = eqx.field(static=True)
 
     def __init__(
         self,
@@ -64,6 +67,7 @@ class Model(eqx.Module):
         *,
         linear_solver: AbstractLinearSolver | None = None,
         merge_fixed: bool = False,
+        redundant: str = "refuse",
     ):
         if not isinstance(linear_solver, AbstractLinearSolver | None):
             raise ValueError(f"Model: `linear_solver` must be DenseLU(), BlockSparse() or None, got {linear_solver!r}.")
@@ -72,6 +76,9 @@ class Model(eqx.Module):
         self.merge_fixed = merge_fixed
         if not isinstance(merge_fixed, bool):
             raise ValueError(f"Model: `merge_fixed` must be True or False, got {merge_fixed!r}.")
+        self.redundant = redundant
+        if redundant not in _REDUNDANT:
+            raise ValueError(f"Model: `redundant` must be one of {_REDUNDANT}, got {redundant!r}.")
         if not self.bodies:
             raise ValueError("Model: `bodies` is empty; a scene needs at least one RigidBody.")
         for what, kind, members in (
@@ -126,7 +133,9 @@ class Model(eqx.Module):
             system = assemble(bodies, self.joints, self.forces)
         else:
             system = assemble_merged(bodies, self.joints, self.forces, self._groups)
-        return dataclasses.replace(system, linear_solver=self.linear_solver)
+        return dataclasses.replace(
+            system, linear_solver=self.linear_solver, minimum_norm=self.redundant == "minimum_norm"
+        )
 
     @property
     def _groups(self) -> tuple[Group, ...] | None:
