@@ -62,6 +62,11 @@ def describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> st
             f"residual {details['residual']:.3g}. "
             "`throw=False` returns the data up to the step before."
         )
+    if code is RESULTS.singular_configuration:
+        return (
+            f"{code.message} It does so about step {int(details['step'])} of {int(details['num_steps'])}, "
+            f"t = {details['time']:.6g} s. `throw=False` returns the data, which follow one branch."
+        )
     if code is RESULTS.position_failed:
         violation = np.abs(details["violation"])
         worst = int(np.argmax(np.where(np.isfinite(violation), violation, np.inf)))

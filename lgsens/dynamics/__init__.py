@@ -37,6 +37,7 @@ from lgsens.dynamics._matrices import (
 from lgsens.dynamics._redundant import (
     AbstractRedundantSystem as AbstractRedundantSystem,
     least_norm as least_norm,
+    require_independent as require_independent,
     softness as softness,
 )
 from lgsens.dynamics._results import RESULTS as RESULTS

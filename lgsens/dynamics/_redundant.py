@@ -19,11 +19,11 @@ Multipliers. The round-off of Φ leaves eps/(βh²)/ε of n in λ. Nobody asks f
 is made there what it is said to be, the multipliers that minimize Σ d_i λ_i² for given Bᵀλ. With λ̂ = √d λ and
 B̂ = B/√d that is the orthogonal projection of λ̂ on the range of B̂,
 
-    λ̂⁺ = P λ̂,     P = lim_{δ → 0} (B̂B̂ᵀ + δ I)⁻¹ B̂B̂ᵀ,
+    λ̂⁺ = λ̂ − lim_{δ → 0} [δ (B̂B̂ᵀ + δI)⁻¹]^k λ̂,
 
-and k iterations x ← x + (B̂B̂ᵀ + δI)⁻¹ B̂B̂ᵀ (λ̂ − x) from 0 leave (δ/(δ + σ²))^k of it, σ a singular value of B̂. This is
-smooth where the rank of B is constant; derivatives pass through it, those of d included. By it any λ will
-do that has the right Bᵀλ, and so will any λ' with the right derivative of Bᵀλ.
+where k factors leave (δ/(δ + σ²))^k of what belongs to a singular value σ of B̂, and round-off is multiplied by the
+part along n over δ, which is small. This is smooth where the rank of B is constant; derivatives pass through it, those
+of d included. Before it any λ will do that has the right Bᵀλ, and any λ' with the right derivative of Bᵀλ.
 
 Physics. d_i are compliances: by the principle of least work these are the forces in joints that all give way alike,
 by d metres per newton, in the limit of d → 0.
@@ -42,7 +42,7 @@ from jaxtyping import Array, Float
 
 from lgsens.dynamics._system import AbstractSystem
 
-_SOFTNESS = 1e-7  # ε
+SOFTNESS = 1e-7  # ε
 _REGULARIZATION = 1e-7  # δ, relative to the mean square of a row of B̂: three iterations leave 1e-21/σ⁶
 _ITERATIONS = 3
 
@@ -60,7 +60,16 @@ class AbstractRedundantSystem(AbstractSystem):
 def softness(system: AbstractSystem) -> Float[Array, " m"] | None:
     """c; None: no constraint may be redundant."""
     compliance = system.compliance if isinstance(system, AbstractRedundantSystem) else None
-    return None if compliance is None else _SOFTNESS * lax.stop_gradient(compliance)
+    return None if compliance is None else SOFTNESS * lax.stop_gradient(compliance)
+
+
+def require_independent(system: AbstractSystem, method: str) -> None:
+    """Raise `ValueError` where constraints may be redundant, for a method that cannot treat that."""
+    if softness(system) is not None:
+        raise ValueError(
+            f"{method} needs independent constraints, and the model has redundant='minimum_norm'. Use "
+            "DirectDifferentiation() or AdjointVariable(), or a model without redundant equations."
+        )
 
 
 def refined(product: Callable, solve: Callable, rhs):
@@ -82,7 +91,7 @@ def least_norm(system: AbstractSystem, q, lam: Float[Array, " m"]) -> Float[Arra
     normal = rows @ rows.T
     shift = _REGULARIZATION * lax.stop_gradient(jnp.trace(normal) / len(root))
     factor = jnp.linalg.cholesky(normal + shift * jnp.eye(len(root), dtype=lam.dtype), symmetrize_input=False)
-    found = jnp.zeros_like(lam)
+    along = root * lam
     for _ in range(_ITERATIONS):
-        found = found + jsl.cho_solve((factor, True), normal @ (root * lam - found))
-    return found / root
+        along = shift * jsl.cho_solve((factor, True), along)
+    return lam - along / root

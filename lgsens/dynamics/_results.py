@@ -13,6 +13,7 @@ class RESULTS(IntEnum):
     equilibrium_failed = 4
     integration_failed = 5
     position_failed = 6
+    singular_configuration = 7
 
     @property
     def message(self) -> str:
@@ -43,6 +44,11 @@ _MESSAGES = {
     RESULTS.integration_failed: (
         "The explicit integration left the finite numbers, or took more than `max_steps` steps in an output interval. "
         "Try more `num_steps`, a looser `rtol`, more `max_steps`, or, for stiff forces, GeneralizedAlpha."
+    ),
+    RESULTS.singular_configuration: (
+        "The mechanism passes a singular configuration, where its joints lose independence and the motion may branch (a "
+        "linkage that lies flat): which way it goes on is not determined, and derivatives by lengths are infinite. End "
+        "the simulation before, change the lengths, or let the joints give way there (`Bushing`)."
     ),
     RESULTS.position_failed: (
         "No position satisfies the joints for these values of the driven ones: they are out of reach, or the mechanism "

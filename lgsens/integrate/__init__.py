@@ -16,3 +16,4 @@ from lgsens.integrate._scheme import (
     factorize_iteration_matrix as factorize_iteration_matrix,
     increment as increment,
 )
+from lgsens.integrate._singular import margin_of as margin_of, singular_steps as singular_steps

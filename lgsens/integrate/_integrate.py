@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.dynamics import AbstractSystem, State, mass_matrix, softness, tangents
 from lgsens.integrate._scheme import GeneralizedAlpha, advance, factorize_iteration_matrix, increment
+from lgsens.integrate._singular import Watch, margin_of
 from lgsens.linear import Factors, Inverse, Matrix
 
 _MODIFIED_LIMIT = 12  # iterations; more cost as much as a full one
@@ -36,12 +37,15 @@ class Stats(NamedTuple):
         increment: the last increment of each step, relative as in `GeneralizedAlpha.tolerance`, shape (n,).
         residual: the largest entry of the residual r before that increment [N or N m], shape (n,).
         converged: whether each step converged, shape (n,), bool.
+        margin: how far the step is from a singular configuration (`_singular`), NaN where that was not looked at,
+            shape (n,).
     """
 
     iterations: Int[Array, " n"]
     increment: Float[Array, " n"]
     residual: Float[Array, " n"]
     converged: Bool[Array, " n"]
+    margin: Float[Array, " n"]
 
 
 class Constants(NamedTuple):
@@ -85,6 +89,7 @@ class _Iterate(NamedTuple):
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
     settled: Bool[Array, ""]  # what modified Newton left before this iteration was small enough
+    margin: Float[Array, ""]  # of full Newton
 
 
 def take_step(
@@ -115,9 +120,11 @@ def take_step(
         if soft is not None:
             violation = violation - soft * iterate.lam
         if factors is None:
-            solver = factorize_iteration_matrix(scheme, system, tangents(system, *point), mass, motion.x, h)
+            at_point = tangents(system, *point)
+            solver = factorize_iteration_matrix(scheme, system, at_point, mass, motion.x, h)
+            margin = iterate.margin if earlier is not None else margin_of(solver, at_point.constraint_jacobian, scale)
         else:
-            solver = factors
+            solver, margin = factors, iterate.margin
         du, dlam = solver.solve(residual, violation)
         size = jnp.max(jnp.abs(du) * (scheme.beta * h**2) / scale)
         measured = (iterate.iterations > 1) & (iterate.before > 64 * eps)  # increments below are round-off
@@ -126,7 +133,7 @@ def take_step(
         settled = iterate.increment * iterate.contraction**2 <= target
         largest, count = jnp.max(jnp.abs(residual)), iterate.iterations + 1
         return _Iterate(
-            iterate.u - du, iterate.lam - dlam, size, iterate.increment, contraction, largest, count, settled
+            iterate.u - du, iterate.lam - dlam, size, iterate.increment, contraction, largest, count, settled, margin
         )
 
     # NaN compares false, and ends the iterations
@@ -139,8 +146,9 @@ def take_step(
         return running & (iterate.increment > tolerance) & (iterate.iterations < scheme.max_iterations)
 
     infinite, none, no = jnp.full((), jnp.inf, scale.dtype), jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    unknown = jnp.full((), jnp.nan, scale.dtype)
     u, lam = guess.extrapolated(previous)
-    iterate = _Iterate(u, lam, infinite, infinite, guess.contraction, infinite, none, no)
+    iterate = _Iterate(u, lam, infinite, infinite, guess.contraction, infinite, none, no, unknown)
     contraction = guess.contraction
     before = none
     if earlier is not None:
@@ -158,6 +166,7 @@ def take_step(
             residual=iterate.residual,
             iterations=none,
             settled=no,
+            margin=unknown,
         )
     iterate = lax.while_loop(unfinished, partial(corrected, None), iterate)
     motion = advance(scheme, system, previous, iterate.u, h)
@@ -165,7 +174,7 @@ def take_step(
     finite = jnp.all(jnp.isfinite(iterate.u)) & jnp.all(jnp.isfinite(iterate.lam))
     converged = running & (iterate.increment <= tolerance) & finite
     state = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), state)
-    stats = Stats(before + iterate.iterations, iterate.increment, iterate.residual, converged)
+    stats = Stats(before + iterate.iterations, iterate.increment, iterate.residual, converged, iterate.margin)
     return state, guess.after(previous, contraction), stats
 
 
@@ -202,10 +211,12 @@ class Mark(NamedTuple):
     state: State
     guess: Guess
     running: Bool[Array, ""]
+    watch: Watch
 
     @classmethod
     def first(cls, state0: State) -> "Mark":
-        return cls(jnp.zeros((), state0.a.dtype), state0, Guess.first(state0), jnp.ones((), bool))
+        dtype = state0.a.dtype
+        return cls(jnp.zeros((), dtype), state0, Guess.first(state0), jnp.ones((), bool), Watch.first(dtype))
 
 
 def integrate_onward(
@@ -224,30 +235,38 @@ def integrate_onward(
     """
     constants = Constants.of(system)
 
-    def inverse(state: State, n) -> Factors:
+    def inverse(state: State, n) -> tuple[Factors, Float[Array, ""]]:
         at_state = tangents(system, state.q, state.v, state.vdot, state.lam, t0 + n * h)
         x = increment(scheme, state, state.a, h)
-        return factorize_iteration_matrix(scheme, system, at_state, constants.mass, x, h, Inverse)
+        factors = factorize_iteration_matrix(scheme, system, at_state, constants.mass, x, h, Inverse)
+        return factors, margin_of(factors, at_state.constraint_jacobian, constants.scale)
 
     def step(carry, n):
-        previous, guess, earlier, age, running = carry
+        previous, guess, earlier, age, running, watch = carry
+        margin = watch.margin
         if earlier is not None:
             # A matrix that contracts slowly is renewed, unless it was new: then full Newton takes over. In a batch
             # every lane pays for the slowest; for its full iterations it would pay more. A loop of no or one turn,
             # because `cond` would copy the inverse.
+            steps = jnp.maximum(age, 1).astype(margin.dtype)
             due = (jnp.mod(n, scheme.factor_every) == 0) | ((guess.contraction >= _SLOW) & (age > 1))
+            due = due | watch.ends_within(steps + 2.0 * scheme.factor_every)
             age = jnp.where(due, 0, age) + 1
             renewed = lambda carry: (jnp.zeros((), bool), inverse(previous, n))
-            _, earlier = lax.while_loop(lambda carry: carry[0], renewed, (due, earlier))
+            _, (earlier, margin) = lax.while_loop(lambda carry: carry[0], renewed, (due, (earlier, margin)))
+            watch = jax.tree.map(partial(jnp.where, due), watch.after(margin, steps), watch)
+            margin = jnp.where(due, margin, jnp.nan)
         t = t0 + (n + 1) * h
         state, guess, stats = take_step(scheme, system, constants, previous, guess, earlier, running, t, h)
-        return (state, guess, earlier, age, stats.converged), (output(state, t), stats)
+        if earlier is not None:
+            stats = stats._replace(margin=margin)
+        return (state, guess, earlier, age, stats.converged, watch), (output(state, t), stats)
 
     count = mark.n + jnp.arange(num_steps, dtype=constants.scale.dtype)
     earlier = None
     if scheme.factor_every:
-        shape = jax.eval_shape(inverse, mark.state, count[0])
+        shape, _ = jax.eval_shape(inverse, mark.state, count[0])
         earlier = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
-    start = (mark.state, mark.guess, earlier, jnp.zeros((), jnp.int32), mark.running)
-    (state, guess, _, _, running), (outputs, stats) = lax.scan(step, start, count)
-    return outputs, Mark(mark.n + num_steps, state, guess, running), stats
+    start = (mark.state, mark.guess, earlier, jnp.zeros((), jnp.int32), mark.running, mark.watch)
+    (state, guess, _, _, running, watch), (outputs, stats) = lax.scan(step, start, count)
+    return outputs, Mark(mark.n + num_steps, state, guess, running, watch), stats

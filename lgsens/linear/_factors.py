@@ -37,7 +37,9 @@ class Factors(eqx.Module):
         corner = None if softness is None else -(scale**2) * softness
         if not isinstance(dynamic, SparseMatrix):
             above = jnp.concatenate([dynamic, scale * upper], axis=1)
-            below = jnp.concatenate([scale * lower, jnp.zeros((m, m), dynamic.dtype) if corner is None else jnp.diag(corner)], axis=1)
+            below = jnp.concatenate(
+                [scale * lower, jnp.zeros((m, m), dynamic.dtype) if corner is None else jnp.diag(corner)], axis=1
+            )
             return cls(kind.of(jnp.concatenate([above, below])), scale)
         assert plan is not None
         k = dynamic.shape[0]
