@@ -42,7 +42,7 @@ class ConstraintRank:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """k − rank, those that the mechanism has; k − m, the count of Grübler, is less where equations are redundant."""
+        """k − rank, those that the mechanism has; Grübler's count, k − m, is less where equations are redundant."""
         return self.coordinates - self.rank
 
     @property

@@ -14,8 +14,8 @@ linearly in time on both sides of the singular point, without any part along red
 with 2 m_n ≤ m_{n−1} say that it would be zero before the next one. A motion that passes a singular configuration at
 a distance has a minimum of m instead, which steps that resolve it see as such.
 
-m costs one product with the inverse that is shared by many steps. Where m falls so fast that it would be zero before two
-such inverses are over, every step has its own.
+m costs one product with the inverse that many steps share. Where m falls so fast that it would be zero before two such
+inverses are over, every step has its own.
 """
 
 from typing import NamedTuple

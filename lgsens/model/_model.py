@@ -35,6 +35,12 @@ class Model(eqx.Module):
             estimated to take less time for this scene.
         merge_fixed: bodies that a `FixedJoint` connects are one body in the equations of motion, those that it connects
             to the ground are ground: six unknowns per merged body and the joint's equations less.
+        redundant: "refuse" raises where joints constrain the same motion twice. "minimum_norm" accepts that, where the
+            rank of B does not change: the motion is that of the mechanism without the equations too many,
+            `Trajectory.multiplier` the multipliers of least Σ λ_i² (moments divided by the radius of gyration of the
+            bodies): the forces in joints that are all equally stiff, in the limit of rigid ones. Derivatives are exact
+            for changes that leave the equations redundant (both hinges of a door off their axis, and not one of
+            them). `constraint_rank` says which joints are redundant.
 
     The constructors can be traced, so a function that builds a model from design parameters is the
     general parametrization; the gradient with respect to a model is again a model.
