@@ -17,7 +17,7 @@ Z = np.array([0.0, 0.0, 1.0])
 EXACT = lg.GeneralizedAlpha(0.8, tolerance=1e-13)
 
 
-def door(p, hinges=2, **options):
+def door(p, hinges=2, redundant="minimum_norm"):
     """A door 2 m high that swings about a leaning axis, on two hinges as far from the middle, or on one there."""
     mass, width, lean, spread = p["mass"], p["width"], p["lean"], p["spread"]
     axis = jnp.stack([jnp.sin(lean), 0.0 * lean, jnp.cos(lean)])
@@ -30,9 +30,12 @@ def door(p, hinges=2, **options):
     )
     at = {"lower": -spread * axis, "upper": spread * axis} if hinges == 2 else {"only": jnp.zeros(3)}
     joints = {name: lg.RevoluteJoint(None, "door", at=point, axis=axis) for name, point in at.items()}
-    if hinges == 2:
-        options = {"redundant": "minimum_norm"} | options
-    return lg.Model({"door": body}, joints, {"gravity": lg.Gravity((0.0, 0.0, -9.81))}, **options)
+    return lg.Model(
+        {"door": body},
+        joints,
+        {"gravity": lg.Gravity((0.0, 0.0, -9.81))},
+        redundant=redundant if hinges == 2 else "refuse",
+    )
 
 
 DOOR = {name: jnp.asarray(number) for name, number in {"mass": 20.0, "width": 0.9, "lean": 0.3, "spread": 0.6}.items()}
@@ -43,9 +46,11 @@ def planar(redundant, **numbers):
     model = four_bar(**numbers)
     if not redundant:
         return model
-    joints, axis = dict(model.joints), model.joints["A"].axis
+    joints = dict(model.joints)
     for name, a, b in (("B", "crank", "coupler"), ("C", "coupler", "rocker")):
-        joints[name] = lg.RevoluteJoint(a, b, at=joints[name].at, axis=axis)
+        pin = joints[name]
+        assert isinstance(pin, lg.SphericalJoint | lg.UniversalJoint)
+        joints[name] = lg.RevoluteJoint(a, b, at=pin.at, axis=Z)
     return lg.Model(model.bodies, joints, model.forces, redundant="minimum_norm")
 
 

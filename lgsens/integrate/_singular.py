@@ -30,13 +30,12 @@ _SMALL = 0.1  # margins above this fraction of the largest of a run are no sign:
 
 
 def margin_of(factors: Factors, jacobian: Matrix, scale: Float[Array, " k"]) -> Float[Array, ""]:
-    """m, by the factors of S."""
+    """m, by the factors of S; NaN after a failure."""
     if not jacobian.shape[0]:
         return jnp.full((), jnp.inf, scale.dtype)
     y = scale * jnp.asarray(np.random.default_rng(0).normal(size=scale.shape), scale.dtype)
     _, mu = factors.solve(jnp.zeros_like(scale), jacobian @ y)
-    size = jnp.sqrt(jnp.sum(mu**2))
-    return jnp.where(jnp.isfinite(size), 1.0 / size, 0.0)
+    return 1.0 / jnp.sqrt(jnp.sum(mu**2))
 
 
 class Watch(NamedTuple):
