@@ -14,6 +14,7 @@ from lgsens._differentiate import Sensitivities as Sensitivities, differentiate 
 from lgsens._errors import SimulationError as SimulationError
 from lgsens._index_reduced_ode import IndexReducedODE as IndexReducedODE
 from lgsens._kinematics import Kinematics as Kinematics, kinematics as kinematics
+from lgsens._rank import ConstraintRank as ConstraintRank, constraint_rank as constraint_rank
 from lgsens._reference_methods import FiniteDifferences as FiniteDifferences, IndexReduced as IndexReduced
 from lgsens._richardson import Extrapolated as Extrapolated, Richardson as Richardson, richardson as richardson
 from lgsens._simulate import (

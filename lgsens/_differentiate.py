@@ -19,7 +19,7 @@ from lgsens._simulate import as_system, check_integrator, interval, outcome, run
 from lgsens._start import begin
 from lgsens._validate import as_count, as_float
 from lgsens.criteria import Criterion
-from lgsens.dynamics import RESULTS, AbstractSystem, State, is_redundant
+from lgsens.dynamics import RESULTS, AbstractSystem, State, is_redundant, softness
 from lgsens.integrate import GeneralizedAlpha
 from lgsens.model import Model
 from lgsens.sensitivity import (
@@ -227,7 +227,8 @@ def _differentiate_jit(criteria, names, build, start, p, t0, t1, num_steps, inte
     of_multipliers = [name for name, use in zip(names, uses) if use.multipliers]
     if of_multipliers and found.details is not None:
         note = f"{' and '.join(of_multipliers)}: multipliers are used."
-        redundant = is_redundant(system, found.details["jacobian"])  # a given state0 has not been asked
+        # a given state0 has not been asked
+        redundant = softness(system) is None and is_redundant(system, found.details["jacobian"])
         result = jnp.where(redundant, RESULTS.redundant_constraints, result).astype(jnp.int32)
     gradient = tuple(unravel(row) for row in found.gradient)
     return tuple(found.value), gradient, result, found.details, system.constraint_names, note

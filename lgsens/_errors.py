@@ -31,12 +31,17 @@ def redundant_names(jacobian: Matrix, names: tuple[str, ...]) -> list[str]:
     """The joints whose rows of B are linearly dependent: those with weight in the left null space of B."""
     if isinstance(jacobian, SparseMatrix):
         jacobian = jacobian.to_numpy()
+    null_space, _ = left_null_space(jacobian)
+    weight = np.abs(null_space).max(axis=1, initial=0.0)
+    return sorted({name for name, w in zip(names, weight) if w > np.sqrt(np.finfo(jacobian.dtype).eps)})
+
+
+def left_null_space(jacobian: np.ndarray) -> tuple[np.ndarray, int]:
+    """An orthonormal basis of the left null space of B with unit rows, and the rank of B."""
     rows = jacobian / np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), np.finfo(jacobian.dtype).tiny)
     left, singular, _ = np.linalg.svd(rows)
-    threshold = np.sqrt(np.finfo(jacobian.dtype).eps)
-    rank = int(np.sum(singular > threshold))
-    weight = np.abs(left[:, rank:]).max(axis=1, initial=0.0)
-    return sorted({name for name, w in zip(names, weight) if w > threshold})
+    rank = int(np.sum(singular > np.sqrt(np.finfo(jacobian.dtype).eps)))
+    return left[:, rank:], rank
 
 
 def describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> str:
@@ -56,6 +61,11 @@ def describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> st
             f"{details['increment']:.3g} (tolerance {details['tolerance']:.3g}), "
             f"residual {details['residual']:.3g}. "
             "`throw=False` returns the data up to the step before."
+        )
+    if code is RESULTS.singular_configuration:
+        return (
+            f"{code.message} It does so about step {int(details['step'])} of {int(details['num_steps'])}, "
+            f"t = {details['time']:.6g} s. `throw=False` returns the data, which follow one branch."
         )
     if code is RESULTS.position_failed:
         violation = np.abs(details["violation"])

@@ -23,7 +23,7 @@ from lgsens.dynamics import (
     equilibrium as _equilibrium,
     initial_state as _initial,
 )
-from lgsens.integrate import AdaptiveSteps, GeneralizedAlpha, Stats
+from lgsens.integrate import AdaptiveSteps, GeneralizedAlpha, Stats, singular_steps
 from lgsens.model import Model
 from lgsens.sensitivity import AbstractSensitivity, DirectDifferentiation, Parameters, saved_run, times
 
@@ -262,6 +262,9 @@ def outcome(integrator: GeneralizedAlpha, start: Begin, stats: Stats, t0, h):
     """The result code of a simulation, and what its message needs."""
     failed = jnp.argmin(stats.converged)  # the first step that did not converge, 0 if all did
     newton = jnp.where(jnp.all(stats.converged), RESULTS.successful, RESULTS.newton_failed)
+    singular = singular_steps(stats.margin)
+    newton = jnp.where(jnp.any(singular), RESULTS.singular_configuration, newton)
+    failed = jnp.where(jnp.any(singular), jnp.argmax(singular), failed)
     result = jnp.where(start.result == RESULTS.successful, newton, start.result).astype(jnp.int32)
     details = {
         "violation": start.violation,

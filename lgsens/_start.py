@@ -12,6 +12,7 @@ from lgsens.dynamics import (
     Initial,
     State,
     constraint_jacobian,
+    given_way,
     initial_state,
     split_velocity,
 )
@@ -50,6 +51,7 @@ def _started(integrator: GeneralizedAlpha, system: AbstractSystem, initial: Init
     (`missed_increment`). The constraint at t_{n+1} takes B c h³ out again, through the velocity once the scheme is
     under way: B v_n = −h² B c there. Started with B v_0 = 0 it must do so through the first accelerations, and λ is
     off by O(h) for some steps. So v_0 receives h² P c, P the M-orthogonal projection on the constraint directions.
+    Where constraints may be redundant, the joints start with what they give way in a step.
     """
     if not integrator.second_order_start:
         return initial.state
@@ -58,7 +60,7 @@ def _started(integrator: GeneralizedAlpha, system: AbstractSystem, initial: Init
     missed = missed_increment(integrator, system, state.v, state.vdot, initial.jerk)
     _, normal = split_velocity(system, state.q, missed)
     return State(
-        q=state.q,
+        q=given_way(system, state.q, state.lam, integrator.beta * h**2),
         v=state.v + h**2 * normal,
         vdot=state.vdot,
         lam=state.lam,

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from lgsens._start import Begin, begin
 from lgsens._trajectory import Trajectory
 from lgsens._validate import as_float, is_concrete, require
-from lgsens.dynamics import AbstractSystem, Initial, State
+from lgsens.dynamics import AbstractSystem, Initial, State, require_independent
 from lgsens.integrate import AdaptiveSteps, FirstState, GeneralizedAlpha, Stats, integrate_controlled
 from lgsens.sensitivity import AdjointVariable, DirectDifferentiation, Parameters, times
 
@@ -98,6 +98,7 @@ def run_uneven(
     num_steps: int, sensitivity,
 ) -> UnevenRun:  # fmt: skip
     """The states on the grid that is given, or that error control finds."""
+    require_independent(system, type(integrator).__name__)
     scheme, mean = integrator.integrator, (t1 - t0) / num_steps
     if isinstance(integrator, GivenSteps):
         h = (t1 - t0) * (integrator.fractions / jnp.sum(integrator.fractions))
@@ -113,7 +114,7 @@ def run_uneven(
     frozen = jax.lax.stop_gradient((system, first, t0, mean))
     found = jax.lax.stop_gradient(integrate_controlled(integrator, num_steps, *frozen))
     parameters = Parameters(system, t0, found.h / frozen[3] * mean)
-    known = (found.states, Stats(*found.stats[:4]))
+    known = (found.states, Stats(*found.stats[: len(Stats._fields)]))
     states, newton = sensitivity.trajectory(scheme, num_steps, first.at(parameters.h[0]), parameters, known)
     return UnevenRun(start, times(num_steps, parameters), states, newton, found.stats, found.finished)
 

@@ -12,6 +12,8 @@ from lgsens.dynamics._initial import (
     Initial as Initial,
     acceleration_and_jerk as acceleration_and_jerk,
     accelerations as accelerations,
+    assemble as assemble,
+    given_way as given_way,
     initial_state as initial_state,
     is_redundant as is_redundant,
     split_velocity as split_velocity,
@@ -31,6 +33,12 @@ from lgsens.dynamics._matrices import (
     mass_scale as mass_scale,
     tangents as tangents,
     times_tangent_operator as times_tangent_operator,
+)
+from lgsens.dynamics._redundant import (
+    AbstractRedundantSystem as AbstractRedundantSystem,
+    least_norm as least_norm,
+    require_independent as require_independent,
+    softness as softness,
 )
 from lgsens.dynamics._results import RESULTS as RESULTS
 from lgsens.dynamics._state import State as State, Tangents as Tangents

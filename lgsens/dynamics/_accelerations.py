@@ -16,7 +16,8 @@ M is constant. With N = M⁻¹, made once outside the time loop, and the Cholesk
     A [x; μ] = [f; c]:     S μ = B N f − c,     x = N (f − Bᵀ μ),
 
 m³/3 instead of 2 (k + m)³/3 operations: an eighteenth on the quarter-car (k = 48, m = 45). S is scaled to a unit
-diagonal, since the rows of B have different units.
+diagonal, since the rows of B have different units. Where constraints may be redundant, ε is added to it, and the
+solution refined (`_redundant`).
 """
 
 from functools import partial
@@ -30,6 +31,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics._matrices import kkt_product
+from lgsens.dynamics._redundant import SOFTNESS, refined, softness
 from lgsens.dynamics._system import AbstractSystem
 
 
@@ -38,13 +40,15 @@ class Inertia(eqx.Module):
 
     mass: Float[Array, "k k"]
     inverse: Float[Array, "k k"]
+    redundant: bool = eqx.field(static=True)  # whether constraints may be redundant
 
     @classmethod
     def of(cls, system: AbstractSystem) -> "Inertia":
         mass = system.mass_matrix()
         # N serves to solve only, and needs no derivative: that of the solution comes from M.
         fixed = lax.stop_gradient(mass)
-        return cls(mass, jnp.linalg.solve(fixed, jnp.eye(fixed.shape[0], dtype=fixed.dtype)))
+        inverse = jnp.linalg.solve(fixed, jnp.eye(fixed.shape[0], dtype=fixed.dtype))
+        return cls(mass, inverse, softness(system) is not None)
 
 
 class ConstrainedInertia(eqx.Module):
@@ -60,7 +64,10 @@ class ConstrainedInertia(eqx.Module):
         fixed = lax.stop_gradient(jacobian)
         complement = fixed @ inertia.inverse @ fixed.T
         scale = lax.rsqrt(jnp.diagonal(complement))
-        factor = jnp.linalg.cholesky(complement * scale[:, None] * scale[None, :], symmetrize_input=False)
+        unit = complement * scale[:, None] * scale[None, :]
+        if inertia.redundant:
+            unit = unit + SOFTNESS * jnp.eye(unit.shape[0], dtype=unit.dtype)
+        factor = jnp.linalg.cholesky(unit, symmetrize_input=False)
         return cls(inertia, jacobian, factor, scale)
 
     def _eliminate(self, rhs):
@@ -74,7 +81,11 @@ class ConstrainedInertia(eqx.Module):
         """x and μ of A [x; μ] = [force; rate]; its own transpose, and differentiable through M and B."""
         rhs = jnp.concatenate([force, rate])
         product = partial(kkt_product, self.inertia.mass, self.jacobian)
-        solution = lax.custom_linear_solve(product, rhs, lambda _, rhs: self._eliminate(rhs), symmetric=True)
+
+        def eliminate(product, rhs):
+            return refined(product, self._eliminate, rhs) if self.inertia.redundant else self._eliminate(rhs)
+
+        solution = lax.custom_linear_solve(product, rhs, eliminate, symmetric=True)
         return solution[: force.shape[0]], solution[force.shape[0] :]
 
 

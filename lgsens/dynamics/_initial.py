@@ -9,6 +9,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.dynamics._matrices import ConstrainedMass, constraint_jacobian, factorized
+from lgsens.dynamics._redundant import softness
 from lgsens.dynamics._results import RESULTS
 from lgsens.dynamics._state import State
 from lgsens.dynamics._system import AbstractSystem
@@ -34,6 +35,15 @@ def split_velocity(system: AbstractSystem, q, v) -> tuple[Float[Array, " k"], Fl
     kkt = ConstrainedMass.of(system, q)
     tangential, _ = kkt.solve(kkt.mass @ v, jnp.zeros(kkt.jacobian.shape[0], v.dtype))
     return tangential, v - tangential
+
+
+def given_way(system: AbstractSystem, q, lam, share):
+    """q moved M-orthogonally by what satisfies Φ(q) = share × c λ: where joints of a `softness` c carry λ."""
+    soft = softness(system)
+    if soft is None:
+        return q
+    x, _ = ConstrainedMass.of(system, q).solve(jnp.zeros(system.group.dim, lam.dtype), share * soft * lam)
+    return system.group.retract(q, x)
 
 
 def accelerations(system: AbstractSystem, q, v, t):
@@ -71,6 +81,8 @@ def assemble(system: AbstractSystem):
     normal = jnp.linalg.solve(mass, jacobian.T)
     scale = system.coordinate_scale()
     tolerance = 16 * jnp.finfo(v_ref.dtype).eps
+    # Redundant equations leave μ open, not q: the shortest μ will do, in the derivative too.
+    solve = jnp.linalg.solve if softness(system) is None else _shortest
 
     def place(mu):
         return group.retract(q_ref, normal @ mu)
@@ -81,7 +93,7 @@ def assemble(system: AbstractSystem):
             x = normal @ mu
             q = group.retract(q_ref, x)
             slope = jax.vmap(lambda row: group.tangent_rmv(x, row))(system.constraint_jacobian(q)) @ normal
-            step = jnp.linalg.solve(slope, equation(mu))
+            step = solve(slope, equation(mu))
             # Far from assembly a full step may leave the branch: at most a fifth of the scene at a time.
             size = jnp.max(jnp.abs(normal @ step) / scale)
             step = step * jnp.minimum(1.0, 0.2 / jnp.maximum(size, 0.2))
@@ -95,7 +107,7 @@ def assemble(system: AbstractSystem):
         return lax.while_loop(unfinished, body, start)[0]
 
     def tangent_solve(linear, rhs):
-        return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(rhs)), rhs)
+        return solve(jax.jacfwd(linear)(jnp.zeros_like(rhs)), rhs)
 
     mu = lax.custom_root(
         lambda mu: system.constraint(place(mu)),
@@ -105,6 +117,11 @@ def assemble(system: AbstractSystem):
     )
     q = place(mu)
     return q, system.constraint(q)
+
+
+def _shortest(matrix, rhs):
+    """The shortest solution of consistent equations."""
+    return jnp.linalg.pinv(matrix, rtol=1e-8 if matrix.dtype == jnp.float64 else 1e-4) @ rhs
 
 
 def independence(jacobian: Float[Array, "m k"]) -> Float[Array, ""]:
@@ -146,7 +163,7 @@ def initial_state(system: AbstractSystem, t) -> Initial:
     vdot, lam, vddot = acceleration_and_jerk(system, q, v, t)
     state = State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
     dtype = v.dtype
-    redundant = is_redundant(system, constraint_jacobian(system, q))
+    redundant = softness(system) is None and is_redundant(system, constraint_jacobian(system, q))
     length = jnp.max(system.coordinate_scale())
     largest = jnp.max(jnp.abs(violation), initial=0.0)
     assembled = largest <= 1e3 * jnp.finfo(dtype).eps * jnp.maximum(length, 1.0)  # NaN is not assembled

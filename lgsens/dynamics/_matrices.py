@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens.dynamics._redundant import refined, softness
 from lgsens.dynamics._state import Tangents
 from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem
 from lgsens.linear import LU, Factors, Matrix, SparseMatrix
@@ -60,10 +61,12 @@ def times_tangent_operator(system: AbstractSystem, x, matrices: tuple[Matrix, ..
     return tuple(jnp.split(turned, [sum(heights[:i]) for i in range(1, len(heights))]))
 
 
-def factorized(system: AbstractSystem, dynamic: Matrix, upper: Matrix, lower: Matrix, scale, kind: Any = LU) -> Factors:
-    """The factors of [[A, U], [L, 0]] by the linear solver of the system; `kind` as in `Factors.of`."""
+def factorized(
+    system: AbstractSystem, dynamic: Matrix, upper: Matrix, lower: Matrix, scale, kind: Any = LU, softness=None
+) -> Factors:
+    """The factors of [[A, U], [L, 0]] by the linear solver of the system; `kind`, `softness` as in `Factors.of`."""
     plan = system.elimination if isinstance(system, AbstractSparseSystem) else None
-    return Factors.of(dynamic, upper, lower, scale, plan=plan, kind=kind)
+    return Factors.of(dynamic, upper, lower, scale, plan=plan, kind=kind, softness=softness)
 
 
 def kkt_solve(mass, jacobian, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
@@ -88,14 +91,17 @@ class ConstrainedMass(eqx.Module):
     mass: Matrix
     jacobian: Matrix
     factors: Factors | None  # None: dense, where `kkt_solve` makes them
+    soft: bool = eqx.field(static=True)  # whether they are those of K_c (`_redundant`)
 
     @classmethod
     def of(cls, system: AbstractSystem, q) -> "ConstrainedMass":
         mass, jacobian = mass_matrix(system), constraint_jacobian(system, q)
-        if _sparse(system) is None:
-            return cls(mass, jacobian, None)
+        soft = softness(system)
+        if _sparse(system) is None and soft is None:
+            return cls(mass, jacobian, None, False)
         fixed, border = lax.stop_gradient((mass, jacobian))
-        return cls(mass, jacobian, factorized(system, fixed, border.T, border, mass_scale(mass)))
+        factors = factorized(system, fixed, border.T, border, mass_scale(mass), softness=soft)
+        return cls(mass, jacobian, factors, soft is not None)
 
     def solve(self, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
         """x and μ of M x + Bᵀμ = force, B x = rate; differentiable through M and B, by one more solve."""
@@ -103,6 +109,7 @@ class ConstrainedMass(eqx.Module):
         if factors is None:
             return kkt_solve(self.mass, self.jacobian, force, rate)
         product = partial(kkt_product, self.mass, self.jacobian)
-        solve = lambda _, rhs: jnp.concatenate(factors.solve(rhs[:k], rhs[k:]))
+        once = lambda rhs: jnp.concatenate(factors.solve(rhs[:k], rhs[k:]))
+        solve = lambda product, rhs: refined(product, once, rhs) if self.soft else once(rhs)
         solution = lax.custom_linear_solve(product, jnp.concatenate([force, rate]), solve, symmetric=True)
         return solution[:k], solution[k:]

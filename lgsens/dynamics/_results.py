@@ -14,6 +14,7 @@ class RESULTS(IntEnum):
     integration_failed = 5
     position_failed = 6
     steps_exhausted = 7
+    singular_configuration = 8
 
     @property
     def message(self) -> str:
@@ -30,7 +31,9 @@ _MESSAGES = {
     RESULTS.redundant_constraints: (
         "The joints constrain the same motion twice, so the multipliers are not unique. Replace one of the "
         "joints named by one with fewer equations (a revolute by a spherical or a cylindrical joint, say), or "
-        "remove it where the `free` coordinates of its bodies satisfy it anyway."
+        "remove it where the `free` coordinates of its bodies satisfy it anyway. Or keep them and take the multipliers "
+        "of least norm: Model(…, redundant='minimum_norm'), unless they do so in this configuration only, "
+        "a singular one: `constraint_rank` tells."
     ),
     RESULTS.newton_failed: (
         "Newton's iteration did not converge. Try a smaller step (more `num_steps`), more "
@@ -43,6 +46,11 @@ _MESSAGES = {
     RESULTS.integration_failed: (
         "The explicit integration left the finite numbers, or took more than `max_steps` steps in an output interval. "
         "Try more `num_steps`, a looser `rtol`, more `max_steps`, or, for stiff forces, GeneralizedAlpha."
+    ),
+    RESULTS.singular_configuration: (
+        "The mechanism passes a singular configuration, where its joints lose independence and the motion may branch "
+        "(a linkage that lies flat): which way it goes on is not determined, and derivatives by lengths are infinite. "
+        "End the simulation before, change the lengths, or let a joint give way (`Bushing`)."
     ),
     RESULTS.position_failed: (
         "No position satisfies the joints for these values of the driven ones: they are out of reach, or the mechanism "

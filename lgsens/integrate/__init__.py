@@ -23,4 +23,5 @@ from lgsens.integrate._scheme import (
     increment as increment,
     missed_increment as missed_increment,
 )
+from lgsens.integrate._singular import margin_of as margin_of, singular_steps as singular_steps
 from lgsens.integrate._uneven import integrate_uneven as integrate_uneven, moved as moved

@@ -101,6 +101,7 @@ class ControlledStats(NamedTuple):
         increment: the last increment of each step, relative as in `GeneralizedAlpha.tolerance`, shape (n,).
         residual: the largest entry of the residual r before that increment [N or N m], shape (n,).
         converged: whether each step converged, shape (n,), bool.
+        margin: as in `Stats`; not looked at, NaN, shape (n,).
         error: the estimated error of each step, relative as in `AdaptiveSteps.tolerance`, shape (n,).
         rejected: attempts with a longer step before each, shape (n,), int32.
         steps: the number of steps that t1 took, shape (), int32.
@@ -110,6 +111,7 @@ class ControlledStats(NamedTuple):
     increment: Float[Array, " n"]
     residual: Float[Array, " n"]
     converged: Bool[Array, " n"]
+    margin: Float[Array, " n"]
     error: Float[Array, " n"]
     rejected: Int[Array, " n"]
     steps: Int[Array, ""]
@@ -180,7 +182,7 @@ def integrate_controlled(
             return _Trial(jnp.where(again, trial.h * shorter, trial.h), found, error, iterations, rejected, again)
 
         none = jnp.zeros((), jnp.int32)
-        nothing = Attempt(ready.state, ready.contraction, Stats(none, h * 0.0, h * 0.0, progress.running))
+        nothing = Attempt(ready.state, ready.contraction, Stats(none, h * 0.0, h * 0.0, progress.running, jnp.nan * h))
         trial = lax.while_loop(
             lambda trial: trial.trying, attempt, _Trial(wanted, nothing, h * 0.0, none, none, active)
         )

@@ -12,15 +12,16 @@ chain of 512 links), so an iteration is also the last where increments of that s
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from lgsens.dynamics import AbstractSystem, State, mass_matrix, tangents
+from lgsens.dynamics import AbstractSystem, State, mass_matrix, softness, tangents
 from lgsens.integrate._scheme import GeneralizedAlpha, advance, factorize_iteration_matrix, increment
+from lgsens.integrate._singular import Watch, margin_of
 from lgsens.linear import Factors, Inverse, Matrix
 
 _MODIFIED_LIMIT = 12  # iterations; more cost as much as a full one
@@ -38,12 +39,15 @@ class Stats(NamedTuple):
         increment: the last increment of each step, relative as in `GeneralizedAlpha.tolerance`, shape (n,).
         residual: the largest entry of the residual r before that increment [N or N m], shape (n,).
         converged: whether each step converged, shape (n,), bool.
+        margin: how far the step is from a singular configuration (`_singular`), NaN where that was not looked at,
+            shape (n,).
     """
 
     iterations: Int[Array, " n"]
     increment: Float[Array, " n"]
     residual: Float[Array, " n"]
     converged: Bool[Array, " n"]
+    margin: Float[Array, " n"]
 
 
 class Constants(NamedTuple):
@@ -51,10 +55,11 @@ class Constants(NamedTuple):
 
     mass: Matrix  # M, (k, k)
     scale: Float[Array, " k"]
+    softness: Float[Array, " m"] | None  # c; None: no constraint may be redundant
 
     @classmethod
     def of(cls, system: AbstractSystem) -> "Constants":
-        return cls(mass_matrix(system), system.coordinate_scale())
+        return cls(mass_matrix(system), system.coordinate_scale(), softness(system))
 
 
 class Guess(NamedTuple):
@@ -89,6 +94,7 @@ class _Iterate(NamedTuple):
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
     settled: Bool[Array, ""]  # what modified Newton left before this iteration was small enough
+    margin: Float[Array, ""]  # of full Newton
 
 
 def take_step(
@@ -106,7 +112,7 @@ def take_step(
 
     `earlier` solves with the iteration matrix of an earlier step, for modified Newton; None: full Newton only.
     """
-    mass, scale = constants
+    mass, scale, soft = constants
     eps = float(jnp.finfo(scale.dtype).eps)
     tolerance = max(scheme.tolerance, 64 * eps)
     target = max(tolerance**2, 0.04 * eps)
@@ -116,10 +122,14 @@ def take_step(
         point = (motion.q, motion.v, motion.vdot, iterate.lam, t)
         residual = system.residual(*point)
         violation = system.constraint(motion.q) / (scheme.beta * h**2)
+        if soft is not None:
+            violation = violation - soft * iterate.lam
         if factors is None:
-            solver = factorize_iteration_matrix(scheme, system, tangents(system, *point), mass, motion.x, h)
+            at_point = tangents(system, *point)
+            solver = factorize_iteration_matrix(scheme, system, at_point, mass, motion.x, h)
+            margin = iterate.margin if earlier is not None else margin_of(solver, at_point.constraint_jacobian, scale)
         else:
-            solver = factors
+            solver, margin = factors, iterate.margin
         du, dlam = solver.solve(residual, violation)
         size = jnp.max(jnp.abs(du) * (scheme.beta * h**2) / scale)
         measured = (iterate.iterations > 1) & (iterate.before > _ROUGH * eps)
@@ -129,7 +139,7 @@ def take_step(
         settled = (iterate.increment * iterate.contraction**2 <= target) | rough
         largest, count = jnp.max(jnp.abs(residual)), iterate.iterations + 1
         return _Iterate(
-            iterate.u - du, iterate.lam - dlam, size, iterate.increment, contraction, largest, count, settled
+            iterate.u - du, iterate.lam - dlam, size, iterate.increment, contraction, largest, count, settled, margin
         )
 
     # NaN compares false, and ends the iterations
@@ -142,8 +152,9 @@ def take_step(
         return running & (iterate.increment > tolerance) & (iterate.iterations < scheme.max_iterations)
 
     infinite, none, no = jnp.full((), jnp.inf, scale.dtype), jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    unknown = jnp.full((), jnp.nan, scale.dtype)
     u, lam = guess.extrapolated(previous)
-    iterate = _Iterate(u, lam, infinite, infinite, guess.contraction, infinite, none, no)
+    iterate = _Iterate(u, lam, infinite, infinite, guess.contraction, infinite, none, no, unknown)
     contraction = guess.contraction
     before = none
     if earlier is not None:
@@ -161,6 +172,7 @@ def take_step(
             residual=iterate.residual,
             iterations=none,
             settled=no,
+            margin=unknown,
         )
     iterate = lax.while_loop(unfinished, partial(corrected, None), iterate)
     motion = advance(scheme, system, previous, iterate.u, h)
@@ -168,24 +180,30 @@ def take_step(
     finite = jnp.all(jnp.isfinite(iterate.u)) & jnp.all(jnp.isfinite(iterate.lam))
     converged = running & (iterate.increment <= tolerance) & finite
     state = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), state)
-    stats = Stats(before + iterate.iterations, iterate.increment, iterate.residual, converged)
+    stats = Stats(before + iterate.iterations, iterate.increment, iterate.residual, converged, iterate.margin)
     return state, guess.after(previous, contraction), stats
 
 
-def inverse_at(scheme: GeneralizedAlpha, system: AbstractSystem, constants: Constants, state: State, t, h) -> Factors:
-    """The inverse of the iteration matrix of a step of size h from here, for modified Newton."""
+def inverse_at(
+    scheme: GeneralizedAlpha, system: AbstractSystem, constants: Constants, state: State, t, h
+) -> tuple[Factors, Float[Array, ""]]:
+    """The inverse of the iteration matrix of a step of size h from here, for modified Newton; its margin."""
     at_state = tangents(system, state.q, state.v, state.vdot, state.lam, t)
     x = increment(scheme, state, state.a, h)
-    return factorize_iteration_matrix(scheme, system, at_state, constants.mass, x, h, Inverse)
+    factors = factorize_iteration_matrix(scheme, system, at_state, constants.mass, x, h, Inverse)
+    return factors, margin_of(factors, at_state.constraint_jacobian, constants.scale)
 
 
-def no_inverse(inverse: Callable[..., Factors], *arguments) -> Factors:
+Found = TypeVar("Found")
+
+
+def no_inverse(inverse: Callable[..., Found], *arguments) -> Found:
     """Zeros of the shapes that `inverse(*arguments)` has, to begin with."""
     shape = jax.eval_shape(inverse, *arguments)
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
 
 
-def renewed_where(due, inverse: Callable[[], Factors], earlier: Factors) -> Factors:
+def renewed_where(due, inverse: Callable[[], Found], earlier: Found) -> Found:
     """`inverse()` where it is due. A loop of no or one turn, because `cond` would copy the inverse."""
     renewed = lambda carry: (jnp.zeros((), bool), inverse())
     return lax.while_loop(lambda carry: carry[0], renewed, (due, earlier))[1]
@@ -224,10 +242,12 @@ class Mark(NamedTuple):
     state: State
     guess: Guess
     running: Bool[Array, ""]
+    watch: Watch
 
     @classmethod
     def first(cls, state0: State) -> "Mark":
-        return cls(jnp.zeros((), state0.a.dtype), state0, Guess.first(state0), jnp.ones((), bool))
+        dtype = state0.a.dtype
+        return cls(jnp.zeros((), dtype), state0, Guess.first(state0), jnp.ones((), bool), Watch.first(dtype))
 
 
 def integrate_onward(
@@ -246,25 +266,32 @@ def integrate_onward(
     """
     constants = Constants.of(system)
 
-    def inverse(state: State, n) -> Factors:
+    def inverse(state: State, n) -> tuple[Factors, Float[Array, ""]]:
         return inverse_at(scheme, system, constants, state, t0 + n * h, h)
 
     def step(carry, n):
-        previous, guess, earlier, age, running = carry
+        previous, guess, earlier, age, running, watch = carry
+        margin = watch.margin
         if earlier is not None:
             # A matrix that contracts slowly is renewed, unless it was new: then full Newton takes over. In a batch
             # every lane pays for the slowest; for its full iterations it would pay more.
+            steps = jnp.maximum(age, 1).astype(margin.dtype)
             due = (jnp.mod(n, scheme.factor_every) == 0) | ((guess.contraction >= SLOW) & (age > 1))
+            due = due | watch.ends_within(steps + 2.0 * scheme.factor_every)
             age = jnp.where(due, 0, age) + 1
-            earlier = renewed_where(due, partial(inverse, previous, n), earlier)
+            earlier, margin = renewed_where(due, partial(inverse, previous, n), (earlier, margin))
+            watch = jax.tree.map(partial(jnp.where, due), watch.after(margin, steps), watch)
+            margin = jnp.where(due, margin, jnp.nan)
         t = t0 + (n + 1) * h
         state, guess, stats = take_step(scheme, system, constants, previous, guess, earlier, running, t, h)
-        return (state, guess, earlier, age, stats.converged), (output(state, t), stats)
+        if earlier is not None:
+            stats = stats._replace(margin=margin)
+        return (state, guess, earlier, age, stats.converged, watch), (output(state, t), stats)
 
     count = mark.n + jnp.arange(num_steps, dtype=constants.scale.dtype)
     earlier = None
     if scheme.factor_every:
-        earlier = no_inverse(inverse, mark.state, count[0])
-    start = (mark.state, mark.guess, earlier, jnp.zeros((), jnp.int32), mark.running)
-    (state, guess, _, _, running), (outputs, stats) = lax.scan(step, start, count)
-    return outputs, Mark(mark.n + num_steps, state, guess, running), stats
+        earlier, _ = no_inverse(inverse, mark.state, count[0])
+    start = (mark.state, mark.guess, earlier, jnp.zeros((), jnp.int32), mark.running, mark.watch)
+    (state, guess, _, _, running, watch), (outputs, stats) = lax.scan(step, start, count)
+    return outputs, Mark(mark.n + num_steps, state, guess, running, watch), stats

@@ -15,7 +15,8 @@ becomes
          [B T(x),                       0 ]],      c = (1 − α_m)/(1 − α_f),
 
 which does not degenerate as h → 0 (Bottasso, Bauchau & Cardona 2007; its condition at h = 1e-3 would
-else be 1e18). Its constraint rows and multipliers are further scaled by the size of M.
+else be 1e18). Its constraint rows and multipliers are further scaled by the size of M. Where constraints may be
+redundant, Φ(q⁺)/(βh²) − c λ⁺ = 0, with −diag(c) in the corner of S (`dynamics/_redundant.py`).
 """
 
 import math
@@ -24,7 +25,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import AbstractSystem, State, Tangents, factorized, mass_scale, times_tangent_operator
+from lgsens.dynamics import AbstractSystem, State, Tangents, factorized, mass_scale, softness, times_tangent_operator
 from lgsens.linear import LU, Factors
 
 
@@ -143,4 +144,4 @@ def factorize_iteration_matrix(
     jacobian = tangents.constraint_jacobian
     stiffness, lower = times_tangent_operator(system, x, (tangents.stiffness, jacobian))
     dynamic = scheme.inertia_factor * mass + (scheme.gamma * h) * tangents.damping + (scheme.beta * h**2) * stiffness
-    return factorized(system, dynamic, jacobian.T, lower, mass_scale(mass), kind)
+    return factorized(system, dynamic, jacobian.T, lower, mass_scale(mass), kind, softness(system))

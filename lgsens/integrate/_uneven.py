@@ -85,7 +85,7 @@ class UnevenSteps(eqx.Module):
         return cls(scheme, system, Constants.of(system))
 
     def _inverse(self, state: State, t, h) -> Factors:
-        return inverse_at(self.scheme, self.system, self.constants, state, t, h)
+        return inverse_at(self.scheme, self.system, self.constants, state, t, h)[0]
 
     def first(self, state0: State, t0, h) -> Progress:
         """Before the first step, to whose size h the a of `state0` belongs."""

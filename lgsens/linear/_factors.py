@@ -22,13 +22,24 @@ class Factors(eqx.Module):
 
     @classmethod
     def of(
-        cls, dynamic: Matrix, upper: Matrix, lower: Matrix, scale, *, plan: Elimination | None = None, kind: Any = LU
+        cls,
+        dynamic: Matrix,
+        upper: Matrix,
+        lower: Matrix,
+        scale,
+        *,
+        plan: Elimination | None = None,
+        kind: Any = LU,
+        softness: Float[Array, " m"] | None = None,
     ) -> "Factors":
-        """`plan`: None for arrays. `kind`: LU or `Inverse` of what is dense."""
+        """`plan`: None for arrays. `kind`: LU or `Inverse` of what is dense. `softness`: c of −diag(c) instead of 0."""
+        m = lower.shape[0]
+        corner = None if softness is None else -(scale**2) * softness
         if not isinstance(dynamic, SparseMatrix):
-            m = lower.shape[0]
             above = jnp.concatenate([dynamic, scale * upper], axis=1)
-            below = jnp.concatenate([scale * lower, jnp.zeros((m, m), dynamic.dtype)], axis=1)
+            below = jnp.concatenate(
+                [scale * lower, jnp.zeros((m, m), dynamic.dtype) if corner is None else jnp.diag(corner)], axis=1
+            )
             return cls(kind.of(jnp.concatenate([above, below])), scale)
         assert plan is not None
         k = dynamic.shape[0]
@@ -36,6 +47,9 @@ class Factors(eqx.Module):
         values = jnp.concatenate([a, scale * u, scale * b])
         rows = np.concatenate([at[0], rows_u, k + rows_b])
         columns = np.concatenate([at[1], k + columns_u, columns_b])
+        if corner is not None:
+            own = np.arange(k, k + m)
+            values, rows, columns = (jnp.concatenate([values, corner]), *(np.append(x, own) for x in (rows, columns)))
         return cls(BlockFactors.of(plan, values, rows, columns, kind), scale)
 
     def largest_inverse(self) -> Float[Array, ""]:

@@ -105,4 +105,5 @@ def _assemble(
         free=tuple(body.coordinates for body in ordered),
         assembled=all(joint.assembled for joint in joints.values()),
         linear_solver=None,
+        minimum_norm=False,
     )

@@ -21,6 +21,8 @@ from lgsens.model._stack import stacked
 from lgsens.model._summary import Summary, summarize
 from lgsens.model._system import MultibodySystem
 
+_REDUNDANT = ("refuse", "minimum_norm")
+
 
 class Model(eqx.Module):
     """A scene of rigid bodies connected by joints and forces; a pytree whose numbers are all float leaves.
@@ -33,6 +35,12 @@ class Model(eqx.Module):
             estimated to take less time for this scene.
         merge_fixed: bodies that a `FixedJoint` connects are one body in the equations of motion, those that it connects
             to the ground are ground: six unknowns per merged body and the joint's equations less.
+        redundant: "refuse" raises where joints constrain the same motion twice. "minimum_norm" accepts that, where the
+            rank of B does not change: the motion is that of the mechanism without the equations too many,
+            `Trajectory.multiplier` the multipliers of least Σ λ_i² (moments divided by the radius of gyration of the
+            bodies): the forces in joints that are all equally stiff, in the limit of rigid ones. Derivatives are exact
+            for changes that leave the equations redundant (both hinges of a door off their axis, and not one of
+            them). `constraint_rank` says which joints are redundant.
 
     The constructors can be traced, so a function that builds a model from design parameters is the
     general parametrization; the gradient with respect to a model is again a model.
@@ -55,6 +63,7 @@ class Model(eqx.Module):
     forces: dict[str, AbstractForce]
     linear_solver: AbstractLinearSolver | None = eqx.field(static=True)
     merge_fixed: bool = eqx.field(static=True)
+    redundant: str = eqx.field(static=True)
 
     def __init__(
         self,
@@ -64,6 +73,7 @@ class Model(eqx.Module):
         *,
         linear_solver: AbstractLinearSolver | None = None,
         merge_fixed: bool = False,
+        redundant: str = "refuse",
     ):
         if not isinstance(linear_solver, AbstractLinearSolver | None):
             raise ValueError(f"Model: `linear_solver` must be DenseLU(), BlockSparse() or None, got {linear_solver!r}.")
@@ -72,6 +82,9 @@ class Model(eqx.Module):
         self.merge_fixed = merge_fixed
         if not isinstance(merge_fixed, bool):
             raise ValueError(f"Model: `merge_fixed` must be True or False, got {merge_fixed!r}.")
+        self.redundant = redundant
+        if redundant not in _REDUNDANT:
+            raise ValueError(f"Model: `redundant` must be one of {_REDUNDANT}, got {redundant!r}.")
         if not self.bodies:
             raise ValueError("Model: `bodies` is empty; a scene needs at least one RigidBody.")
         for what, kind, members in (
@@ -126,7 +139,9 @@ class Model(eqx.Module):
             system = assemble(bodies, self.joints, self.forces)
         else:
             system = assemble_merged(bodies, self.joints, self.forces, self._groups)
-        return dataclasses.replace(system, linear_solver=self.linear_solver)
+        return dataclasses.replace(
+            system, linear_solver=self.linear_solver, minimum_norm=self.redundant == "minimum_norm"
+        )
 
     @property
     def _groups(self) -> tuple[Group, ...] | None:

@@ -6,10 +6,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens._validate import suggestion
-from lgsens.dynamics import AbstractSparseSystem, Tangents
+from lgsens.dynamics import AbstractRedundantSystem, AbstractSparseSystem, Tangents, least_norm
 from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew
 from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, chosen
 from lgsens.model._constraints import AbstractConstraint
@@ -31,7 +32,7 @@ from lgsens.model._topology import Topology, topology
 _traced_once = partial(jax.jit, inline=True)
 
 
-class MultibodySystem(AbstractSparseSystem):
+class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     """Rigid bodies, joints and forces as stacked numbers.
 
     For body i with coordinates [x_i, θ_i] (paper §3.2, signs as in ERRATA):
@@ -57,6 +58,7 @@ class MultibodySystem(AbstractSparseSystem):
     free: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # the coordinates, 0 to 5, of each body
     assembled: bool = eqx.field(static=True)
     linear_solver: AbstractLinearSolver | None = eqx.field(static=True)  # None: the cheaper one
+    minimum_norm: bool = eqx.field(static=True)  # whether constraints may be redundant
 
     @property
     def topology(self) -> Topology:
@@ -124,6 +126,23 @@ class MultibodySystem(AbstractSparseSystem):
             for _ in range((own >= 0).sum())
         )
 
+    @property
+    def compliance(self):
+        """1/m for what is measured in metres, 1/(m l²) for angles and cosines, with m the mean mass of the bodies and l
+        the radius of gyration of all of them: a moment counts as a force at the arm l."""
+        if not self.minimum_norm:
+            return None
+        mass = jnp.mean(self.mass)
+        square = jnp.mean(jnp.trace(self.inertia, axis1=1, axis2=2)) / (3.0 * mass)
+        square = jnp.where(square > 0, square, 1.0)
+        angular = []
+        for stack, rows in zip(self.constraints, self.topology.rows):
+            translation = stack.map(constraint_jacobian, self.pose).reshape(*rows.shape, -1, BODY_DIM)
+            without = jnp.all(translation[..., : ROTATION.start] == 0.0, axis=(2, 3))
+            angular.append((without.astype(mass.dtype), rows))
+        angular = lax.stop_gradient(added(angular, self.topology.num_constraints, mass.dtype))
+        return (1.0 + angular * (1.0 / square - 1.0)) / mass
+
     def multiplier_rows(self, joint: str) -> np.ndarray:
         """Where the multipliers of a joint are in λ, in the order of its basic constraints."""
         own = [
@@ -141,7 +160,14 @@ class MultibodySystem(AbstractSparseSystem):
         return self.parts.system, *self.parts.motion(self._placed(q), self.twists(v), self.twists(vdot))
 
     def multiplier(self, joint: str, q, v, vdot, lam, t):
-        """The multipliers of a joint, along leading axes; those of a merged one from the equations of its bodies."""
+        """The multipliers of a joint, along leading axes; those of a merged one from the equations of its bodies.
+
+        Where constraints may be redundant they are those of least norm.
+        """
+        least = partial(least_norm, self)
+        for _ in lam.shape[:-1]:
+            least = jax.vmap(least)
+        lam = least(q, lam)
         whole, q, v, vdot = self.of_parts(q, v, vdot)
         if joint not in whole.constraint_names:
             raise ValueError(f"`multiplier`: {suggestion(joint, set(whole.constraint_names))}.")

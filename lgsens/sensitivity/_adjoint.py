@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from lgsens.dynamics import State, factor_size, mass_matrix
+from lgsens.dynamics import State, factor_size, mass_matrix, softness
 from lgsens.integrate import GeneralizedAlpha
 from lgsens.sensitivity._blocks import Blocks, padded, sweep_blocks
 from lgsens.sensitivity._linearization import (
@@ -107,6 +107,9 @@ def adjoint_sweep(scheme: GeneralizedAlpha, states: State, parameters: Parameter
             bar = bar._replace(system=jax.tree.map(jnp.add, bar.system, bar_system))
             return (c, bar), (solved, Grid(bar_t, bar_t + jnp.sum(rates, axis=1), bar_ratio))
         n = (step.t - parameters.t0) / h
+        if softness(system) is not None:
+            violation = jax.vmap(system.constraint)(step.state.q)
+            bar = bar._replace(h=bar.h + jnp.sum(mu.lam * violation) * 2.0 / (scheme.beta * h**3))
         bar = Parameters(
             system=jax.tree.map(jnp.add, bar.system, bar_system),
             t0=bar.t0 + jnp.sum(bar_t),

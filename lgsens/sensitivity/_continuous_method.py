@@ -5,7 +5,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from lgsens.dynamics import State
+from lgsens.dynamics import State, require_independent
 from lgsens.integrate import GeneralizedAlpha
 from lgsens.sensitivity._continuous_adjoint import Cotangents, continuous_adjoint_sweep
 from lgsens.sensitivity._criterion_terms import (
@@ -59,6 +59,7 @@ class ContinuousAdjoint(eqx.Module):
         uses: tuple[bool, bool],
     ) -> Cotangents:
         """dΨ as it acts on the initial state, the system and p; `uses`: whether F and G use v̇ or λ."""
+        require_independent(parameters.system, "ContinuousAdjoint")
         count = jnp.arange(states.v.shape[0], dtype=states.v.dtype)
         t, h = parameters.t0 + count * parameters.h, parameters.h
         derivatives = uses[0] and self.accelerations in ("derivatives", None)

@@ -8,7 +8,7 @@ the numbers of the system, t0 and h. Differentiating the step (eqs. 24–29, §6
     (28)  v'_{n+1} − v'_n − h ((1 − γ) a'_n + γ a'_{n+1}) − v_h h'                              = b.v
                                                                        v_h = (1 − γ) a_n + γ a_{n+1}
     (29)  v̇'_{n+1} − ((1 − α_m) a'_{n+1} + α_m a'_n − α_f v̇'_n)/(1 − α_f)                      = b.vdot
-    (26)  (B w_{n+1} + Φ_p p')/(βh²)                                                          = b.lam
+    (26)  (B w_{n+1} + Φ_p p')/(βh²)  [− c λ'_{n+1} − 2Φ h'/(βh³), redundant constraints]      = b.lam
     (25)  M v̇'_{n+1} + C_t v'_{n+1} + K_t w_{n+1} + Bᵀλ'_{n+1} + r_p p' + r_t (t0' + (n+1) h')   = b.a
 
 Row 0 is δ_0 = b_0 and the last row p' = b.p. L is block lower bidiagonal with a border for p. A derivative has b_0 and
@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from lgsens.dynamics import AbstractSystem, State, Tangents, mass_matrix, tangents
+from lgsens.dynamics import AbstractSystem, State, Tangents, mass_matrix, softness, tangents
 from lgsens.integrate import GeneralizedAlpha, factorize_iteration_matrix, increment, moved
 from lgsens.linear import Factors
 
@@ -200,15 +200,18 @@ def pseudo_load_function(state: State):
 
 
 def pseudo_loads(step: Step, parameters: Parameters, d: Parameters):
-    """r_p p' + r_t t' and Φ_p p', with t' = t0' + (n+1) h'."""
+    """r_p p' + r_t t' and Φ_p p' (with − 2Φ h'/h where constraints may be redundant); with t' = t0' + (n+1) h'."""
     n = (step.t - parameters.t0) / parameters.h
     loads = pseudo_load_function(step.state)
-    return jax.jvp(loads, (parameters.system, step.t), (d.system, d.t0 + n * d.h))[1]
+    r_p, phi_p = jax.jvp(loads, (parameters.system, step.t), (d.system, d.t0 + n * d.h))[1]
+    if softness(parameters.system) is not None:
+        phi_p = phi_p - (2.0 * d.h / parameters.h) * parameters.system.constraint(step.state.q)
+    return r_p, phi_p
 
 
 def matvec(scheme: GeneralizedAlpha, states: State, parameters: Parameters, delta: Variation, d: Parameters):
     """L (δ, p'), all steps at once: the equations above, written out. What JAX differentiates a second time."""
-    mass = mass_matrix(parameters.system)
+    mass, soft = mass_matrix(parameters.system), softness(parameters.system)
     group = parameters.system.group
 
     def rows(step: Step, previous: Variation, current: Variation, single: SingleStep | None, d_grid) -> Variation:
@@ -229,7 +232,7 @@ def matvec(scheme: GeneralizedAlpha, states: State, parameters: Parameters, delt
             w=current.w - w,
             v=current.v - v,
             vdot=current.vdot - vdot,
-            lam=(b @ current.w + phi_p) / (scheme.beta * h**2),
+            lam=(b @ current.w + phi_p) / (scheme.beta * h**2) - (0.0 if soft is None else soft * current.lam),
             a=mass @ current.vdot + c_t @ current.v + k_t @ current.w + current.lam @ b + r_p,
         )
 

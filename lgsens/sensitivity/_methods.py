@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
-from lgsens.dynamics import State
+from lgsens.dynamics import State, require_independent
 from lgsens.integrate import GeneralizedAlpha, Stats, integrate, integrate_uneven
 from lgsens.sensitivity._adjoint import adjoint_sweep
 from lgsens.sensitivity._continuous_direct import continuous_direct_sweep
@@ -113,6 +113,7 @@ class ContinuousDirect(AbstractSensitivity):
     """
 
     def trajectory(self, scheme, num_steps, state0, parameters):
+        require_independent(parameters.system, "ContinuousDirect")
         return _decoded(_continuous_trajectory(scheme, num_steps, state0, parameters))
 
 

@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import State
-from lgsens.integrate import Constants, GeneralizedAlpha, Guess, Stats, take_step
+from lgsens.integrate import Constants, GeneralizedAlpha, Guess, Stats, margin_of, take_step
 from lgsens.sensitivity._criterion_terms import Functional
 from lgsens.sensitivity._direct import direct_step
 from lgsens.sensitivity._linearization import (
@@ -77,6 +77,8 @@ def direct_on_the_fly(
         earlier = factors if scheme.factor_every else None
         state, guess, stats = take_step(scheme, system, constants, previous, guess, earlier, running, t, h)
         converged, prepared = linearized_at(previous, state, t)
+        margin = margin_of(prepared.factors, prepared.tangents.constraint_jacobian, constants.scale)
+        stats = stats._replace(margin=margin)
 
         def along(delta, d: Parameters):
             loads = pseudo_loads(converged, parameters, d)

@@ -1,0 +1,140 @@
+"""`constraint_rank`: how many of the constraints are independent, and the joints that say the same."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from lgsens._errors import left_null_space, redundant_names
+from lgsens._simulate import as_system
+from lgsens.dynamics import AbstractSystem, assemble
+from lgsens.model import Model, MultibodySystem
+
+_DIRECTIONS = 4  # of motion, in which the neighbourhood of the reference is looked at
+_DISTANCE = 0.01  # how far, in rad or lengths of the scene
+_ITERATIONS = 20
+
+
+@dataclasses.dataclass(frozen=True)
+class ConstraintRank:
+    """Rank and freedom of a mechanism; `print` shows them.
+
+    Attributes:
+        coordinates: number of unknown coordinates k.
+        equations: number of constraint equations m.
+        rank: the rank of the constraint gradient B, in configurations near the reference.
+        reference_rank: that in the reference configuration; below `rank` where the reference is singular (a dead
+            centre, a linkage that lies flat).
+        joints: the names of the joints involved in redundant equations, sorted.
+    """
+
+    coordinates: int
+    equations: int
+    rank: int
+    reference_rank: int
+    joints: tuple[str, ...]
+
+    @property
+    def redundant(self) -> int:
+        """m − rank: equations that follow from the others."""
+        return self.equations - self.rank
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """k − rank, those that the mechanism has; Grübler's count, k − m, is less where equations are redundant."""
+        return self.coordinates - self.rank
+
+    @property
+    def singular(self) -> bool:
+        """Whether the reference is a singular configuration."""
+        return self.reference_rank < self.rank
+
+    def __str__(self) -> str:
+        rows = [
+            ("Unknown coordinates", self.coordinates),
+            ("Constraint equations", self.equations),
+            ("Independent of them", self.rank),
+            ("Degrees of freedom", self.degrees_of_freedom),
+        ]
+        lines = [f"{what:<24}{number:>5}" for what, number in rows]
+        if self.joints:
+            lines.append(f"Redundant equations in  {', '.join(self.joints)}")
+        if self.singular:
+            lines.append(f"The reference configuration is singular: rank {self.reference_rank}")
+        return "\n".join(lines)
+
+
+def constraint_rank(model: Model | AbstractSystem) -> ConstraintRank:
+    """How many constraint equations of a model are independent, and which joints share the others.
+
+        rank B(q) near the reference configuration,     n ≠ 0 with Bᵀn = 0: redundant, with weight in the joints of n
+
+    Arguments:
+        model: the scene, or an `AbstractSystem`; its numbers known, not traced.
+
+    The rank is the largest found in the reference configuration and in four that the mechanism reaches by moving from
+    it by 0.01 rad or lengths of the scene: in a singular reference configuration alone it would be too small, and
+    equations would seem redundant that are not.
+    """
+    system = as_system(model)
+    if isinstance(system, MultibodySystem):
+        system = dataclasses.replace(system, minimum_norm=True)  # which can be assembled whatever its rank
+    q, _ = _assembled(system)
+    _, jacobian = _evaluated(system, q)
+    first = jacobian
+    reference_rank = rank = left_null_space(jacobian)[1]
+    for direction in np.random.default_rng(0).normal(size=(_DIRECTIONS, jacobian.shape[1])):
+        moved = _moved(system, q, direction)
+        if moved is not None and left_null_space(moved)[1] > rank:
+            jacobian, rank = moved, left_null_space(moved)[1]
+    m, k = first.shape
+    names = tuple(redundant_names(jacobian, system.constraint_names))
+    return ConstraintRank(k, m, rank, reference_rank, names)
+
+
+def _moved(system: AbstractSystem, q, direction):
+    """B in a configuration near q along a direction, if there is one."""
+    scale = np.asarray(system.coordinate_scale())
+    violation, jacobian = _evaluated(system, q)
+    # the part of the direction that the constraints allow, in comparable coordinates
+    rows = jacobian * scale
+    x = direction - np.linalg.lstsq(rows, rows @ direction, rcond=None)[0]
+    size = np.abs(x).max(initial=0.0)
+    if size < 1e-6:  # no freedom
+        return None
+    q = _retracted(system, q, _DISTANCE * scale * x / size)
+    tolerance = 1e3 * np.finfo(scale.dtype).eps * max(scale.max(), 1.0)
+    for _ in range(_ITERATIONS):
+        violation, jacobian = _evaluated(system, q)
+        if np.abs(violation).max(initial=0.0) <= tolerance:
+            return jacobian
+        # singular values that the distance does not explain belong to redundant equations
+        step = np.linalg.lstsq(jacobian * scale, violation, rcond=1e-2 * _DISTANCE)[0]
+        q = _retracted(system, q, -scale * step)
+    return None
+
+
+@eqx.filter_jit
+def _assembled(system):
+    return assemble(system)
+
+
+@eqx.filter_jit
+def _value_and_jacobian(system, q):
+    return system.constraint(q), system.constraint_jacobian(q)
+
+
+def _evaluated(system, q) -> tuple[np.ndarray, np.ndarray]:
+    """Φ and B."""
+    violation, jacobian = _value_and_jacobian(system, q)
+    return np.asarray(violation), np.asarray(jacobian)
+
+
+@eqx.filter_jit
+def _retract(system, q, x):
+    return system.group.retract(q, x)
+
+
+def _retracted(system, q, x):
+    return _retract(system, q, jax.numpy.asarray(x))

@@ -1,0 +1,64 @@
+"""Singular configurations: where B loses rank during the motion (a parallelogram linkage that lies flat).
+
+There the constraints do not determine the motion: branches meet. A time step jumps over such a point and goes on along
+one of them, often the right one, while the derivatives by lengths are those of a branch point: infinite. Nothing
+in the step shows it, as its equations are regular on both sides.
+
+Let y be a fixed displacement, and S [x; μ] = [0; B y], that is B A⁻¹ Bᵀ μ = −B y (up to T and O(h)). With the singular
+values σ_i of B A^{-1/2} and its singular vectors μ is the sum of the u_i (v_i · A^{1/2} y)/σ_i: where the smallest
+falls to zero, so does the margin
+
+    m = 1/|μ| ∝ σ_min,
+
+linearly in time on both sides of the singular point, without any part along redundant equations. Two successive steps
+with 2 m_n ≤ m_{n−1} say that it would be zero before the next one. A motion that passes a singular configuration at
+a distance has a minimum of m instead, which steps that resolve it see as such.
+
+m costs one product with the inverse that many steps share. Where m falls so fast that it would be zero before two such
+inverses are over, every step has its own.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lgsens.linear import Factors, Matrix
+
+_SMALL = 0.1  # margins above this fraction of the largest of a run are no sign: B may turn by radians in a step
+
+
+def margin_of(factors: Factors, jacobian: Matrix, scale: Float[Array, " k"]) -> Float[Array, ""]:
+    """m, by the factors of S; NaN after a failure."""
+    if not jacobian.shape[0]:
+        return jnp.full((), jnp.inf, scale.dtype)
+    y = scale * jnp.asarray(np.random.default_rng(0).normal(size=scale.shape), scale.dtype)
+    _, mu = factors.solve(jnp.zeros_like(scale), jacobian @ y)
+    return 1.0 / jnp.sqrt(jnp.sum(mu**2))
+
+
+class Watch(NamedTuple):
+    """The margin when it was last known, and its change per step then."""
+
+    margin: Float[Array, ""]
+    slope: Float[Array, ""]
+
+    @classmethod
+    def first(cls, dtype) -> "Watch":
+        return cls(jnp.full((), jnp.inf, dtype), jnp.zeros((), dtype))
+
+    def after(self, margin, age) -> "Watch":
+        """With a margin known `age` steps later; the slope to the first one is −inf, which asks for another at once."""
+        return Watch(margin, (margin - self.margin) / age)
+
+    def ends_within(self, steps):
+        """Whether the margin would be zero so many steps later."""
+        return self.margin + self.slope * steps <= 0.0
+
+
+def singular_steps(margins: Float[Array, " n"]):
+    """For each step whether a singular configuration is passed in it or in the next; margins not known are NaN."""
+    before = jnp.concatenate([jnp.full(1, jnp.nan, margins.dtype), margins[:-1]])
+    largest = jnp.nanmax(margins)
+    return (2.0 * margins <= before) & (margins <= _SMALL * largest)

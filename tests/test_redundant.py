@@ -1,0 +1,247 @@
+"""Redundant constraints: motion, multipliers of least norm, gradients; against mechanisms without them and NumPy."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lgsens as lg
+from lgsens.examples import four_bar
+from lgsens.integrate import singular_steps
+from tests.helpers import says
+
+Z = np.array([0.0, 0.0, 1.0])
+EXACT = lg.GeneralizedAlpha(0.8, tolerance=1e-13)
+
+
+def door(p, hinges=2, redundant="minimum_norm"):
+    """A door 2 m high that swings about a leaning axis, on two hinges as far from the middle, or on one there."""
+    mass, width, lean, spread = p["mass"], p["width"], p["lean"], p["spread"]
+    axis = jnp.stack([jnp.sin(lean), 0.0 * lean, jnp.cos(lean)])
+    across = jnp.stack([0.0 * lean, 1.0 + 0.0 * lean, 0.0 * lean])
+    third = jnp.cross(axis, across)
+    turn = jnp.stack([across, third, axis], axis=1)  # columns: the axes of the door
+    inertia = mass / 12.0 * jnp.stack([0.0 * width + 4.0, width**2 + 4.0, width**2])
+    body = lg.RigidBody(
+        mass, inertia, width / 2.0 * across, turn, angular_velocity=1.5 * Z, velocity=0.75 * width * third
+    )
+    at = {"lower": -spread * axis, "upper": spread * axis} if hinges == 2 else {"only": jnp.zeros(3)}
+    joints = {name: lg.RevoluteJoint(None, "door", at=point, axis=axis) for name, point in at.items()}
+    return lg.Model(
+        {"door": body},
+        joints,
+        {"gravity": lg.Gravity((0.0, 0.0, -9.81))},
+        redundant=redundant if hinges == 2 else "refuse",
+    )
+
+
+DOOR = {name: jnp.asarray(number) for name, number in {"mass": 20.0, "width": 0.9, "lean": 0.3, "spread": 0.6}.items()}
+
+
+def planar(redundant, **numbers):
+    """The four-bar in its own form of 17 equations, or of four revolute joints: 20 equations of rank 17."""
+    model = four_bar(**numbers)
+    if not redundant:
+        return model
+    joints = dict(model.joints)
+    for name, a, b in (("B", "crank", "coupler"), ("C", "coupler", "rocker")):
+        pin = joints[name]
+        assert isinstance(pin, lg.SphericalJoint | lg.UniversalJoint)
+        joints[name] = lg.RevoluteJoint(a, b, at=pin.at, axis=Z)
+    return lg.Model(model.bodies, joints, model.forces, redundant="minimum_norm")
+
+
+CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, -1, 0), (1, -1, 1), (0, -1, 1), (0, 0, 1)], float)
+
+
+def bricard(mass=1.0, size=1.0, relaxed=None, redundant="minimum_norm"):
+    """The Bricard mechanism of the IFToMM benchmarks: five rods on edges of a cube and the ground, six revolute joints.
+
+    Each of the axes is orthogonal to both rods; `relaxed`: the joint that is cylindrical instead.
+    """
+    corners = size * jnp.asarray(CORNERS)
+    rods = jnp.roll(corners, -1, axis=0) - corners
+    bodies, joints = {}, {}
+    names = [*(f"rod {i}" for i in range(5)), None]
+    for i, name in enumerate(names):
+        along = rods[i] / size
+        kind = lg.CylindricalJoint if i == relaxed else lg.RevoluteJoint
+        joints[f"hinge {i}"] = kind(names[i - 1], name, at=corners[i], axis=jnp.cross(rods[i - 1], rods[i]))
+        if name is not None:
+            inertia = mass * size**2 / 12.0 * (jnp.eye(3) - 0.99 * jnp.outer(along, along))
+            bodies[name] = lg.RigidBody(mass, inertia, (corners[i] + corners[(i + 1) % 6]) / 2.0)
+    return lg.Model(bodies, joints, {"gravity": lg.Gravity((0.0, -9.81, 0.0))}, redundant=redundant)
+
+
+MOTION = ("position", "velocity", "acceleration", "angular_velocity", "angular_acceleration")
+
+
+def same_motion(one, other, tolerance):
+    for body in one.system.body_names:
+        for what in MOTION:
+            a, b = getattr(one.body(body), what), getattr(other.body(body), what)
+            np.testing.assert_allclose(
+                a, b, rtol=0, atol=tolerance * (1.0 + jnp.abs(b).max()), err_msg=f"{body} {what}"
+            )
+
+
+def least_norm(trajectory, n):
+    """λ at step n by NumPy's pseudo-inverse, with moments divided by the radius of gyration."""
+    system = trajectory.system
+    q = jax.tree.map(lambda leaf: leaf[n], trajectory.states.q)
+    jacobian = np.asarray(system.constraint_jacobian(q))
+    gyration = np.sqrt(np.mean(np.trace(system.inertia, axis1=1, axis2=2)) / 3.0 / np.mean(system.mass))
+    # rows of points move with translations, rows of axes do not
+    columns = system.index[:, :3].ravel()
+    arm = np.where(np.abs(jacobian[:, columns]).max(axis=1) > 0.0, 1.0, gyration)
+    return arm * (np.linalg.pinv((jacobian * arm[:, None]).T, rcond=1e-9) @ (trajectory.states.lam[n] @ jacobian))
+
+
+def multipliers(trajectory, n):
+    system = trajectory.system
+    lam = np.zeros(len(system.constraint_names))
+    for name in set(system.constraint_names):
+        lam[system.multiplier_rows(name)] = trajectory.multiplier(name)[n]
+    return lam
+
+
+def test_a_door_on_two_hinges_moves_like_one_on_one_and_loads_both():
+    two, one = (lg.simulate(door(DOOR, hinges), t1=0.5, num_steps=100, integrator=EXACT) for hinges in (2, 1))
+    # joints give way by 1e-7 of what the scheme is off in a step
+    same_motion(two, one, 1e-7)
+    upper, lower = two.multiplier("upper"), two.multiplier("lower")
+    single = one.multiplier("only")
+    assert jnp.abs(single[:, :3]).max() > 150.0  # nearly the weight
+    np.testing.assert_allclose(upper[:, :3] + lower[:, :3], single[:, :3], rtol=0, atol=1e-5)
+    # the load along the axis and the moments in equal shares
+    axis = np.array([np.sin(0.3), 0.0, np.cos(0.3)])
+    np.testing.assert_allclose(upper[:, :3] @ axis, lower[:, :3] @ axis, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(upper[:, 3:], lower[:, 3:], rtol=0, atol=1e-7)
+    for n in (0, 50, 100):
+        # the round-off of λ that the projection leaves, and that of the pseudo-inverse
+        np.testing.assert_allclose(multipliers(two, n), least_norm(two, n), rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("route", [lg.IndexReducedODE(), lg.Richardson(EXACT)])
+def test_other_integrators_take_redundant_constraints(route):
+    two, one = (lg.simulate(door(DOOR, hinges), t1=0.1, num_steps=20, integrator=route) for hinges in (2, 1))
+    same_motion(two, one, 1e-6)  # the index-reduced route: 1e-10
+
+
+def criteria(scene, p, method, where):
+    run = lg.simulate(scene(p), t1=p["t1"], num_steps=16, integrator=EXACT, sensitivity=method)
+    body, joint = where
+    force = run.multiplier(joint)
+    motion = run.body(body)
+    return jnp.stack(
+        [
+            lg.time_integral(run.t, motion.position[:, 0] ** 2),
+            lg.time_integral(run.t, motion.acceleration[:, 1] ** 2),
+            jnp.sum(force[-1, :3]) + force[-1, -1],
+        ]
+    )
+
+
+def fourth_order_difference(function, p, name, step):
+    at = lambda s: function(p | {name: p[name] * (1.0 + s * step)})
+    return (8.0 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12.0 * step * p[name])
+
+
+def check_gradients(scene, p, where, tolerance):
+    value = partial(criteria, scene, where=where)
+    exact = jax.jit(lambda p: value(p, lg.DirectDifferentiation()))
+    forward = jax.jacfwd(exact)(p)
+    reverse = jax.jit(jax.jacrev(lambda p: value(p, lg.AdjointVariable())))(p)
+    for name in p:
+        scale = 1.0 + np.abs(forward[name])
+        np.testing.assert_allclose(reverse[name] / scale, forward[name] / scale, rtol=0, atol=tolerance, err_msg=name)
+        difference = fourth_order_difference(exact, p, name, 1e-3)
+        np.testing.assert_allclose(difference / scale, forward[name] / scale, rtol=0, atol=tolerance, err_msg=name)
+    return forward
+
+
+def test_gradients_of_the_door_in_both_modes():
+    # round-off of λ, 1e-9 of 200 N, over a relative step of 1e-3
+    check_gradients(door, DOOR | {"t1": jnp.asarray(0.2)}, ("door", "upper"), 1e-6)
+
+
+@pytest.mark.slow
+def test_a_four_bar_of_revolute_joints_is_the_planar_one():
+    p = {name: jnp.asarray(number) for name, number in {"a": 0.3, "m3": 2.0, "th0": 1.2, "w0": 5.0, "t1": 0.1}.items()}
+    build = lambda redundant: lambda p: planar(redundant, **{name: p[name] for name in p if name != "t1"})
+    one, other = (lg.simulate(build(redundant)(p), t1=0.1, num_steps=50) for redundant in (True, False))
+    same_motion(one, other, 1e-6)
+    where = ("coupler", "A")  # revolute in both: but out of the plane of 5e-8 of the largest moments
+    found = check_gradients(build(True), p, where, 1e-6)
+    plain = jax.jacfwd(lambda p: criteria(build(False), p, lg.DirectDifferentiation(), where))(p)
+    for name in p:
+        np.testing.assert_allclose(found[name][:2], plain[name][:2], rtol=1e-6, atol=1e-6, err_msg=name)
+
+
+def test_rank_of_bricard_and_door():
+    found = lg.constraint_rank(bricard())
+    assert (found.coordinates, found.equations, found.rank, found.reference_rank) == (30, 30, 29, 29)
+    assert (found.redundant, found.degrees_of_freedom, found.singular) == (1, 1, False)
+    assert found.joints == tuple(f"hinge {i}" for i in range(6))
+    assert "Degrees of freedom          1" in str(found) and "hinge 0, hinge 1" in str(found)
+    assert lg.constraint_rank(door(DOOR, redundant="refuse")).joints == ("lower", "upper")
+    assert lg.constraint_rank(door(DOOR, hinges=1)).redundant == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [lg.DenseLU(), lg.BlockSparse()])
+def test_bricard_moves_like_its_variant_with_a_cylindrical_joint(solver):
+    model = eqx.tree_at(lambda m: m.linear_solver, bricard(), solver, is_leaf=lambda x: x is None)
+    one = lg.simulate(model, t1=1.0, num_steps=500)
+    other = lg.simulate(bricard(relaxed=2, redundant="refuse"), t1=1.0, num_steps=500)
+    assert jnp.abs(one.body("rod 2").position[-1] - one.body("rod 2").position[0]).max() > 0.6
+    same_motion(one, other, 1e-7)  # accelerations carry round-off/(βh²) = 2e-10, amplified by the mechanism
+    for n in (0, 250, 500):
+        np.testing.assert_allclose(multipliers(one, n), least_norm(one, n), rtol=0, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_gradients_of_bricard():
+    p = {"mass": jnp.asarray(1.2), "size": jnp.asarray(0.9), "t1": jnp.asarray(0.4)}
+    check_gradients(lambda p: bricard(p["mass"], p["size"]), p, ("rod 2", "hinge 3"), 1e-6)
+
+
+def test_what_cannot_take_redundant_constraints_says_so():
+    with pytest.raises(ValueError, match=says("`redundant` must be one of", "'maybe'")):
+        door(DOOR, redundant="maybe")
+    with pytest.raises(ValueError, match=says("ContinuousDirect needs independent constraints", "AdjointVariable()")):
+        lg.simulate(door(DOOR), t1=0.1, num_steps=4, sensitivity=lg.ContinuousDirect())
+    with pytest.raises(ValueError, match=says("AdaptiveSteps needs independent constraints", "equal steps")):
+        lg.simulate(door(DOOR), t1=0.1, num_steps=4, integrator=lg.AdaptiveSteps())
+    with pytest.raises(ValueError, match=says("redundant='minimum_norm'")):
+        lg.simulate(door(DOOR, redundant="refuse"), t1=0.1, num_steps=4)
+
+
+def parallelogram(th0, b=0.9, c=0.3):
+    """Crank and rocker of equal lengths: it lies flat at th = π, in a singular configuration."""
+    return four_bar(a=0.3, b=b, c=c, d=0.9, k=0.0, cd=0.0, g=0.0, th0=th0, m4=1.0)
+
+
+@pytest.mark.parametrize("factor_every", [20, 0])
+def test_a_parallelogram_through_its_dead_centre_is_said_to_be_singular(factor_every):
+    scheme = lg.GeneralizedAlpha(0.8, factor_every=factor_every)
+    with pytest.raises(lg.SimulationError, match=says("passes a singular configuration", "of 100, t = 0.0")):
+        lg.simulate(parallelogram(2.8), t1=0.1, num_steps=100, integrator=scheme)
+    found = lg.simulate(parallelogram(2.8), t1=0.1, num_steps=100, integrator=scheme, throw=False)
+    assert found.result == lg.RESULTS.singular_configuration
+    # at 5 rad/s it is flat after (π − 2.8)/5 = 0.0683 s, in step 69
+    assert int(jnp.argmax(singular_steps(found.stats.margin))) in (67, 68)
+    assert jnp.all(jnp.isfinite(found.body("coupler").position))
+    # before it nothing is wrong; nor with lengths that leave b + c longer than the 1.2 m to the pin by 1 cm
+    assert lg.simulate(parallelogram(2.8), t1=0.06, num_steps=100, integrator=scheme).result == 0
+    near = lg.simulate(parallelogram(2.8, b=0.88, c=0.33), t1=0.1, num_steps=100, integrator=scheme)
+    assert jnp.nanmin(near.stats.margin) < 0.5 * jnp.nanmax(near.stats.margin)
+
+
+def test_a_reference_that_lies_flat_is_singular():
+    found = lg.constraint_rank(parallelogram(np.pi))
+    assert found.singular and found.rank == found.reference_rank + 1 and not found.joints
+    assert "singular" in str(found)
