@@ -18,10 +18,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from lgsens.dynamics import AbstractSystem, State, mass_matrix, tangents
-from lgsens.integrate._scheme import GeneralizedAlpha, advance, factorize_iteration_matrix, increment
+from lgsens.dynamics import AbstractSystem, State, mass_matrix
+from lgsens.integrate._scheme import AbstractStep, GeneralizedAlpha, Index3Step, Motion, increment
+from lgsens.integrate._stabilized import StabilizedFactors, StabilizedStep
 from lgsens.linear import Factors, Inverse, Matrix
 
+Solver = Factors | StabilizedFactors
 _MODIFIED_LIMIT = 12  # iterations; more cost as much as a full one
 _SLOW = 0.1  # the contraction from which on a new matrix pays, in the next step
 _STALLED = 0.3  # that from which on two full iterations cost less
@@ -49,10 +51,20 @@ class Constants(NamedTuple):
 
     mass: Matrix  # M, (k, k)
     scale: Float[Array, " k"]
+    inverse_mass: Matrix = None  # M⁻¹, (k, k), where the scheme is stabilized; M is dense there
 
     @classmethod
-    def of(cls, system: AbstractSystem) -> "Constants":
+    def of(cls, system: AbstractSystem, *, stabilized: bool = False) -> "Constants":
+        if stabilized:
+            mass = system.mass_matrix()
+            return cls(mass, system.coordinate_scale(), jnp.linalg.inv(mass))
         return cls(mass_matrix(system), system.coordinate_scale())
+
+    def step(self, scheme: GeneralizedAlpha, system: AbstractSystem, previous: State, h) -> AbstractStep:
+        """The equations of the step from `previous`."""
+        if scheme.stabilized:
+            return StabilizedStep.of(scheme, system, self.mass, self.inverse_mass, previous, h)
+        return Index3Step(scheme, system, self.mass, previous, h)
 
 
 class Guess(NamedTuple):
@@ -92,7 +104,7 @@ def take_step(
     constants: Constants,
     previous: State,
     guess: Guess,
-    earlier: Factors | None,
+    earlier: Solver | None,
     running,
     t,
     h,
@@ -101,22 +113,17 @@ def take_step(
 
     `earlier` solves with the iteration matrix of an earlier step, for modified Newton; None: full Newton only.
     """
-    mass, scale = constants
+    scale, equations = constants.scale, constants.step(scheme, system, previous, h)
     eps = float(jnp.finfo(scale.dtype).eps)
     tolerance = max(scheme.tolerance, 64 * eps)
     target = max(tolerance**2, 0.04 * eps)
 
-    def corrected(factors: Factors | None, iterate: _Iterate) -> _Iterate:
-        motion = advance(scheme, system, previous, iterate.u, h)
-        point = (motion.q, motion.v, motion.vdot, iterate.lam, t)
-        residual = system.residual(*point)
-        violation = system.constraint(motion.q) / (scheme.beta * h**2)
-        if factors is None:
-            solver = factorize_iteration_matrix(scheme, system, tangents(system, *point), mass, motion.x, h)
-        else:
-            solver = factors
+    def corrected(factors: Solver | None, iterate: _Iterate) -> _Iterate:
+        motion = equations.motion(iterate.u, iterate.lam)
+        residual, violation = equations.defect(motion, iterate.lam, t)
+        solver = equations.factors(motion, iterate.lam, t) if factors is None else factors
         du, dlam = solver.solve(residual, violation)
-        size = jnp.max(jnp.abs(du) * (scheme.beta * h**2) / scale)
+        size = jnp.max(equations.change(du, dlam) * (scheme.beta * h**2) / scale)
         measured = (iterate.iterations > 1) & (iterate.before > 64 * eps)  # increments below are round-off
         ratio = jnp.sqrt(size / jnp.where(measured, iterate.before, 1.0))
         contraction = jnp.where(measured, jnp.maximum(ratio, _FASTEST), iterate.contraction)
@@ -140,7 +147,10 @@ def take_step(
     iterate = _Iterate(u, lam, infinite, infinite, guess.contraction, infinite, none, no)
     contraction = guess.contraction
     before = none
-    if earlier is not None:
+    if scheme.iterations is not None:
+        iterate = lax.fori_loop(0, scheme.iterations, lambda _, iterate: corrected(earlier, iterate), iterate)
+        iterate = iterate._replace(iterations=jnp.where(running, iterate.iterations, 0))
+    elif earlier is not None:
         iterate = lax.while_loop(contracting, partial(corrected, earlier), iterate)
         closer = iterate.contraction < 1.0
         contraction = jnp.where(jnp.isfinite(iterate.contraction), iterate.contraction, 1.0)
@@ -156,8 +166,9 @@ def take_step(
             iterations=none,
             settled=no,
         )
-    iterate = lax.while_loop(unfinished, partial(corrected, None), iterate)
-    motion = advance(scheme, system, previous, iterate.u, h)
+    if scheme.iterations is None:
+        iterate = lax.while_loop(unfinished, partial(corrected, None), iterate)
+    motion = equations.motion(iterate.u, iterate.lam)
     state = State(q=motion.q, v=motion.v, vdot=motion.vdot, lam=iterate.lam, a=iterate.u)
     finite = jnp.all(jnp.isfinite(iterate.u)) & jnp.all(jnp.isfinite(iterate.lam))
     converged = running & (iterate.increment <= tolerance) & finite
@@ -219,12 +230,11 @@ def integrate_onward(
     The steps are those of one long run where n of the mark is a multiple of `factor_every`: the inverse of the
     iteration matrix is due there, and is not part of the mark.
     """
-    constants = Constants.of(system)
+    constants = Constants.of(system, stabilized=scheme.stabilized)
 
-    def inverse(state: State, n) -> Factors:
-        at_state = tangents(system, state.q, state.v, state.vdot, state.lam, t0 + n * h)
-        x = increment(scheme, state, state.a, h)
-        return factorize_iteration_matrix(scheme, system, at_state, constants.mass, x, h, Inverse)
+    def inverse(state: State, n) -> Solver:
+        at_state = Motion(increment(scheme, state, state.a, h), state.q, state.v, state.vdot)
+        return constants.step(scheme, system, state, h).factors(at_state, state.lam, t0 + n * h, Inverse)
 
     def step(carry, n):
         previous, guess, earlier, age, running = carry
@@ -232,7 +242,9 @@ def integrate_onward(
             # A matrix that contracts slowly is renewed, unless it was new: then full Newton takes over. In a batch
             # every lane pays for the slowest; for its full iterations it would pay more. A loop of no or one turn,
             # because `cond` would copy the inverse.
-            due = (jnp.mod(n, scheme.factor_every) == 0) | ((guess.contraction >= _SLOW) & (age > 1))
+            due = jnp.mod(n, scheme.factor_every) == 0
+            if scheme.iterations is None:  # else by the clock, which is the same in all lanes
+                due = due | ((guess.contraction >= _SLOW) & (age > 1))
             age = jnp.where(due, 0, age) + 1
             renewed = lambda carry: (jnp.zeros((), bool), inverse(previous, n))
             _, earlier = lax.while_loop(lambda carry: carry[0], renewed, (due, earlier))
