@@ -219,7 +219,7 @@ def _differentiate_jit(criteria, names, build, start, p, t0, t1, num_steps, inte
         found = _differences(task, flat, method)
     elif isinstance(method, ContinuousAdjoint):
         found = _continuous_adjoint(task, flat, method, uses)
-    elif isinstance(method, DirectDifferentiation):
+    elif isinstance(method, DirectDifferentiation) and integrator.iterations is None and not integrator.stabilized:
         found = _on_the_fly(task, flat)
     else:
         found = _through_the_trajectory(task, flat, method)

@@ -1,5 +1,6 @@
 """The initial state of a model, as the scheme starts from it."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -51,12 +52,16 @@ def _started(integrator: GeneralizedAlpha, system: AbstractSystem, initial: Init
     (`missed_increment`). The constraint at t_{n+1} takes B c h³ out again, through the velocity once the scheme is
     under way: B v_n = −h² B c there. Started with B v_0 = 0 it must do so through the first accelerations, and λ is
     off by O(h) for some steps. So v_0 receives h² P c, P the M-orthogonal projection on the constraint directions.
-    Where constraints may be redundant, the joints start with what they give way in a step.
+    Stabilized index 2 keeps B v = 0, and takes B c h³ out by its correction. Where constraints may be redundant, the
+    joints start with what they give way in a step.
     """
     if not integrator.second_order_start:
         return initial.state
     state = initial.state
     delta = integrator.alpha_m - integrator.alpha_f
+    a = state.vdot + (delta * h) * initial.jerk
+    if integrator.stabilized:
+        return dataclasses.replace(state, a=a)
     missed = missed_increment(integrator, system, state.v, state.vdot, initial.jerk)
     _, normal = split_velocity(system, state.q, missed)
     return State(
@@ -64,5 +69,5 @@ def _started(integrator: GeneralizedAlpha, system: AbstractSystem, initial: Init
         v=state.v + h**2 * normal,
         vdot=state.vdot,
         lam=state.lam,
-        a=state.vdot + (delta * h) * initial.jerk,
+        a=a,
     )

@@ -73,6 +73,8 @@ def check_uneven(integrator: UnevenIntegrator, num_steps: int, sensitivity, save
         raise ValueError(
             f"`num_steps` = {num_steps}, but GivenSteps has {integrator.num_steps}; give `integrator.num_steps`."
         )
+    if integrator.integrator.stabilized:
+        raise ValueError(f"{name}: `integrator` must be of index 3; leave `stabilized` out, or take equal steps.")
     if not isinstance(sensitivity, DirectDifferentiation | AdjointVariable):
         raise ValueError(
             f"`sensitivity` = {sensitivity!r} needs equal steps; with {name} DirectDifferentiation() or "

@@ -255,6 +255,8 @@ def test_bad_input():
         run(given, num_steps=3)
     with pytest.raises(ValueError, match=says("`save`", "equal steps", "GivenSteps")):
         run(given, num_steps=2, save=lambda s: s.t)
+    with pytest.raises(ValueError, match=says("AdaptiveSteps", "`stabilized`", "equal steps")):
+        run(lg.AdaptiveSteps(lg.GeneralizedAlpha(stabilized=True)), num_steps=3)
     with pytest.raises(ValueError, match=says("`sensitivity`", "equal steps", "AdaptiveSteps")):
         run(lg.AdaptiveSteps(), num_steps=3, sensitivity=lg.Autodiff())
     with pytest.raises(ValueError, match=says("checkpoints")):

@@ -18,10 +18,20 @@ from lgsens.integrate._integrate import (
 )
 from lgsens.integrate._scheme import (
     GeneralizedAlpha as GeneralizedAlpha,
+    Motion as Motion,
     advance as advance,
     factorize_iteration_matrix as factorize_iteration_matrix,
     increment as increment,
     missed_increment as missed_increment,
 )
 from lgsens.integrate._singular import margin_of as margin_of, singular_steps as singular_steps
+from lgsens.integrate._stabilized import (
+    StabilizedFactors as StabilizedFactors,
+    StabilizedStep as StabilizedStep,
+    StabilizedTangents as StabilizedTangents,
+    by_configuration as by_configuration,
+    halves as halves,
+    with_corrections as with_corrections,
+    without_corrections as without_corrections,
+)
 from lgsens.integrate._uneven import integrate_uneven as integrate_uneven, moved as moved

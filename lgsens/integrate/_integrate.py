@@ -19,11 +19,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from lgsens.dynamics import AbstractSystem, State, mass_matrix, softness, tangents
-from lgsens.integrate._scheme import GeneralizedAlpha, advance, factorize_iteration_matrix, increment
-from lgsens.integrate._singular import Watch, margin_of
+from lgsens.dynamics import AbstractSystem, State, mass_matrix, require_independent, softness
+from lgsens.integrate._scheme import AbstractStep, GeneralizedAlpha, Index3Step, Motion, increment
+from lgsens.integrate._singular import Watch
+from lgsens.integrate._stabilized import StabilizedFactors, StabilizedStep
 from lgsens.linear import Factors, Inverse, Matrix
 
+Solver = Factors | StabilizedFactors
 _MODIFIED_LIMIT = 12  # iterations; more cost as much as a full one
 SLOW = 0.1  # the contraction from which on a new matrix pays, in the next step
 _STALLED = 0.3  # that from which on two full iterations cost less
@@ -56,10 +58,22 @@ class Constants(NamedTuple):
     mass: Matrix  # M, (k, k)
     scale: Float[Array, " k"]
     softness: Float[Array, " m"] | None  # c; None: no constraint may be redundant
+    inverse_mass: Matrix = None  # M⁻¹, (k, k), where the scheme is stabilized; M is dense there
 
     @classmethod
-    def of(cls, system: AbstractSystem) -> "Constants":
-        return cls(mass_matrix(system), system.coordinate_scale(), softness(system))
+    def of(cls, system: AbstractSystem, *, stabilized: bool = False) -> "Constants":
+        scale = system.coordinate_scale()
+        if stabilized:
+            require_independent(system, "GeneralizedAlpha(stabilized=True)")
+            mass = system.mass_matrix()
+            return cls(mass, scale, None, jnp.linalg.inv(mass))
+        return cls(mass_matrix(system), scale, softness(system))
+
+    def step(self, scheme: GeneralizedAlpha, system: AbstractSystem, previous: State, h) -> AbstractStep:
+        """The equations of the step from `previous`."""
+        if scheme.stabilized:
+            return StabilizedStep.of(scheme, system, self.mass, self.inverse_mass, previous, h)
+        return Index3Step(scheme, system, self.mass, self.scale, self.softness, previous, h)
 
 
 class Guess(NamedTuple):
@@ -103,7 +117,7 @@ def take_step(
     constants: Constants,
     previous: State,
     guess: Guess,
-    earlier: Factors | None,
+    earlier: Solver | None,
     running,
     t,
     h,
@@ -112,26 +126,17 @@ def take_step(
 
     `earlier` solves with the iteration matrix of an earlier step, for modified Newton; None: full Newton only.
     """
-    mass, scale, soft = constants
+    scale, equations = constants.scale, constants.step(scheme, system, previous, h)
     eps = float(jnp.finfo(scale.dtype).eps)
     tolerance = max(scheme.tolerance, 64 * eps)
     target = max(tolerance**2, 0.04 * eps)
 
-    def corrected(factors: Factors | None, iterate: _Iterate) -> _Iterate:
-        motion = advance(scheme, system, previous, iterate.u, h)
-        point = (motion.q, motion.v, motion.vdot, iterate.lam, t)
-        residual = system.residual(*point)
-        violation = system.constraint(motion.q) / (scheme.beta * h**2)
-        if soft is not None:
-            violation = violation - soft * iterate.lam
-        if factors is None:
-            at_point = tangents(system, *point)
-            solver = factorize_iteration_matrix(scheme, system, at_point, mass, motion.x, h)
-            margin = iterate.margin if earlier is not None else margin_of(solver, at_point.constraint_jacobian, scale)
-        else:
-            solver, margin = factors, iterate.margin
+    def corrected(factors: Solver | None, iterate: _Iterate) -> _Iterate:
+        motion = equations.motion(iterate.u, iterate.lam)
+        residual, violation = equations.defect(motion, iterate.lam, t)
+        solver, margin = equations.factors(motion, iterate.lam, t) if factors is None else (factors, iterate.margin)
         du, dlam = solver.solve(residual, violation)
-        size = jnp.max(jnp.abs(du) * (scheme.beta * h**2) / scale)
+        size = jnp.max(equations.change(du, dlam) * (scheme.beta * h**2) / scale)
         measured = (iterate.iterations > 1) & (iterate.before > _ROUGH * eps)
         ratio = jnp.sqrt(size / jnp.where(measured, iterate.before, 1.0))
         contraction = jnp.where(measured, jnp.maximum(ratio, _FASTEST), iterate.contraction)
@@ -157,7 +162,10 @@ def take_step(
     iterate = _Iterate(u, lam, infinite, infinite, guess.contraction, infinite, none, no, unknown)
     contraction = guess.contraction
     before = none
-    if earlier is not None:
+    if scheme.iterations is not None:
+        iterate = lax.fori_loop(0, scheme.iterations, lambda _, iterate: corrected(earlier, iterate), iterate)
+        iterate = iterate._replace(iterations=jnp.where(running, iterate.iterations, 0))
+    elif earlier is not None:
         iterate = lax.while_loop(contracting, partial(corrected, earlier), iterate)
         closer = iterate.contraction < 1.0
         contraction = jnp.where(jnp.isfinite(iterate.contraction), iterate.contraction, 1.0)
@@ -174,8 +182,9 @@ def take_step(
             settled=no,
             margin=unknown,
         )
-    iterate = lax.while_loop(unfinished, partial(corrected, None), iterate)
-    motion = advance(scheme, system, previous, iterate.u, h)
+    if scheme.iterations is None:
+        iterate = lax.while_loop(unfinished, partial(corrected, None), iterate)
+    motion = equations.motion(iterate.u, iterate.lam)
     state = State(q=motion.q, v=motion.v, vdot=motion.vdot, lam=iterate.lam, a=iterate.u)
     finite = jnp.all(jnp.isfinite(iterate.u)) & jnp.all(jnp.isfinite(iterate.lam))
     converged = running & (iterate.increment <= tolerance) & finite
@@ -186,12 +195,10 @@ def take_step(
 
 def inverse_at(
     scheme: GeneralizedAlpha, system: AbstractSystem, constants: Constants, state: State, t, h
-) -> tuple[Factors, Float[Array, ""]]:
+) -> tuple[Solver, Float[Array, ""]]:
     """The inverse of the iteration matrix of a step of size h from here, for modified Newton; its margin."""
-    at_state = tangents(system, state.q, state.v, state.vdot, state.lam, t)
-    x = increment(scheme, state, state.a, h)
-    factors = factorize_iteration_matrix(scheme, system, at_state, constants.mass, x, h, Inverse)
-    return factors, margin_of(factors, at_state.constraint_jacobian, constants.scale)
+    at_state = Motion(increment(scheme, state, state.a, h), state.q, state.v, state.vdot)
+    return constants.step(scheme, system, state, h).factors(at_state, state.lam, t, Inverse)
 
 
 Found = TypeVar("Found")
@@ -264,9 +271,9 @@ def integrate_onward(
     The steps are those of one long run where n of the mark is a multiple of `factor_every`: the inverse of the
     iteration matrix is due there, and is not part of the mark.
     """
-    constants = Constants.of(system)
+    constants = Constants.of(system, stabilized=scheme.stabilized)
 
-    def inverse(state: State, n) -> tuple[Factors, Float[Array, ""]]:
+    def inverse(state: State, n) -> tuple[Solver, Float[Array, ""]]:
         return inverse_at(scheme, system, constants, state, t0 + n * h, h)
 
     def step(carry, n):
@@ -276,8 +283,9 @@ def integrate_onward(
             # A matrix that contracts slowly is renewed, unless it was new: then full Newton takes over. In a batch
             # every lane pays for the slowest; for its full iterations it would pay more.
             steps = jnp.maximum(age, 1).astype(margin.dtype)
-            due = (jnp.mod(n, scheme.factor_every) == 0) | ((guess.contraction >= SLOW) & (age > 1))
-            due = due | watch.ends_within(steps + 2.0 * scheme.factor_every)
+            due = (jnp.mod(n, scheme.factor_every) == 0) | watch.ends_within(steps + 2.0 * scheme.factor_every)
+            if scheme.iterations is None:  # else by the clock, which is the same in all lanes
+                due = due | ((guess.contraction >= SLOW) & (age > 1))
             age = jnp.where(due, 0, age) + 1
             earlier, margin = renewed_where(due, partial(inverse, previous, n), (earlier, margin))
             watch = jax.tree.map(partial(jnp.where, due), watch.after(margin, steps), watch)

@@ -19,14 +19,26 @@ else be 1e18). Its constraint rows and multipliers are further scaled by the siz
 redundant, Φ(q⁺)/(βh²) − c λ⁺ = 0, with −diag(c) in the corner of S (`dynamics/_redundant.py`).
 """
 
+import abc
 import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import AbstractSystem, State, Tangents, factorized, mass_scale, softness, times_tangent_operator
-from lgsens.linear import LU, Factors
+from lgsens.dynamics import (
+    AbstractSystem,
+    State,
+    Tangents,
+    factorized,
+    mass_scale,
+    softness,
+    tangents,
+    times_tangent_operator,
+)
+from lgsens.integrate._singular import margin_of
+from lgsens.linear import LU, Factors, Matrix
 
 
 class GeneralizedAlpha(eqx.Module):
@@ -41,6 +53,12 @@ class GeneralizedAlpha(eqx.Module):
             scene, at which a step has converged. The error left is its square; below 64 round-offs
             it is raised to that (single precision).
         max_iterations: full Newton iterations per step before the step has failed.
+        iterations: a fixed budget instead, so many iterations in every step and no test between them: of modified
+            Newton, with a matrix renewed every `factor_every` steps and at no other time, or of full Newton where that
+            is 0. Every step then costs the same, in each lane of a batch too. A step whose last increment is above
+            `tolerance` has failed all the same, and `Stats.increment` says what it was; with a larger tolerance the
+            motion is off by about the last increment times the contraction of one iteration, and so is its derivative,
+            which is that of converged steps. None: as many as it takes.
         factor_every: steps that share one inverse of the iteration matrix (modified Newton). Its iterations cost a
             tenth of a full one, and go on until the error left is what full Newton would leave; a step that they do
             not bring there is finished by full Newton. 0: full Newton always. The sensitivities do not depend on it:
@@ -50,9 +68,12 @@ class GeneralizedAlpha(eqx.Module):
             it anyway: positions, velocities and multipliers are then second order from the first step.
             False: a₀ = v̇₀ and v₀ as it is; multipliers are first order in the first steps (Arnold,
             Brüls & Cardona, Numerische Mathematik 129, 2015, doi:10.1007/s00211-014-0633-1).
+        stabilized: satisfy B v = 0 in every step besides Φ = 0 (stabilized index 2, after Gear, Gupta & Leimkuhler),
+            at the price of m more unknowns in a step; see `_stabilized.py`. Dense. False: index 3, where B v is O(h²).
 
     All static and hashable. Raises `ValueError` for ρ∞ outside [0, 1), a tolerance that is not positive, fewer than 1
-    iteration, or a negative `factor_every`. Source: Sonneville & Brüls (2014), §4; Brüls, Cardona & Arnold (2012).
+    iteration, a negative `factor_every`, or a `stabilized` that is not a bool. Source: Sonneville & Brüls (2014), §4;
+    Brüls, Cardona & Arnold (2012).
     """
 
     rho_inf: float = eqx.field(static=True, default=0.9)
@@ -60,6 +81,8 @@ class GeneralizedAlpha(eqx.Module):
     max_iterations: int = eqx.field(static=True, default=10, kw_only=True)
     factor_every: int = eqx.field(static=True, default=20, kw_only=True)
     second_order_start: bool = eqx.field(static=True, default=True, kw_only=True)
+    iterations: int | None = eqx.field(static=True, default=None, kw_only=True)
+    stabilized: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def __check_init__(self):
         if not isinstance(self.rho_inf, int | float) or not 0.0 <= self.rho_inf < 1.0:
@@ -79,6 +102,15 @@ class GeneralizedAlpha(eqx.Module):
             raise ValueError(
                 "GeneralizedAlpha: `factor_every` must be an int, at least 0 (0: full Newton always), got "
                 f"{self.factor_every!r}."
+            )
+        if self.iterations is not None and (not isinstance(self.iterations, int) or self.iterations < 1):
+            raise ValueError(
+                "GeneralizedAlpha: `iterations` must be an int, at least 1, or None (until they converge), got "
+                f"{self.iterations!r}."
+            )
+        if not isinstance(self.stabilized, bool):
+            raise ValueError(
+                f"GeneralizedAlpha: `stabilized` must be True (index 2) or False (index 3), got {self.stabilized!r}."
             )
 
     @property
@@ -117,9 +149,9 @@ def increment(scheme: GeneralizedAlpha, previous: State, u, h) -> Float[Array, "
     return h * previous.v + h**2 * ((0.5 - scheme.beta) * previous.a + scheme.beta * u)
 
 
-def advance(scheme: GeneralizedAlpha, system: AbstractSystem, previous: State, u, h) -> Motion:
-    """What follows from the unknown u = a_{n+1}."""
-    x = increment(scheme, previous, u, h)
+def advance(scheme: GeneralizedAlpha, system: AbstractSystem, previous: State, u, h, correction=None) -> Motion:
+    """What follows from the unknown u = a_{n+1}; `correction` is added to it in x alone."""
+    x = increment(scheme, previous, u if correction is None else u + correction, h)
     v = previous.v + h * ((1.0 - scheme.gamma) * previous.a + scheme.gamma * u)
     vdot = ((1.0 - scheme.alpha_m) * u + scheme.alpha_m * previous.a - scheme.alpha_f * previous.vdot) / (
         1.0 - scheme.alpha_f
@@ -145,3 +177,52 @@ def factorize_iteration_matrix(
     stiffness, lower = times_tangent_operator(system, x, (tangents.stiffness, jacobian))
     dynamic = scheme.inertia_factor * mass + (scheme.gamma * h) * tangents.damping + (scheme.beta * h**2) * stiffness
     return factorized(system, dynamic, jacobian.T, lower, mass_scale(mass), kind, softness(system))
+
+
+class AbstractStep(eqx.Module):
+    """The equations of one step from `previous`, for Newton: the unknowns are u and the multipliers of the scheme."""
+
+    @abc.abstractmethod
+    def motion(self, u, lam) -> Motion:
+        """What follows from the unknowns."""
+
+    @abc.abstractmethod
+    def defect(self, motion: Motion, lam, t) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
+        """What is left of the dynamic equilibrium [N or N m], and of the constraints, as accelerations."""
+
+    @abc.abstractmethod
+    def factors(self, motion: Motion, lam, t, kind: Any = LU) -> tuple[Any, Float[Array, ""]]:
+        """The factors of the iteration matrix, whose solution for the defect is what Newton takes from the unknowns;
+        and their margin (`_singular`)."""
+
+    @abc.abstractmethod
+    def change(self, du, dlam) -> Float[Array, " k"]:
+        """How far increments of the unknowns move the configuration, over βh²."""
+
+
+class Index3Step(AbstractStep):
+    """Eqs. (24)–(29) as above."""
+
+    scheme: GeneralizedAlpha
+    system: AbstractSystem
+    mass: Matrix
+    scale: Float[Array, " k"]
+    softness: Float[Array, " m"] | None
+    previous: State
+    h: Float[Array, ""]
+
+    def motion(self, u, lam):
+        return advance(self.scheme, self.system, self.previous, u, self.h)
+
+    def defect(self, motion, lam, t):
+        residual = self.system.residual(motion.q, motion.v, motion.vdot, lam, t)
+        violation = self.system.constraint(motion.q) / (self.scheme.beta * self.h**2)
+        return residual, violation if self.softness is None else violation - self.softness * lam
+
+    def factors(self, motion, lam, t, kind=LU):
+        at_state = tangents(self.system, motion.q, motion.v, motion.vdot, lam, t)
+        factors = factorize_iteration_matrix(self.scheme, self.system, at_state, self.mass, motion.x, self.h, kind)
+        return factors, margin_of(factors, at_state.constraint_jacobian, self.scale)
+
+    def change(self, du, dlam):
+        return jnp.abs(du)

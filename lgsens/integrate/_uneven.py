@@ -26,6 +26,7 @@ from lgsens.integrate._integrate import (
     SLOW,
     Constants,
     Guess,
+    Solver,
     Stats,
     inverse_at,
     no_inverse,
@@ -33,7 +34,6 @@ from lgsens.integrate._integrate import (
     take_step,
 )
 from lgsens.integrate._scheme import GeneralizedAlpha
-from lgsens.linear import Factors
 
 _SAME = 2.0  # the change of h up to which modified Newton keeps its matrix
 
@@ -54,7 +54,7 @@ class Progress(NamedTuple):
     h: Float[Array, ""]  # of the step that the state's a belongs to
     past: _Past
     contraction: Float[Array, ""]
-    inverse: Factors | None
+    inverse: Solver | None
     inverse_h: Float[Array, ""]
     age: Int[Array, ""]  # steps with this inverse
     running: Bool[Array, ""]
@@ -84,7 +84,7 @@ class UnevenSteps(eqx.Module):
     def of(cls, scheme: GeneralizedAlpha, system: AbstractSystem) -> "UnevenSteps":
         return cls(scheme, system, Constants.of(system))
 
-    def _inverse(self, state: State, t, h) -> Factors:
+    def _inverse(self, state: State, t, h) -> Solver:
         return inverse_at(self.scheme, self.system, self.constants, state, t, h)[0]
 
     def first(self, state0: State, t0, h) -> Progress:

@@ -14,7 +14,14 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from lgsens.dynamics import State, require_independent
-from lgsens.integrate import GeneralizedAlpha, Stats, integrate, integrate_uneven
+from lgsens.integrate import (
+    GeneralizedAlpha,
+    Stats,
+    integrate,
+    integrate_uneven,
+    with_corrections,
+    without_corrections,
+)
 from lgsens.sensitivity._adjoint import adjoint_sweep
 from lgsens.sensitivity._continuous_direct import continuous_direct_sweep
 from lgsens.sensitivity._direct import direct_sweep
@@ -27,6 +34,11 @@ from lgsens.sensitivity._linearization import (
     to_algebra,
     to_ambient,
     zeros_like_trajectory,
+)
+from lgsens.sensitivity._stabilized import (
+    stabilized_adjoint_sweep,
+    stabilized_direct_sweep,
+    stabilized_matvec,
 )
 
 
@@ -62,7 +74,7 @@ class DirectDifferentiation(AbstractSensitivity):
 
     def trajectory(self, scheme, num_steps, state0, parameters, found=None):
         _refuse_checkpoints(self)
-        return _decoded(_direct_trajectory(scheme, num_steps, state0, parameters, found))
+        return _trajectory(_direct_trajectory, scheme, num_steps, state0, parameters, found)
 
 
 class AdjointVariable(AbstractSensitivity):
@@ -84,7 +96,7 @@ class AdjointVariable(AbstractSensitivity):
 
     def trajectory(self, scheme, num_steps, state0, parameters, found=None):
         _refuse_checkpoints(self)
-        return _decoded(_adjoint_trajectory(scheme, num_steps, state0, parameters, found))
+        return _trajectory(_adjoint_trajectory, scheme, num_steps, state0, parameters, found)
 
 
 def _check_checkpoints(method: DirectDifferentiation | AdjointVariable) -> None:
@@ -114,7 +126,12 @@ class ContinuousDirect(AbstractSensitivity):
 
     def trajectory(self, scheme, num_steps, state0, parameters):
         require_independent(parameters.system, "ContinuousDirect")
-        return _decoded(_continuous_trajectory(scheme, num_steps, state0, parameters))
+        if scheme.stabilized:
+            raise ValueError(
+                "ContinuousDirect integrates the differentiated equations at index 3, and `integrator` is stabilized; "
+                "leave `stabilized` out, or take DirectDifferentiation()."
+            )
+        return _trajectory(_continuous_trajectory, scheme, num_steps, state0, parameters)
 
 
 class Autodiff(AbstractSensitivity):
@@ -127,7 +144,7 @@ class Autodiff(AbstractSensitivity):
 
     def trajectory(self, scheme, num_steps, state0, parameters):
         full = dataclasses.replace(scheme, factor_every=0)
-        return _decoded(_run(full, num_steps, state0, parameters))
+        return _trajectory(_run, full, num_steps, state0, parameters)
 
 
 # The custom rules see statistics as floats: an integer output of a `custom_vjp` reaches operations that have no
@@ -155,9 +172,17 @@ def decoded(stats: Stats) -> Stats:
     return stats._replace(iterations=stats.iterations.astype(jnp.int32), converged=stats.converged.astype(bool))
 
 
-def _decoded(run) -> tuple[State, Stats]:
-    states, stats = run
-    return states, decoded(stats)
+def _trajectory(rule, scheme, num_steps, state0, parameters, *found) -> tuple[State, Stats]:
+    """What a rule below gives, with the multipliers of the joints only."""
+    states, stats = rule(scheme, num_steps, with_corrections(scheme, state0), parameters, *found)
+    return without_corrections(scheme, states), decoded(stats)
+
+
+def _sweeps(scheme):
+    """L, the solution with L, and that with Lᵀ."""
+    if scheme.stabilized:
+        return stabilized_matvec, stabilized_direct_sweep, stabilized_adjoint_sweep
+    return matvec, direct_sweep, adjoint_sweep
 
 
 # Direct differentiation. The tangent of the trajectory solves L (δ, p') = (b, p'), b = (δ_0, 0, …, 0).
@@ -181,11 +206,12 @@ def _direct_rule(scheme, num_steps, primals, tangents):
     # One flat vector, because `custom_linear_solve` is transposed only where no part of b is a constant, and the
     # tangent of a parameter that is not differentiated is one: a zero.
     flat, unravel = ravel_pytree((b, d_parameters))
+    product, forwards, backwards = _sweeps(scheme)
     solution = lax.custom_linear_solve(
-        lambda unknown: ravel_pytree(matvec(scheme, states, parameters, *unravel(unknown)))[0],
+        lambda unknown: ravel_pytree(product(scheme, states, parameters, *unravel(unknown)))[0],
         flat,
-        solve=lambda _, rhs: ravel_pytree(direct_sweep(scheme, states, parameters, *unravel(rhs)))[0],
-        transpose_solve=lambda _, rhs: ravel_pytree(adjoint_sweep(scheme, states, parameters, *unravel(rhs)))[0],
+        solve=lambda _, rhs: ravel_pytree(forwards(scheme, states, parameters, *unravel(rhs)))[0],
+        transpose_solve=lambda _, rhs: ravel_pytree(backwards(scheme, states, parameters, *unravel(rhs)))[0],
     )
     delta, _ = unravel(solution)
     d_states = jax.vmap(partial(to_ambient, group))(states, delta)
@@ -229,7 +255,8 @@ def _adjoint_backward(scheme, num_steps, kept, cotangents):
     states, parameters = kept
     group = parameters.system.group
     c = jax.vmap(partial(cotangent_to_algebra, group))(states, cotangents[0])
-    mu, bar = adjoint_sweep(scheme, states, parameters, c, jax.tree.map(jnp.zeros_like, parameters))
+    _, _, backwards = _sweeps(scheme)
+    mu, bar = backwards(scheme, states, parameters, c, jax.tree.map(jnp.zeros_like, parameters))
     state0 = jax.tree.map(lambda leaf: leaf[0], states)
     first = Variation(*[leaf[0] for leaf in mu])
     return cotangent_to_ambient(group, state0, first), bar, None

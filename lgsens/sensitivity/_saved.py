@@ -16,7 +16,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from lgsens.dynamics import State
-from lgsens.integrate import GeneralizedAlpha, Stats, integrate_outputs
+from lgsens.integrate import GeneralizedAlpha, Stats, integrate_outputs, with_corrections, without_corrections
 from lgsens.sensitivity._linearization import Parameters, times
 from lgsens.sensitivity._methods import AbstractSensitivity, AdjointVariable, DirectDifferentiation, decoded, encoded
 from lgsens.sensitivity._segments import (
@@ -49,6 +49,11 @@ def saved_run(
     The default method does without the states where nothing is differentiated, those with `checkpoints` always.
     """
     if isinstance(method, DirectDifferentiation | AdjointVariable) and method.checkpoints is not None:
+        if scheme.stabilized:
+            raise ValueError(
+                f"{type(method).__name__}: `checkpoints` = {method.checkpoints!r} is for index 3, and `integrator` is "
+                "stabilized; leave one of them out."
+            )
         segments = Segments.of(scheme, num_steps, method.checkpoints)
         rule = _direct_segments if isinstance(method, DirectDifferentiation) else _adjoint_segments
         run, _ = cast(tuple[SavedRun, Any], rule(output, scheme, segments, state0, parameters))
@@ -71,8 +76,17 @@ def _decoded(run: SavedRun) -> SavedRun:
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
 def _saved(output, scheme, num_steps, state0, parameters):
     system, t0, h = parameters
-    outputs, final, stats = integrate_outputs(scheme, num_steps, system, state0, t0, h, partial(output, system))
-    return SavedRun(outputs, final, encoded(stats, h.dtype))
+    physical = partial(without_corrections, scheme)
+    outputs, final, stats = integrate_outputs(
+        scheme,
+        num_steps,
+        system,
+        with_corrections(scheme, state0),
+        t0,
+        h,
+        lambda state, t: output(system, physical(state), t),
+    )
+    return SavedRun(outputs, physical(final), encoded(stats, h.dtype))
 
 
 @_saved.defjvp
