@@ -60,10 +60,17 @@ def times_tangent_operator(system: AbstractSystem, x, matrices: tuple[Matrix, ..
     return tuple(jnp.split(turned, [sum(heights[:i]) for i in range(1, len(heights))]))
 
 
-def factorized(system: AbstractSystem, dynamic: Matrix, upper: Matrix, lower: Matrix, scale, kind: Any = LU) -> Factors:
-    """The factors of [[A, U], [L, 0]] by the linear solver of the system; `kind` as in `Factors.of`."""
-    plan = system.elimination if isinstance(system, AbstractSparseSystem) else None
-    return Factors.of(dynamic, upper, lower, scale, plan=plan, kind=kind)
+def factorized(
+    system: AbstractSystem, dynamic: Matrix, upper: Matrix, lower: Matrix, scale, kind: Any = LU, *, exact: bool = False
+) -> Factors:
+    """The factors of [[A, U], [L, 0]] by the linear solver of the system; `kind` as in `Factors.of`.
+
+    `exact`: never of mixed precision.
+    """
+    sparse = system if isinstance(system, AbstractSparseSystem) else None
+    plan, solver = (None, None) if sparse is None else (sparse.elimination, sparse.linear_solver)
+    mixed = solver is not None and solver.mixed and not exact
+    return Factors.of(dynamic, upper, lower, scale, plan=plan, kind=kind, mixed=mixed)
 
 
 def kkt_solve(mass, jacobian, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens.linear._dense import LU
-from lgsens.linear._elimination import BlockFactors, Elimination
+from lgsens.linear._elimination import BlockFactors, BlockMatrix, Elimination
+from lgsens.linear._mixed import factors_of
 from lgsens.linear._sparse import SparseMatrix
 
 Matrix = Any  # a SparseMatrix or an array
@@ -17,26 +18,34 @@ Matrix = Any  # a SparseMatrix or an array
 class Factors(eqx.Module):
     """The factors of S = [[A, U], [L, 0]], its border scaled by σ to the size of A; U = Bᵀ and L = B T in a step."""
 
-    factors: Any  # LU, Inverse or BlockFactors
+    factors: Any  # LU, Inverse or BlockFactors, or of mixed precision
     scale: Float[Array, ""]  # σ
 
     @classmethod
     def of(
-        cls, dynamic: Matrix, upper: Matrix, lower: Matrix, scale, *, plan: Elimination | None = None, kind: Any = LU
+        cls,
+        dynamic: Matrix,
+        upper: Matrix,
+        lower: Matrix,
+        scale,
+        *,
+        plan: Elimination | None = None,
+        kind: Any = LU,
+        mixed: bool = False,
     ) -> "Factors":
-        """`plan`: None for arrays. `kind`: LU or `Inverse` of what is dense."""
+        """`plan`: None for arrays. `kind`: LU or `Inverse` of what is dense. `mixed`: of mixed precision."""
         if not isinstance(dynamic, SparseMatrix):
             m = lower.shape[0]
             above = jnp.concatenate([dynamic, scale * upper], axis=1)
             below = jnp.concatenate([scale * lower, jnp.zeros((m, m), dynamic.dtype)], axis=1)
-            return cls(kind.of(jnp.concatenate([above, below])), scale)
+            return cls(factors_of(jnp.concatenate([above, below]), kind, mixed=mixed), scale)
         assert plan is not None
         k = dynamic.shape[0]
         (a, *at), (u, rows_u, columns_u), (b, rows_b, columns_b) = (x.entries() for x in (dynamic, upper, lower))
         values = jnp.concatenate([a, scale * u, scale * b])
         rows = np.concatenate([at[0], rows_u, k + rows_b])
         columns = np.concatenate([at[1], k + columns_u, columns_b])
-        return cls(BlockFactors.of(plan, values, rows, columns, kind), scale)
+        return cls(factors_of(BlockMatrix.of(plan, values, rows, columns), kind, mixed=mixed), scale)
 
     def largest_inverse(self) -> Float[Array, ""]:
         """The largest number in the inverses of a sparse matrix with `Inverse`: of blocks, and of what is left."""
