@@ -62,11 +62,24 @@ def times_tangent_operator(system: AbstractSystem, x, matrices: tuple[Matrix, ..
 
 
 def factorized(
-    system: AbstractSystem, dynamic: Matrix, upper: Matrix, lower: Matrix, scale, kind: Any = LU, softness=None
+    system: AbstractSystem,
+    dynamic: Matrix,
+    upper: Matrix,
+    lower: Matrix,
+    scale,
+    kind: Any = LU,
+    softness=None,
+    *,
+    exact: bool = False,
 ) -> Factors:
-    """The factors of [[A, U], [L, 0]] by the linear solver of the system; `kind`, `softness` as in `Factors.of`."""
-    plan = system.elimination if isinstance(system, AbstractSparseSystem) else None
-    return Factors.of(dynamic, upper, lower, scale, plan=plan, kind=kind, softness=softness)
+    """The factors of [[A, U], [L, 0]] by the linear solver of the system; `kind`, `softness` as in `Factors.of`.
+
+    `exact`: never of mixed precision.
+    """
+    sparse = system if isinstance(system, AbstractSparseSystem) else None
+    plan, solver = (None, None) if sparse is None else (sparse.elimination, sparse.linear_solver)
+    mixed = solver is not None and solver.mixed and not exact
+    return Factors.of(dynamic, upper, lower, scale, plan=plan, kind=kind, softness=softness, mixed=mixed)
 
 
 def kkt_solve(mass, jacobian, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from lgsens.dynamics._state import Tangents
 from lgsens.liegroups import AbstractLieGroup
-from lgsens.linear import Elimination, SparseMatrix
+from lgsens.linear import AbstractLinearSolver, Elimination, SparseMatrix
 
 
 class AbstractSystem(eqx.Module):
@@ -76,7 +76,12 @@ class AbstractSparseSystem(AbstractSystem):
 
     Where `elimination` is a plan, the time of a step follows the number of bodies; None: all is dense, as it is for
     every other system.
+
+    Attributes:
+        linear_solver: what was asked for (static); None: the solver that is estimated to take less time.
     """
+
+    linear_solver: eqx.AbstractVar[AbstractLinearSolver | None]
 
     @property
     @abc.abstractmethod

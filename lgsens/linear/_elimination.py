@@ -10,7 +10,7 @@ leave is dense. All entries that are ever needed lie in one array: the blocks S�
 the rest; an entry belongs to the level that eliminates its row or its column first.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -123,6 +123,44 @@ class Eliminated(eqx.Module):
     left: Float[Array, "c q p"]  # Y
 
 
+class BlockMatrix(eqx.Module):
+    """A sparse matrix in the places of its factors, with `@` by vectors from both sides."""
+
+    entries: Float[Array, " numbers"]
+    plan: Elimination = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, plan: Elimination, values, rows: np.ndarray, columns: np.ndarray) -> "BlockMatrix":
+        filling = plan.filling()
+        given = (values, plan.places(rows, columns))
+        return cls(added([given, (jnp.ones(len(filling), values.dtype), filling)], plan.numbers, values.dtype), plan)
+
+    @property
+    def dtype(self):
+        return self.entries.dtype
+
+    def rest(self, entries) -> Float[Array, "r r"]:
+        """What the levels leave of the entries."""
+        count = len(self.plan.rest)
+        return entries[self.plan.numbers - count**2 :].reshape(count, count)
+
+    def _times(self, x, turned: Callable, exchanged: bool):
+        x = jnp.concatenate([x, jnp.zeros(1, x.dtype)])
+        products = [(turned(self.rest(self.entries)[None])[0] @ x[self.plan.rest], self.plan.rest)]
+        for i, (own, boundary) in enumerate(self.plan.levels):
+            pivot, right, left = map(turned, self.plan.blocks(self.entries, i))
+            right, left = (left, right) if exchanged else (right, left)
+            products.append((_product(pivot, x[own]) + _product(right, x[boundary]), own))
+            products.append((_product(left, x[own]), boundary))
+        return added(products, len(x), x.dtype)[:-1]
+
+    def __matmul__(self, x):
+        return self._times(x, lambda blocks: blocks, exchanged=False)
+
+    def __rmatmul__(self, x):
+        return self._times(x, _turned, exchanged=True)
+
+
 class BlockFactors(eqx.Module):
     """The factors of a sparse matrix: its levels, and what is left of it."""
 
@@ -131,14 +169,9 @@ class BlockFactors(eqx.Module):
     plan: Elimination = eqx.field(static=True)
 
     @classmethod
-    def of(cls, plan: Elimination, values, rows: np.ndarray, columns: np.ndarray, kind: Any) -> "BlockFactors":
+    def of(cls, matrix: BlockMatrix, kind: Any) -> "BlockFactors":
         """`kind`: LU or Inverse, for the rest."""
-        filling = plan.filling()
-        entries = added(
-            [(values, plan.places(rows, columns)), (jnp.ones(len(filling), values.dtype), filling)],
-            plan.numbers,
-            values.dtype,
-        )
+        entries, plan = matrix.entries, matrix.plan
         eliminated = []
         for i, (_, boundary) in enumerate(plan.levels):
             pivot, right, left = plan.blocks(entries, i)
@@ -149,23 +182,22 @@ class BlockFactors(eqx.Module):
             across = np.broadcast_to(boundary[:, None, :], (len(boundary), q, q))
             places = plan.places(np.swapaxes(across, 1, 2).ravel(), across.ravel())
             entries = entries.at[places[places >= 0]].add(-(level.left @ right).ravel()[np.flatnonzero(places >= 0)])
-        count = len(plan.rest)
-        rest = kind.of(entries[plan.numbers - count**2 :].reshape(count, count))
-        return cls(tuple(eliminated), rest, plan)
+        return cls(tuple(eliminated), kind.of(matrix.rest(entries)), plan)
 
     def solve(self, rhs, *, transposed: bool = False):
         """S⁻¹ rhs or S⁻ᵀ rhs, one column or several."""
         if rhs.ndim == 2:
             return jax.vmap(lambda column: self.solve(column, transposed=transposed), in_axes=1, out_axes=1)(rhs)
-        turned = lambda blocks: jnp.swapaxes(blocks, 1, 2)
         b = jnp.concatenate([rhs, jnp.zeros(1, rhs.dtype)])
         for level, (own, boundary) in zip(self.eliminated, self.plan.levels):
-            left = turned(level.right) if transposed else level.left
+            left = _turned(level.right) if transposed else level.left
             b = b.at[boundary.ravel()].add(-_product(left, b[own]).ravel())
         if len(self.plan.rest):
             b = b.at[self.plan.rest].set(self.rest.solve(b[self.plan.rest], transposed=transposed))
         for level, (own, boundary) in reversed(list(zip(self.eliminated, self.plan.levels))):
-            inverse, right = (turned(level.inverse), turned(level.left)) if transposed else (level.inverse, level.right)
+            inverse, right = (
+                (_turned(level.inverse), _turned(level.left)) if transposed else (level.inverse, level.right)
+            )
             b = b.at[own.ravel()].set((_product(inverse, b[own]) - _product(right, b[boundary])).ravel())
         return b[:-1]
 
@@ -188,6 +220,10 @@ def inverses(blocks: Float[Array, "c p p"]) -> Float[Array, "c p p"]:
         return rest - column[:, None, :] * row[None, :, :]
 
     return jnp.moveaxis(lax.fori_loop(0, size, eliminate, jnp.moveaxis(blocks, 0, 2)), 2, 0)
+
+
+def _turned(blocks):
+    return jnp.swapaxes(blocks, 1, 2)
 
 
 def _product(blocks, x):

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens.linear._dense import LU
-from lgsens.linear._elimination import BlockFactors, Elimination
+from lgsens.linear._elimination import BlockFactors, BlockMatrix, Elimination
+from lgsens.linear._mixed import factors_of
 from lgsens.linear._sparse import SparseMatrix
 
 Matrix = Any  # a SparseMatrix or an array
@@ -17,7 +18,7 @@ Matrix = Any  # a SparseMatrix or an array
 class Factors(eqx.Module):
     """The factors of S = [[A, U], [L, 0]], its border scaled by σ to the size of A; U = Bᵀ and L = B T in a step."""
 
-    factors: Any  # LU, Inverse or BlockFactors
+    factors: Any  # LU, Inverse or BlockFactors, or of mixed precision
     scale: Float[Array, ""]  # σ
 
     @classmethod
@@ -31,8 +32,10 @@ class Factors(eqx.Module):
         plan: Elimination | None = None,
         kind: Any = LU,
         softness: Float[Array, " m"] | None = None,
+        mixed: bool = False,
     ) -> "Factors":
-        """`plan`: None for arrays. `kind`: LU or `Inverse` of what is dense. `softness`: c of −diag(c) instead of 0."""
+        """`plan`: None for arrays. `kind`: LU or `Inverse` of what is dense. `softness`: c of −diag(c) instead of 0.
+        `mixed`: of mixed precision."""
         m = lower.shape[0]
         corner = None if softness is None else -(scale**2) * softness
         if not isinstance(dynamic, SparseMatrix):
@@ -40,7 +43,7 @@ class Factors(eqx.Module):
             below = jnp.concatenate(
                 [scale * lower, jnp.zeros((m, m), dynamic.dtype) if corner is None else jnp.diag(corner)], axis=1
             )
-            return cls(kind.of(jnp.concatenate([above, below])), scale)
+            return cls(factors_of(jnp.concatenate([above, below]), kind, mixed=mixed), scale)
         assert plan is not None
         k = dynamic.shape[0]
         (a, *at), (u, rows_u, columns_u), (b, rows_b, columns_b) = (x.entries() for x in (dynamic, upper, lower))
@@ -50,7 +53,7 @@ class Factors(eqx.Module):
         if corner is not None:
             own = np.arange(k, k + m)
             values, rows, columns = (jnp.concatenate([values, corner]), *(np.append(x, own) for x in (rows, columns)))
-        return cls(BlockFactors.of(plan, values, rows, columns, kind), scale)
+        return cls(factors_of(BlockMatrix.of(plan, values, rows, columns), kind, mixed=mixed), scale)
 
     def largest_inverse(self) -> Float[Array, ""]:
         """The largest number in the inverses of a sparse matrix with `Inverse`: of blocks, and of what is left."""

@@ -9,11 +9,30 @@ from lgsens.linear._ordering import levels
 
 
 class AbstractLinearSolver(eqx.Module):
-    """How the equations of a step are solved."""
+    """How the equations of a step are solved.
+
+    Attributes:
+        mixed: whether factors are in single precision and solutions refined in double (`_mixed`).
+    """
+
+    mixed: eqx.AbstractVar[bool]
 
 
 class DenseLU(AbstractLinearSolver):
-    """LU factors of the whole matrix with row exchanges (LAPACK): time grows with the third power of its size."""
+    """LU factors of the whole matrix with row exchanges (LAPACK): time grows with the third power of its size.
+
+    Arguments:
+        mixed: factors in single precision, solutions refined in double: motion and sensitivities are those of double
+            precision to 1e-9. A matrix that cannot be refined (a condition above 1e6) fails the step. Without effect
+            where everything is in single precision. `benchmarks/precision.py` measures what it costs.
+
+    Raises `ValueError` where `mixed` is not True or False.
+    """
+
+    mixed: bool = eqx.field(static=True, default=False, kw_only=True)
+
+    def __check_init__(self):
+        _check_mixed(self)
 
 
 class BlockSparse(AbstractLinearSolver):
@@ -21,7 +40,22 @@ class BlockSparse(AbstractLinearSolver):
 
     Bodies and then their joints are eliminated in levels, all of a level at once, without exchanges between blocks;
     what remains where it is too dense to go on is solved by a dense LU.
+
+    Arguments:
+        mixed: as in `DenseLU`.
+
+    Raises `ValueError` where `mixed` is not True or False.
     """
+
+    mixed: bool = eqx.field(static=True, default=False, kw_only=True)
+
+    def __check_init__(self):
+        _check_mixed(self)
+
+
+def _check_mixed(solver: AbstractLinearSolver) -> None:
+    if not isinstance(solver.mixed, bool):
+        raise ValueError(f"{type(solver).__name__}: `mixed` must be True or False, got {solver.mixed!r}.")
 
 
 def elimination(

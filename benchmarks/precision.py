@@ -1,0 +1,212 @@
+"""What precision costs and what it loses: mixed precision beside double, and single precision over the step.
+
+    python benchmarks/precision.py [--parts mixed single] [--cache FOLDER] [--out benchmarks/results]
+    python benchmarks/precision.py --readme   # the table of precision.json, into benchmarks/README.md; measures nothing
+
+mixed: simulations and gradients by all numbers of the assembled system, in reverse mode, with factors in single
+precision (`DenseLU(mixed=True)`, `BlockSparse(mixed=True)`) and in double. The programs of a scene take turns; medians
+of `--repeats` rounds or more. The difference is the largest of all entries of the gradient, relative to the largest.
+
+single: value and gradient of the top's and the four-bar's criteria without 64-bit floats, against the independent
+numbers of tests/data, at steps from 0.1 s down. With C h² the error of the scheme and ε/h^p what round-off makes of it,
+C, ε and p are fitted to logarithms of errors; the optimum is the h of their least sum, (p ε/(2C))^(1/(p+2)).
+
+Writes what it measured into precision.json beside what other runs left there, and draws precision.png.
+"""
+
+import dataclasses
+import json
+import os
+import statistics
+import time
+import warnings
+from pathlib import Path
+
+from benchmark import SINGLE_THREAD, circumstances, environment, interleaved, options, write
+from rival_tables import put_into
+
+PARTS = ("mixed", "single")
+STEPS = (10, 14, 20, 28, 40, 57, 80, 113, 160, 226, 320, 640, 1280)  # per second
+PROBLEMS = ("spinning_top_brulls.l_1.0_reproduces_published_number", "four_bar_spring")
+
+
+def scenes() -> dict:
+    """Scene and solver: the model, a body whose acceleration is observed, steps of 1 ms."""
+    import lgsens as lg
+    from lgsens.examples import QuarterCar, spatial_chain, spinning_top
+
+    car = QuarterCar.load().model(wheel="locked")
+    return {
+        ("top", lg.DenseLU): (spinning_top(0.7), "top", 1000),
+        ("quarter-car", lg.DenseLU): (car, "chassis", 500),
+        ("quarter-car", lg.BlockSparse): (car, "chassis", 500),
+        ("chain of 64", lg.BlockSparse): (spatial_chain(64, spin=24.0 / 64), "link63", 100),
+    }
+
+
+def measure_mixed(repeats: int) -> list[dict]:
+    import equinox as eqx
+    import jax
+    import numpy as np
+
+    import lgsens as lg
+
+    rows = []
+    for (scene, solver), (model, body, num_steps) in scenes().items():
+
+        def psi(system, every, num_steps=num_steps, body=body):
+            scheme = lg.GeneralizedAlpha(0.9, factor_every=every)
+            trajectory = lg.simulate(system, t1=num_steps * 1e-3, num_steps=num_steps, integrator=scheme, throw=False)
+            return lg.time_integral(trajectory.t, trajectory.body(body).acceleration[:, 2] ** 2)
+
+        works = {
+            "simulate": lambda system, psi=psi: psi(system, 20),
+            "simulate, full Newton": lambda system, psi=psi: psi(system, 0),
+            "gradient": eqx.filter_value_and_grad(lambda system, psi=psi: psi(system, 20)),
+        }
+        calls, records = {}, {}
+        for work, function in works.items():
+            for mixed in (False, True):
+                system = dataclasses.replace(model.system(), linear_solver=solver(mixed=mixed))
+                started = time.perf_counter()
+                program = eqx.filter_jit(function).lower(system).compile()
+                compiled = time.perf_counter() - started
+                memory = program.compiled.memory_analysis().temp_size_in_bytes / 1e6
+                run = lambda program=program, system=system: jax.block_until_ready(program(system))
+                numbers = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(run())])
+                calls[work, mixed], records[work, mixed] = run, (numbers, compiled, memory)
+        times = interleaved(calls, repeats, seconds=4.0)
+        for work in works:
+            row = {"scene": scene, "solver": solver.__name__, "work": work, "num_steps": num_steps}
+            for mixed, name in ((False, "double"), (True, "mixed")):
+                _, row[f"{name}_compile_s"], row[f"{name}_temporary_mb"] = records[work, mixed]
+                for kind in ("wall", "cpu"):
+                    median = statistics.median(getattr(times[work, mixed], kind))
+                    row[f"{name}_{kind}_us_per_step"] = median / num_steps * 1e6
+            double, mixed = (records[work, own][0] for own in (False, True))
+            row["difference"] = float(np.abs(mixed - double).max() / np.abs(double).max())
+            rows.append(row)
+            print(row, flush=True)
+        jax.clear_caches()
+    return rows
+
+
+def measure_single() -> list[dict]:
+    import jax
+    import jax.numpy as jnp
+    from references import compare
+
+    from lgsens.examples import PROBLEMS as KNOWN
+
+    rows = []
+    for name in PROBLEMS:
+        problem, counts, found = KNOWN[name], [round(KNOWN[name].t1 * n) for n in STEPS], []
+        with jax.enable_x64(False), warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # that says what this measures
+            for n in counts:
+                run = jax.jit(lambda p, n=n, problem=problem: problem.differentiate(p, num_steps=n, throw=False))
+                parameters = {key: jnp.asarray(value, jnp.float32) for key, value in problem.parameters.items()}
+                found.append(jax.device_get(run(parameters)))
+        steps = [problem.t1 / n for n in counts]
+        for criterion, record in compare(problem, found)["criteria"].items():
+            for what in ("value", "gradient"):
+                errors = record[what]["errors"]
+                row = {"scene": name.partition("_")[0], "criterion": criterion, "what": what, "step": steps}
+                rows.append(row | {"error": errors} | fit(steps, errors))
+                print(rows[-1], flush=True)
+    return rows
+
+
+def fit(steps: list[float], errors: list[float]) -> dict:
+    """C, ε and p of C h² + ε/h^p, by least squares of logarithms; the optimal step and the least error."""
+    import numpy as np
+    from scipy.optimize import least_squares
+
+    h, e = np.array(steps), np.array(errors)
+    good = np.isfinite(e) & (e > 0)
+    h, e = h[good], e[good]
+    model = lambda z: np.exp(z[0]) * h**2 + np.exp(z[1]) / h ** z[2]
+    start = [np.log(e[0] / h[0] ** 2), np.log(e[-1] * h[-1]), 1.0]
+    z = least_squares(lambda z: np.log(model(z) / e), start, loss="soft_l1").x
+    c, eps, p = np.exp(z[0]), np.exp(z[1]), z[2]
+    optimum = (p * eps / (2 * c)) ** (1 / (p + 2)) if p > 0 else 0.0
+    least = c * optimum**2 + eps / optimum**p if p > 0 else float(eps)
+    return {"C": float(c), "epsilon": float(eps), "p": float(p), "optimum": float(optimum), "least": float(least)}
+
+
+def plot(rows: list[dict], path: Path) -> None:
+    from lgsens.plotting import ErrorPanel, errors, save
+
+    def panel(scene: str) -> ErrorPanel:
+        own = [row for row in rows if row["scene"] == scene]
+        series = {f"{row['criterion']}, {row['what']}": (row["step"], row["error"]) for row in own}
+        return ErrorPanel(scene, "relative error [–]", series)
+
+    save(errors([panel(name) for name in dict.fromkeys(row["scene"] for row in rows)], "Single precision"), path)
+
+
+def table(document: dict) -> str:
+    lines = []
+    if "mixed" in document:
+        part = document["mixed"]
+        lines += [
+            f"{circumstances(part['environment'])} Processor time in brackets.",
+            "",
+            "| scene | solver | work | double [µs/step] | mixed [µs/step] | mixed / double | temporary memory [MB] "
+            "| difference |",
+            "|---|---|---|---|---|---|---|---|",
+        ]
+        for row in part["rows"]:
+            time_of = lambda name, kind, row=row: row[f"{name}_{kind}_us_per_step"]
+            cells = [f"{time_of(name, 'wall'):.1f} ({time_of(name, 'cpu'):.1f})" for name in ("double", "mixed")]
+            ratios = [time_of("mixed", kind) / time_of("double", kind) for kind in ("wall", "cpu")]
+            lines.append(
+                f"| {row['scene']} | `{row['solver']}` | {row['work']} | {' | '.join(cells)} "
+                f"| {ratios[0]:.2f} ({ratios[1]:.2f}) "
+                f"| {row['double_temporary_mb']:.2f} → {row['mixed_temporary_mb']:.2f} | {row['difference']:.0e} |"
+            )
+    if "single" in document:
+        lines += [
+            "",
+            "| scene | criterion | error of | C [1/s²] | ε | p | optimal h [ms] | error there |",
+            "|---|---|---|---|---|---|---|---|",
+        ]
+        for row in document["single"]["rows"]:
+            lines.append(
+                f"| {row['scene']} | {row['criterion']} | {row['what']} | {row['C']:.2g} | {row['epsilon']:.1e} "
+                f"| {row['p']:.1f} | {1e3 * row['optimum']:.1f} | {row['least']:.0e} |"
+            )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = options(__doc__)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--cache", help="folder for compiled programs (default: none)")
+    parser.add_argument("--readme", action="store_true", help="put the table into benchmarks/README.md")
+    arguments = parser.parse_args()
+    path = arguments.out / "precision.json"
+    document = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    if not arguments.readme:
+        os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+        if arguments.cache:
+            jax.config.update("jax_compilation_cache_dir", arguments.cache)
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        for part in arguments.parts:
+            found = environment(SINGLE_THREAD)
+            rows = measure_mixed(arguments.repeats) if part == "mixed" else measure_single()
+            document[part] = {"environment": found, "rows": rows}
+            write(path, document)
+    if "single" in document:
+        plot(document["single"]["rows"], arguments.out / "precision.png")
+    text = table(document)
+    if arguments.readme:
+        put_into(Path(__file__).parent / "README.md", text, "precision")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
