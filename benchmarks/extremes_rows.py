@@ -1,0 +1,104 @@
+"""What the modules of the extremes share: a row of the table, and both derivatives of a function in one program."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lgsens.testing._differences import NODES, difference
+
+EPS = float(np.finfo(np.float64).eps)
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One line of the table: `measured` is right if it is at most `bound`; `why` says where the bound comes from."""
+
+    extreme: str
+    measures: str
+    measured: float
+    bound: float
+    why: str
+
+    @property
+    def holds(self) -> bool:
+        return self.measured <= self.bound  # not so for NaN
+
+    @property
+    def verdict(self) -> str:
+        return "right" if self.holds else "WRONG"
+
+
+def derivatives(function: Callable[[Any], Any], points):
+    """Values, Jacobians in forward mode and in reverse mode of a function of a vector, of several points.
+
+    One program, and one point after the other: what is compiled is the function once in each mode, however many points.
+    """
+
+    def one(p):
+        forward, value = jax.jacfwd(lambda p: (function(p),) * 2, has_aux=True)(p)
+        return value, forward, jax.jacrev(function)(p)
+
+    found = jax.jit(lambda points: jax.lax.map(one, points))(jnp.asarray(points, float))
+    return tuple(np.asarray(array) for array in found)
+
+
+def by_differences(function, points, step: float):
+    """Jacobians by central differences of sixth order, and how far they are from those of fourth order."""
+    points = np.asarray(points, float)
+    count, size = points.shape
+    moves = np.array(NODES)[:, None, None] * step * np.eye(size)[None]
+    moved = points[:, None, None, :] + moves[None]
+    values = jax.jit(lambda points: jax.lax.map(function, points))(jnp.asarray(moved.reshape(-1, size)))
+    values = np.asarray(values).reshape(count, len(NODES), size, -1)
+    found = [[difference(values[i, :, j], step, np.zeros(())) for j in range(size)] for i in range(count)]
+    slopes, orders = (
+        np.array([[getattr(each, name) for each in row] for row in found]) for name in ("value", "tolerance")
+    )
+    return slopes.swapaxes(1, 2), orders.swapaxes(1, 2)
+
+
+def largest(error, size=1.0) -> float:
+    """The largest entry of |error|/size; NaN stays NaN."""
+    return float(np.max(np.abs(error) / size))
+
+
+def worst(errors, bounds) -> int:
+    """Which error is closest to its bound, or beyond it by most."""
+    return int(np.argmax(np.where(np.isnan(errors), np.inf, np.asarray(errors) / np.asarray(bounds))))
+
+
+def worst_row(extreme: str, measures: str, errors, bounds, labels, why: str) -> Row:
+    """The row of the case that is closest to its bound."""
+    i = worst(errors, bounds)
+    return Row(extreme, f"{measures}; closest at {labels[i]}", float(errors[i]), float(bounds[i]), why)
+
+
+def linear_error(rho_inf: float, phase, steps: int):
+    """|z^n − exp(iφn)| of the scheme for q̈ = −ω² q, z the principal root of its step at φ = hω.
+
+    With q, hv, h²a as unknowns, one step (eqs. 24-29) is A⁻¹ B; NumPy only, nothing of lgsens.
+    """
+    r = rho_inf
+    alpha_m, alpha_f = (2 * r - 1) / (r + 1), r / (r + 1)
+    gamma = 0.5 + alpha_f - alpha_m
+    beta = (gamma + 0.5) ** 2 / 4
+    errors = []
+    for s in np.atleast_1d(phase):
+        # v̇ = −ω²q, so (29) reads (1 − α_m) a⁺ + α_m a = −ω² ((1 − α_f) q⁺ + α_f q)
+        after = np.array([[1, 0, -beta], [0, 1, -gamma], [(1 - alpha_f) * s**2, 0, 1 - alpha_m]])
+        before = np.array([[1, 1, 0.5 - beta], [0, 1, 1 - gamma], [-alpha_f * s**2, 0, -alpha_m]])
+        roots = np.linalg.eigvals(np.linalg.solve(after, before))
+        exact = np.exp(1j * s)
+        principal = roots[np.argmin(np.abs(roots - exact))]
+        errors.append(abs(principal**steps - exact**steps))
+    return np.array(errors)
+
+
+def noise_sum(rho_inf: float, steps: int) -> float:
+    """What the double root −ρ∞ makes of errors in multipliers: Σ k ρ^k ≤ 1/(1 − ρ∞)², in n steps at most n^1.5."""
+    return min(1.0 / (1.0 - rho_inf) ** 2, math.pow(steps, 1.5))
