@@ -153,7 +153,7 @@ ZERO_STEPS, ZERO_TIME, ZERO_STIFFNESS = 100, 1.0, 25.0
 
 
 def at_its_anchor(p, explicit):
-    """z of a body that rests where its spring of no length is anchored; p = (start of the body [m], its speed [m/s])."""
+    """z of a body at rest where its spring of no length is anchored; p = (its start [m], its speed [m/s])."""
     zero = jnp.zeros_like(p[0])
     place = jnp.stack([zero, zero, p[0]])
     body = lg.RigidBody(1.0, (1.0, 1.0, 1.0), position=place, velocity=jnp.stack([zero, zero, p[1]]))

@@ -36,7 +36,7 @@ class Growth(NamedTuple):
         factor: g, the largest change of a coordinate up to each time, in units of 1 rad or of the length of the scene,
             for a change of that size of the configuration, and of that size over the run by the velocity, at first;
             shape (n+1,).
-        chaotic: whether g grows faster than t⁴ in the second half of the run, by more than a factor of 16, shape (), bool.
+        chaotic: whether g grows faster than t⁴, by more than a factor of 16 in the second half of the run, shape ().
         horizon: the time at which round-off has grown to the size of the scene, g ε = 1 [s], shape (); inf: later.
     """
 
@@ -69,7 +69,7 @@ def sensitivity_growth(
 
     Arguments: as in `simulate`, which it costs about four times.
 
-    Raises as `simulate`. Source: the growth is that of the largest Lyapunov exponent (Benettin et al., Meccanica 15, 1980).
+    Raises as `simulate`. Source: the rate is the largest Lyapunov exponent (Benettin et al., Meccanica 15, 1980).
     """
     system = as_system(model)
     check_integrator(integrator)

@@ -25,7 +25,7 @@ def growths():
 
 
 def test_upright_pendulum_grows_by_its_exponent(growths):
-    """δ(t) = δ₀ cosh ωt + v₀/ω sinh ωt: over the second half by e^{ωT/2}, but for e^{−ωT} = 2e-6 and (ωh)² ωT/12 = 3e-4."""
+    """δ₀ cosh ωt + v₀/ω sinh ωt grows by e^{ωT/2} in the second half, but for e^{−ωT} = 2e-6 and (ωh)² ωT/12 = 3e-4."""
     growth = growths[1.0]
     grown = float(growth.factor[-1] / growth.factor[STEPS // 2])
     np.testing.assert_allclose(np.log(grown), RATE * TIME / 2, rtol=1e-3)

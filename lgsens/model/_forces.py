@@ -96,7 +96,8 @@ class SpringDamper(AbstractForce):
             ℓ₀ is then the reference length.
 
     Give `free_length` or `preload`, not both; with neither the spring is free in the reference
-    configuration. Points that coincide exchange no force, and ℓ₀ of such points has derivative zero. Raises `ValueError` for both, or wrong shapes.
+    configuration. Points that coincide exchange no force, and as reference give ℓ₀ = 0 the derivative zero. Raises
+    `ValueError` for both, or wrong shapes.
     """
 
     a: str | None = eqx.field(static=True)

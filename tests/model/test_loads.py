@@ -226,7 +226,7 @@ def test_spring_of_coinciding_points_is_finite():
 
 
 def test_spring_of_no_length_has_its_tangent_where_its_points_meet():
-    """With tension k |d| it pulls with k d: on translations the tangent is k [[-I, I], [I, -I]], by formula and autodiff."""
+    """With tension k |d| it pulls with k d: the tangent on translations is k [−I, I], by formula and by autodiff."""
     k, zero = jnp.asarray(7.0), jnp.zeros(3)
     none = jnp.zeros(())
     load = SpringDamperLoad(zero, zero, k, none, none, none)
