@@ -2,7 +2,6 @@
 
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from extremes_rows import EPS, Row, by_differences, derivatives, largest, linear_error, worst_row

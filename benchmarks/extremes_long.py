@@ -88,7 +88,7 @@ def reverse(steps: int = 100_000) -> list[Row]:
         Row(
             f"{steps} steps in reverse",
             "growth of a change of the start, said to be regular",
-            grown if not bool(growth.chaotic) else np.inf,
+            grown if not bool(growth.exponential) else np.inf,
             1.0 / EPS,
             "the motion has digits left",
         ),
@@ -131,7 +131,7 @@ def chaos(seconds: float = 20.0) -> list[Row]:
         growth = lg.sensitivity_growth(double_pendulum(p), t1=seconds, num_steps=steps)
         slopes, transposed = np.asarray(forward(p)), np.asarray(backward(p))
         print(f"{name}: {growth}", flush=True)
-        said = bool(growth.chaotic) == (name == "chaotic")
+        said = bool(growth.exponential) == (name == "chaotic")
         extreme = f"double pendulum over {seconds:g} s, {name}"
         grown = float(growth.factor[-1])
         rows += [
