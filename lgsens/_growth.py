@@ -33,7 +33,7 @@ class Growth(NamedTuple):
 
     Attributes:
         t: the times [s], shape (n+1,).
-        factor: g, the largest change of a coordinate up to each time, in units of 1 rad or of the length of the scene,
+        factor: g, the largest change of a coordinate up to each time, in units of 1 rad or the length of the scene,
             for a change of that size of the configuration, and of that size over the run by the velocity, at first;
             shape (n+1,).
         exponential: whether g grows faster than t⁴, by more than a factor of 16 in the second half of the run, shape ().
@@ -50,10 +50,11 @@ class Growth(NamedTuple):
         said = f"A small change of the initial state grows by {grown:.1e} in {end - float(self.t[0]):.4g} s."
         if not bool(self.exponential):
             return said + " Growth is that of a regular motion."
-        rate = np.log(grown / float(self.factor[len(self.t) // 2])) / (end - float(self.t[len(self.t) // 2]))
-        said += f" It grows exponentially, by e each {1 / rate:.3g} s: the motion is unstable or chaotic, and gradients over "
+        middle = len(self.t) // 2
+        rate = np.log(grown / float(self.factor[middle])) / (end - float(self.t[middle]))
+        said += f" It grows exponentially, by e each {1 / rate:.3g} s: the motion is unstable or chaotic, and its "
         said += (
-            f"the run are dominated by that. They hold for changes of parameters below {1 / grown:.0e} of their size."
+            f"gradients are dominated by that. They hold for changes of parameters below {1 / grown:.0e} of their size."
         )
         if np.isfinite(float(self.horizon)):
             said += f" From t = {float(self.horizon):.4g} s on the motion itself is one of round-off."
