@@ -122,7 +122,7 @@ def chain(p):
 
 
 CHAIN_PLACE, CHAIN_FORCE = slice(0, 18), slice(18, 27)
-MASS_POWERS = [(0, 0, 0), (6, 0, -6), (-6, 0, 6), (0, 6, 0), (0, -6, 0), (-6, 6, -6), (6, -6, 6), (0, 0, 12)]
+MASS_POWERS = [(0, 0, 0), (6, 0, -6), (-6, 0, 6), (0, 6, 0), (0, -6, 0), (-6, 6, -6), (6, -6, 6), (0, 0, 6)]
 INERTIA_POWERS = (-6, -3, 0)
 CASES = [(*powers, 0) for powers in MASS_POWERS] + [(0, 0, 0, power) for power in INERTIA_POWERS]
 

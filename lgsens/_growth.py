@@ -36,7 +36,7 @@ class Growth(NamedTuple):
         factor: g, the largest change of a coordinate up to each time, in units of 1 rad or the length of the scene,
             for a change of that size of the configuration, and of that size over the run by the velocity, at first;
             shape (n+1,).
-        exponential: whether g grows faster than t⁴, by more than a factor of 16 in the second half of the run, shape ().
+        exponential: whether g grows faster than t⁴, by more than 16 times in the second half of the run, shape ().
         horizon: the time at which round-off has grown to the size of the scene, g ε = 1 [s], shape (); inf: later.
     """
 
