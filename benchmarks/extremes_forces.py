@@ -41,44 +41,45 @@ def stiffness() -> list[Row]:
     (joint,), (joint_slopes,), _ = derivatives(partial(swing, rigid=True), points[:1])
     soft = [i for i, power in enumerate(POWERS) if power <= 4]
     slopes, uncertain = by_differences(partial(swing, rigid=False), points[soft], 1e-3)
+    labels, weight = [f"1e{power} N/m" for power in POWERS], MASS * 9.81
     k = 10.0 ** np.array(POWERS)
-    labels = [f"1e{power} N/m" for power in POWERS]
-    force = MASS * 9.81
+    sag = 20 * weight / k
     # ε of a metre is K ε newtons: what the spring force is rounded to, and so its geometric stiffness in K_t.
-    rounded = 16 * EPS * k / force
-    sag = 20 * force / k
-    stiff = np.array(POWERS) >= LIMIT
-    limit = lambda errors: worst_row(
-        "stiffness 1e2 … 1e12 N/m",
-        errors[0],
-        np.array(errors[1])[stiff],
-        errors[2][stiff],
-        labels[LIMIT - 2 :],
-        errors[3],
-    )
-    against = [largest(each - joint) for each in value]
-    against_slopes = [largest((each - joint_slopes)[:, :2]) for each in forward]
-    modes = [largest(each) for each in forward - reverse]
-    measured = [largest(each) for each in (forward[soft] - slopes)]
-    bound = np.array([largest(each) for each in uncertain]) + 64 * EPS * STEPS / 1e-3
-    of_sag = "20 mg/K, the sag of the spring, + 16 K ε/(mg), round-off of its force"
-    slope = "3 times that sag, as the sag itself depends on length and gravity, + the same round-off"
+    rounded = 16 * EPS * k / weight
+    motion = np.array([largest(each - joint) for each in value])
+    motion_slopes = np.array([largest((each - joint_slopes)[:, :2]) for each in forward])
+    stiff, stiff_labels = np.array(POWERS) >= LIMIT, [f"1e{power} N/m" for power in POWERS if power >= LIMIT]
+    extreme, soft_extreme = "stiffness 1e2 … 1e12 N/m", "stiffness 1e2 … 1e4 N/m"
     return [
-        limit(("motion on a bushing − motion on the ball joint", against, sag + rounded, of_sag)),
-        limit(("its derivative by length and gravity − that of the joint", against_slopes, 3 * sag + rounded, slope)),
         worst_row(
-            "stiffness 1e2 … 1e12 N/m",
+            extreme,
+            "motion on a bushing − motion on the ball joint, from 1e6 N/m",
+            motion[stiff],
+            (sag + rounded)[stiff],
+            stiff_labels,
+            "20 mg/K: the sag under 2.5 mg, in rates of up to 4 rad/s; + 16 K ε/(mg), round-off of the spring's force",
+        ),
+        worst_row(
+            extreme,
+            "its derivative by length and gravity − that of the joint, from 1e6 N/m",
+            motion_slopes[stiff],
+            (3 * sag + rounded)[stiff],
+            stiff_labels,
+            "3 times that sag, which depends on length and gravity itself; + the same round-off",
+        ),
+        worst_row(
+            extreme,
             "derivative by length, gravity, ln K: reverse − forward",
-            modes,
+            [largest(each) for each in forward - reverse],
             64 * EPS * STEPS + rounded,
             labels,
             "64 n ε, + 16 K ε/(mg)",
         ),
         worst_row(
-            "stiffness 1e2 … 1e4 N/m",
-            "forward − differences",
-            measured,
-            bound,
+            soft_extreme,
+            "derivative by length, gravity, ln K: forward − differences",
+            [largest(each) for each in forward[soft] - slopes],
+            [largest(each) + 64 * EPS * STEPS / 1e-3 for each in uncertain],
             [labels[i] for i in soft],
             "the last two orders of the differences, + 64 n ε/10⁻³",
         ),
@@ -89,7 +90,7 @@ RATIOS = (0.0, 1e-3, 0.1, 0.9, 1.1, 10.0, 100.0, 1000.0)
 CART_STEPS, CART_TIME, FREQUENCY = 200, 1.0, 5.0
 
 
-def cart(p, free_length=1.0):
+def cart(p):
     """z of a mass on a spring and damper, of ω = e^p₀ and damping ratio p₁, released 0.1 m above its rest."""
     one, zero = jnp.ones_like(p[0]), jnp.zeros_like(p[0])
     rate = jnp.exp(p[0])
@@ -101,7 +102,7 @@ def cart(p, free_length=1.0):
         at_b=jnp.stack([zero, zero, one + 0.1]),
         stiffness=rate**2,
         damping=2.0 * p[1] * rate,
-        free_length=free_length,
+        free_length=one,
     )
     run = lg.simulate(lg.Model({"cart": body}, {}, {"spring": spring}), t1=CART_TIME, num_steps=CART_STEPS)
     return run.body("cart").position[-1, 2:]
