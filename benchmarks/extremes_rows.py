@@ -1,13 +1,13 @@
 """What the modules of the extremes share: a row of the table, and both derivatives of a function in one program."""
 
 import dataclasses
-import math
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.signal import lfilter
 
 from lgsens.testing._differences import NODES, difference
 
@@ -86,15 +86,19 @@ def worst_row(extreme: str, measures: str, errors, bounds, labels, why: str) -> 
     return Row(extreme, f"{measures}; closest at {labels[i]}", float(errors[i]), float(bounds[i]), why)
 
 
+def _coefficients(rho_inf: float):
+    """α_m, α_f, β, γ of Chung & Hulbert (1993)."""
+    alpha_m, alpha_f = (2 * rho_inf - 1) / (rho_inf + 1), rho_inf / (rho_inf + 1)
+    gamma = 0.5 + alpha_f - alpha_m
+    return alpha_m, alpha_f, (gamma + 0.5) ** 2 / 4, gamma
+
+
 def linear_error(rho_inf: float, phase, steps: int):
     """|z^n − exp(iφn)| of the scheme for q̈ = −ω² q, z the principal root of its step at φ = hω.
 
     With q, hv, h²a as unknowns, one step (eqs. 24-29) is A⁻¹ B; NumPy only, nothing of lgsens.
     """
-    r = rho_inf
-    alpha_m, alpha_f = (2 * r - 1) / (r + 1), r / (r + 1)
-    gamma = 0.5 + alpha_f - alpha_m
-    beta = (gamma + 0.5) ** 2 / 4
+    alpha_m, alpha_f, beta, gamma = _coefficients(rho_inf)
     errors = []
     for s in np.atleast_1d(phase):
         # v̇ = −ω²q, so (29) reads (1 − α_m) a⁺ + α_m a = −ω² ((1 − α_f) q⁺ + α_f q)
@@ -107,6 +111,16 @@ def linear_error(rho_inf: float, phase, steps: int):
     return np.array(errors)
 
 
-def noise_sum(rho_inf: float, steps: int) -> float:
-    """What the double root −ρ∞ makes of errors in multipliers: Σ k ρ^k ≤ 1/(1 − ρ∞)², in n steps at most n^1.5."""
-    return min(1.0 / (1.0 - rho_inf) ** 2, math.pow(steps, 1.5))
+def multiplier_noise(rho_inf: float, h, steps: int):
+    """The largest λ/m that errors δ_n of a joint's position, |δ_n| ≤ 1, can make in n steps [1/s²].
+
+    Where a constraint sets the position, eqs. (27)-(28) read (z − 1)² δ = βh² (z + ρ∞)² a, and (29) v̇ in terms of a:
+
+        v̇ = (z − 1)² ((1 − α_m) z + α_m) / ((z + ρ∞)² ((1 − α_f) z + α_f)) δ/(βh²) = Σ c_k z⁻ᵏ δ/(βh²)
+
+    The multiple root −ρ∞ makes c_k grow to about 4k at ρ∞ = 1; the bound is Σ |c_k|/(βh²).
+    """
+    alpha_m, alpha_f, beta, _ = _coefficients(rho_inf)
+    above = np.polymul([1.0, -2.0, 1.0], [1 - alpha_m, alpha_m])
+    below = np.polymul([1.0, 2 * rho_inf, rho_inf**2], [1 - alpha_f, alpha_f])
+    return np.sum(np.abs(lfilter(above, below, np.eye(1, steps)[0]))) / (beta * h**2)

@@ -5,7 +5,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from extremes_rows import EPS, Row, by_differences, derivatives, largest, linear_error, noise_sum, worst_row
+from extremes_rows import EPS, Row, by_differences, derivatives, largest, linear_error, multiplier_noise, worst_row
 from scipy.special import ellipj, ellipk
 
 import lgsens as lg
@@ -57,13 +57,13 @@ def step_sizes(rho_inf: float) -> list[Row]:
     turned = STEPS * phase
     scheme = 2 * (linear_error(rho_inf, phase, STEPS) + phase**2)
     place = ANGLE * ARM * scheme + 4 * EPS * STEPS
-    # The joint is closed to round-off of the arm, ε l; λ follows it by m/(βh²).
-    noise = 4 * EPS * ARM * MASS / (lg.GeneralizedAlpha(rho_inf).beta * h**2) * noise_sum(rho_inf, STEPS)
+    # The joint is closed to round-off of the arm.
+    noise = 4 * EPS * ARM * MASS * multiplier_noise(rho_inf, h, STEPS)
     force = MASS * GRAVITY * scheme + noise
     extreme, labels = f"steps of 1e-7 … 5e-2 s, ρ∞ = {rho_inf:g}", [f"h = {size:g}" for size in h]
     worst = lambda errors, part: [largest(error[part]) for error in errors]
     of_scheme = "twice the scheme's error for the linear oscillation, from its 3 × 3 step; elliptic functions"
-    of_noise = "that, + 4 ε l m/(βh²) min(1/(1 − ρ∞)², n^1.5): round-off of the joint in λ"
+    of_noise = "that, + 4 ε l of the joint, times m/(βh²) Σ |c_k|, what λ makes of such errors at this ρ∞"
     grown = 3 + turned
     return [
         worst_row(extreme, "position", worst(value - exact, PLACE), place, labels, of_scheme),
@@ -137,9 +137,8 @@ def mass_ratios() -> list[Row]:
     worst = lambda errors, part: np.array([largest(error[part]) for error in errors])
     extreme = "masses 1e-6 … 1e6 in one chain, inertias 1e-6"
     noise = 64 * EPS * CHAIN_STEPS
-    # λ follows the round-off of the joints by 1/(βh²), relative to accelerations of 10 m/s².
-    beta, h = lg.GeneralizedAlpha().beta, CHAIN_TIME / CHAIN_STEPS
-    rough = 16 * EPS / (beta * h**2) * noise_sum(0.9, CHAIN_STEPS) / 9.81
+    # λ follows the round-off of the joints, relative to accelerations of 10 m/s².
+    rough = 4 * EPS * multiplier_noise(0.9, CHAIN_TIME / CHAIN_STEPS, CHAIN_STEPS) / 9.81
     of_place = worst(uncertain, CHAIN_PLACE) + noise / step
     of_force = worst(uncertain, CHAIN_FORCE) / size + rough / step
     return [
@@ -165,7 +164,7 @@ def mass_ratios() -> list[Row]:
             worst(forward - slopes, CHAIN_FORCE) / size,
             of_force,
             labels,
-            "as above, + round-off of λ, 16 ε/(βh²) of the acceleration, summed by ρ∞, /10⁻³",
+            "as above, + round-off of the joint in λ, 4 ε l/(βh²) Σ |c_k| of g, /10⁻³",
         ),
         worst_row(
             extreme,
@@ -223,12 +222,11 @@ def unit_rows(powers, labels, extreme) -> list[Row]:
     """Powers of ten (or not) of units per metre and per kilogram; the first are SI."""
     value, forward, reverse = map(np.asarray, every_unit(jnp.asarray(10.0 ** np.array(powers, float))))
     noise = 64 * EPS * UNIT_STEPS
-    beta, h = lg.GeneralizedAlpha().beta, UNIT_TIME / UNIT_STEPS
-    rough = 16 * EPS / (beta * h**2) * noise_sum(0.9, UNIT_STEPS) / 9.81
+    rough = 4 * EPS * multiplier_noise(0.9, UNIT_TIME / UNIT_STEPS, UNIT_STEPS) / 9.81
     rows = []
     for part, name, bound, why in (
         (UNIT_MOTION, "motion", noise, "64 n ε, relative to the largest: other digits are rounded"),
-        (UNIT_FORCE, "λ", rough, "16 ε l/(βh²) of g, summed by ρ∞: round-off of the joint in λ"),
+        (UNIT_FORCE, "λ", rough, "4 ε l/(βh²) Σ |c_k| of g: round-off of the joint in λ"),
     ):
         sizes, slopes = largest(value[0][part]), largest(forward[0][part])
         bounds = bound * np.ones(len(labels))
