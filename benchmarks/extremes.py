@@ -18,8 +18,6 @@ import time
 from functools import partial
 from pathlib import Path
 
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")  # else batched LAPACK of JAX 0.10 may wait
-
 import extremes_failures
 import extremes_forces
 import extremes_long
@@ -50,6 +48,8 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=EXTREMES, metavar="NAME", help=f"among {', '.join(EXTREMES)}")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder (default: %(default)s)")
     arguments = parser.parse_args()
+    # before the first computation: else batched LAPACK of JAX 0.10 may wait for ever
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
     jax.config.update("jax_enable_x64", True)
     found = []
     print("| extreme | of what | bound | measured | verdict | why |\n|---|---|---|---|---|---|")
