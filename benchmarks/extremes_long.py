@@ -6,7 +6,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from extremes_rows import EPS, Row, largest
+from extremes_rows import EPS, Row, derivatives, largest
 
 import lgsens as lg
 from lgsens.examples import spinning_top
@@ -76,22 +76,12 @@ def reverse(steps: int = 100_000) -> list[Row]:
     forwards = jax.jit(jax.jacfwd(partial(mean, method=lg.DirectDifferentiation(checkpoints="sqrt"))))
     gradient, slopes = np.asarray(backwards(p)), np.asarray(forwards(p))
     growth = lg.sensitivity_growth(spinning_top(p[0]), t1=1e-3 * steps, num_steps=steps)
-    grown = float(growth.factor[-1])
+    grown = np.inf if bool(growth.exponential) else float(growth.factor[-1])
+    extreme, modes = f"{steps} steps in reverse", "16 n ε: each step of either mode adds a round-off"
+    error = largest(gradient - slopes, np.abs(slopes).max())
     return [
-        Row(
-            f"{steps} steps in reverse",
-            "relative difference of reverse and forward mode",
-            largest(gradient - slopes, np.abs(slopes).max()),
-            16 * EPS * steps,
-            "16 n ε: each step of either mode adds a round-off",
-        ),
-        Row(
-            f"{steps} steps in reverse",
-            "growth of a change of the start, said to be regular",
-            grown if not bool(growth.exponential) else np.inf,
-            1.0 / EPS,
-            "the motion has digits left",
-        ),
+        Row(extreme, "reverse − forward, relative", error, 16 * EPS * steps, modes),
+        Row(extreme, "growth of a change of the start, regular", grown, 1.0 / EPS, "the motion has digits left"),
     ]
 
 
@@ -113,10 +103,6 @@ def double_pendulum(p):
 REGULAR, CHAOTIC = (-1.45, -1.6), (1.0, 1.2)  # near rest, and high above it
 
 
-def _tip(s):
-    return s.body("bar1").position
-
-
 def chaos(seconds: float = 20.0) -> list[Row]:
     steps = round(seconds / CHAOS_STEP)
 
@@ -124,30 +110,17 @@ def chaos(seconds: float = 20.0) -> list[Row]:
         run = lg.simulate(double_pendulum(p), t1=seconds, num_steps=steps)
         return run.body("bar1").position[-1]
 
-    rows = []
-    forward, backward = jax.jit(jax.jacfwd(tip)), jax.jit(jax.jacrev(tip))
-    for name, start in (("regular", REGULAR), ("chaotic", CHAOTIC)):
-        p = jnp.asarray(start)
-        growth = lg.sensitivity_growth(double_pendulum(p), t1=seconds, num_steps=steps)
-        slopes, transposed = np.asarray(forward(p)), np.asarray(backward(p))
-        print(f"{name}: {growth}", flush=True)
+    rows, starts = [], {"regular": REGULAR, "chaotic": CHAOTIC}
+    for name, start, forward, reverse in zip(starts, starts.values(), *derivatives(tip, list(starts.values()))[1:]):
+        growth = lg.sensitivity_growth(double_pendulum(jnp.asarray(start)), t1=seconds, num_steps=steps)
+        grown, size = float(growth.factor[-1]), largest(forward)
         said = bool(growth.exponential) == (name == "chaotic")
         extreme = f"double pendulum over {seconds:g} s, {name}"
-        grown = float(growth.factor[-1])
+        modes = "16 n ε: both modes multiply the same matrices, from one end or the other"
+        compared = f"gradient, {size:.1e}, relative to the growth, {grown:.1e}, which is said to be {name}"
+        reach = "the gradient of a place is at most the growth, times 2 m for each of the 2 angles"
         rows += [
-            Row(
-                extreme,
-                "relative difference of reverse and forward mode",
-                largest(slopes - transposed, np.abs(slopes).max()),
-                16 * EPS * steps,
-                "16 n ε: both modes multiply the same matrices, from one end or the other",
-            ),
-            Row(
-                extreme,
-                f"gradient {np.abs(slopes).max():.1e}, growth said to be {name}, relative to the growth {grown:.1e}",
-                np.abs(slopes).max() / grown if said else np.inf,
-                4.0,
-                "a gradient of places by angles is at most the growth × the length of 2 m × 2 angles",
-            ),
+            Row(extreme, "reverse − forward, relative", largest(forward - reverse, size), 16 * EPS * steps, modes),
+            Row(extreme, compared, size / grown if said else np.inf, 4.0, reach),
         ]
     return rows
