@@ -12,6 +12,7 @@ from lgsens._advice import Advice as Advice, Costs as Costs, direct_or_adjoint a
 from lgsens._cost import measure_costs as measure_costs
 from lgsens._differentiate import Sensitivities as Sensitivities, differentiate as differentiate
 from lgsens._errors import SimulationError as SimulationError
+from lgsens._growth import Growth as Growth, sensitivity_growth as sensitivity_growth
 from lgsens._index_reduced_ode import IndexReducedODE as IndexReducedODE
 from lgsens._kinematics import Kinematics as Kinematics, kinematics as kinematics
 from lgsens._rank import ConstraintRank as ConstraintRank, constraint_rank as constraint_rank

@@ -46,6 +46,13 @@ class AbstractForce(eqx.Module):
         """
 
 
+def _distance(a, b):
+    """|b − a|; of points that coincide, where it has no derivative, the mean of those to both sides: zero."""
+    square = jnp.sum((b - a) ** 2)
+    apart = square > 0.0
+    return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), 0.0)
+
+
 def _frame(bodies: Mapping[str, RigidBody], name: str | None, dtype) -> Frame:
     return ground_frame(dtype) if name is None else bodies[name].frame
 
@@ -89,7 +96,8 @@ class SpringDamper(AbstractForce):
             ℓ₀ is then the reference length.
 
     Give `free_length` or `preload`, not both; with neither the spring is free in the reference
-    configuration. Points that coincide exchange no force. Raises `ValueError` for both, or wrong shapes.
+    configuration. Points that coincide exchange no force, and as reference give ℓ₀ = 0 the derivative zero. Raises
+    `ValueError` for both, or wrong shapes.
     """
 
     a: str | None = eqx.field(static=True)
@@ -114,7 +122,7 @@ class SpringDamper(AbstractForce):
 
     def loads(self, bodies):
         dtype = self.stiffness.dtype
-        free_length = jnp.linalg.norm(self.at_b - self.at_a) if self.free_length is None else self.free_length
+        free_length = _distance(self.at_a, self.at_b) if self.free_length is None else self.free_length
         load = SpringDamperLoad(
             point_a=_frame(bodies, self.a, dtype).local_point(self.at_a),
             point_b=_frame(bodies, self.b, dtype).local_point(self.at_b),

@@ -80,6 +80,9 @@ class SpringDamperLoad(AbstractClosedFormLoad):
     Dᵀ n F are
 
         ∂/∂q = Dᵀ n (k nᵀD + c (sᵀ P D + nᵀS)) + F Dᵀ P D + D_q(Dᵀ f)|_{f = nF},     ∂/∂v = c Dᵀ n nᵀ D.
+
+    Points that meet give no direction: n = 0 there, and no force. A spring whose tension vanishes with its length pulls
+    with k d all the same, so F/|d| is continued by k: f = (F/|d|) d has the tangent k D at d = 0 and not zero.
     """
 
     point_a: Float[Array, "3"]
@@ -93,7 +96,6 @@ class SpringDamperLoad(AbstractClosedFormLoad):
         """n, |d|, and |d| or 1 to divide by."""
         d = b.point(self.point_b) - a.point(self.point_a)
         square = jnp.sum(d * d)
-        # Points that meet give no direction: the force vanishes there instead of being NaN.
         meet = square == 0.0
         length = jnp.where(meet, 0.0, jnp.sqrt(jnp.where(meet, 1.0, square)))
         divisor = jnp.where(meet, 1.0, length)
@@ -109,25 +111,31 @@ class SpringDamperLoad(AbstractClosedFormLoad):
         tension = self.preload + self.stiffness * (length - self.free_length) + self.damping * rate
         return LineForce(length, rate, tension)
 
+    def _per_length(self, line: LineForce):
+        """F/|d|."""
+        meet = line.length == 0.0
+        return jnp.where(meet, self.stiffness, line.tension / jnp.where(meet, 1.0, line.length))
+
     def force(self, a, b, va, vb, t):
-        n, _, _ = self._line(a, b)
-        return -separation_force(a, b, self.point_a, self.point_b, self.measure(a, b, va, vb, t).tension * n)
+        per_length = self._per_length(self.measure(a, b, va, vb, t))
+        d = b.point(self.point_b) - a.point(self.point_a)
+        return -separation_force(a, b, self.point_a, self.point_b, per_length * d)
 
     def tangents(self, a, b, va, vb, t):
         n, _, divisor = self._line(a, b)
-        _, gradient = separation(a, b, self.point_a, self.point_b)
-        tension = self.measure(a, b, va, vb, t).tension
+        d, gradient = separation(a, b, self.point_a, self.point_b)
+        per_length = self._per_length(self.measure(a, b, va, vb, t))
         along = n @ gradient
         speed = gradient @ jnp.concatenate([va, vb])
         turning = jnp.zeros((3, 12), n.dtype)
         turning = turning.at[:, ROTATION_A].set(-a.orientation @ skew(cross(self.point_a, va[ROTATION])))
         turning = turning.at[:, ROTATION_B].set(b.orientation @ skew(cross(self.point_b, vb[ROTATION])))
-        across = (gradient - jnp.outer(n, along)) / divisor  # P D
-        rate_gradient = speed @ across + n @ turning
+        across = gradient - jnp.outer(n, along)  # |d| P D
+        rate_gradient = speed @ across / divisor + n @ turning
         position = (
             jnp.outer(along, self.stiffness * along + self.damping * rate_gradient)
-            + tension * (gradient.T @ across)
-            + separation_stiffness(a, b, self.point_a, self.point_b, tension * n)
+            + per_length * (gradient.T @ across)
+            + separation_stiffness(a, b, self.point_a, self.point_b, per_length * d)
         )
         return LoadTangents(-position, -self.damping * jnp.outer(along, along))
 

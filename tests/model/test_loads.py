@@ -225,6 +225,21 @@ def test_spring_of_coinciding_points_is_finite():
     assert all(np.all(np.isfinite(leaf)) for leaf in values)
 
 
+def test_spring_of_no_length_has_its_tangent_where_its_points_meet():
+    """With tension k |d| it pulls with k d: the tangent on translations is k [−I, I], by formula and by autodiff."""
+    k, zero = jnp.asarray(7.0), jnp.zeros(3)
+    none = jnp.zeros(())
+    load = SpringDamperLoad(zero, zero, k, none, none, none)
+    frame, twist = Frame(zero, jnp.eye(3)), jnp.zeros(6)
+    closed = load.tangents(frame, frame, twist, twist, none).position
+    moved = lambda x: load.force(frame, Frame(x, frame.orientation), twist, twist, none)
+    by_autodiff = jax.jacfwd(moved)(zero)
+    assert closed is not None
+    for force_a, force_b in ((closed[:3, 6:9], closed[6:9, 6:9]), (by_autodiff[:3], by_autodiff[6:9])):
+        np.testing.assert_array_equal(force_a, 7.0 * np.eye(3))
+        np.testing.assert_array_equal(force_b, -7.0 * np.eye(3))
+
+
 # Roads.
 
 TIMES = np.array([-0.5, 0.0, 0.2, 0.21, 0.3, 0.45, 0.699, 0.7, 0.9, 5.0])
