@@ -64,6 +64,7 @@ from lgsens.sensitivity import (
 )
 
 _NAMESPACES = (
+    "accuracy",
     "examples",
     "optimize",
     "plotting",

@@ -1,0 +1,201 @@
+"""What settings cost and lose: a table, as text, as JSON, as a figure."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lgsens.accuracy._reference import Reference
+from lgsens.accuracy._setting import Setting
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SORTS = ("seconds", "cpu_seconds")
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One setting, measured.
+
+    Attributes:
+        setting: the setting.
+        failure: why there are no numbers; "" where there are.
+        seconds, cpu_seconds: time of Ψ and dΨ/dp, of the clock and of the processor, medians [s].
+        compile_seconds: time to trace and compile them [s].
+        temporary_bytes: what the compiled program takes besides its arguments and results; None if it does not say.
+        value: Ψ.
+        gradient: dΨ/dp times the scale of p, flat.
+        value_error, gradient_error: relative to the reference; the gradient's in the norm max |dΨ/dp_i s_i|.
+        violation: max |Φ| over all times [m, –].
+        energy_drift: what is missing from the balance of energy at worst, relative; None where nothing moves.
+        iterations: Newton's iterations per step, or steps per output interval; None where it is not said.
+        unfinished: steps that did not converge or were not reached.
+    """
+
+    setting: Setting
+    failure: str = ""
+    seconds: float = np.nan
+    cpu_seconds: float = np.nan
+    compile_seconds: float = np.nan
+    temporary_bytes: int | None = None
+    value: float = np.nan
+    gradient: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    value_error: float = np.nan
+    gradient_error: float = np.nan
+    violation: float = np.nan
+    energy_drift: float | None = None
+    iterations: float | None = None
+    unfinished: int = 0
+
+    @property
+    def error(self) -> float:
+        """The larger of the two errors; infinite after a failure."""
+        return np.inf if self.failure else max(self.value_error, self.gradient_error)
+
+    @property
+    def name(self) -> str:
+        """The setting with its number of steps."""
+        return f"{self.setting.label}, {self.setting.num_steps} steps"
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Table:
+    """The settings in the order in which they were given; printed, a table.
+
+    Attributes:
+        rows: the settings.
+        reference: what errors refer to.
+        rounds: over how many rounds the times are medians.
+    """
+
+    rows: tuple[Row, ...]
+    reference: Reference
+    rounds: int
+
+    def __iter__(self):
+        return iter(self.rows)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def is_below_reference(self, row: Row) -> bool:
+        """Whether a row is better than the reference can tell."""
+        return row.error <= self.reference.error
+
+    def __str__(self) -> str:
+        width = max([len(row.setting.label) for row in self.rows], default=0)
+        heads = (
+            "steps",
+            "time [ms]",
+            "CPU [ms]",
+            "error of Ψ",
+            "of dΨ/dp",
+            "|Φ|",
+            "energy",
+            "iter.",
+            "memory",
+            "compile",
+        )
+        lines = [f"{'':{width}}" + "".join(f"{head:>11}" for head in heads)]
+        for row in self.rows:
+            start = f"{row.setting.label:{width}}{row.setting.num_steps:>11}"
+            if row.failure:
+                lines.append(f"{start}  failed: {_short(row.failure)}")
+                continue
+            errors = (
+                f"{'<' * (error <= own)}{max(error, own):.1e}"
+                for error, own in (
+                    (row.value_error, self.reference.value_error),
+                    (row.gradient_error, self.reference.gradient_error),
+                )
+            )
+            cells = (
+                *(f"{1e3 * seconds:.4g}" for seconds in (row.seconds, row.cpu_seconds)),
+                *errors,
+                f"{row.violation:.0e}",
+                "–" if row.energy_drift is None else f"{row.energy_drift:.0e}",
+                "–" if row.iterations is None else f"{row.iterations:.1f}",
+                "–" if row.temporary_bytes is None else f"{row.temporary_bytes / 1e6:.3g} MB",
+                f"{row.compile_seconds:.1f} s",
+            )
+            lines.append(start + "".join(f"{cell:>11}" for cell in cells))
+        lines.append(
+            f"reference: Ψ = {self.reference.value:.12g}, errors of Ψ and dΨ/dp "
+            f"{self.reference.value_error:.0e} and {self.reference.gradient_error:.0e}; errors below are marked <"
+        )
+        return "\n".join([*lines, *(f"  {sentence}" for sentence in self.reference.evidence)])
+
+    __repr__ = __str__
+
+    def document(self) -> dict[str, Any]:
+        """Everything, as JSON takes it; numbers that are not finite are None."""
+        reference = {
+            field.name: _plain(getattr(self.reference, field.name)) for field in dataclasses.fields(self.reference)
+        }
+        return {
+            "rounds": self.rounds,
+            "norm": "errors of the gradient: max |Δ dΨ/dp_i s_i| over max |dΨ/dp_i s_i|, s the scale of p",
+            "reference": reference,
+            "rows": [self._entry(row) for row in self.rows],
+        }
+
+    def _entry(self, row: Row) -> dict[str, Any]:
+        fields = [field.name for field in dataclasses.fields(row) if field.name != "setting"]
+        setting = {"setting": row.setting.label, "family": row.setting.curve, "num_steps": row.setting.num_steps}
+        return (
+            setting
+            | {name: _plain(getattr(row, name)) for name in fields}
+            | {"below_reference": self.is_below_reference(row)}
+        )
+
+    def plot(self, targets: Sequence[float] = (), *, by: str = "seconds", title: str = "") -> "Figure":
+        """Error against time, of Ψ and of dΨ/dp side by side, a curve for each family of settings.
+
+        Arguments:
+            targets: errors for which the recommended settings are marked.
+            by: "seconds" or "cpu_seconds".
+            title: over the figure.
+
+        A curve connects what is not beaten in both by another setting of its family; the others are pale. Errors below
+        that of the reference are drawn there. Raises `ImportError` without matplotlib.
+        """
+        from lgsens import plotting
+        from lgsens.accuracy._recommend import recommend
+
+        check_by(by)
+        panels = {}
+        for quantity, member in (("Ψ", "value_error"), ("dΨ/dp", "gradient_error")):
+            own, series = getattr(self.reference, member), {}
+            for row in self.rows:
+                if not row.failure:
+                    series.setdefault(row.setting.curve, []).append(
+                        (1e3 * getattr(row, by), max(getattr(row, member), own))
+                    )
+            panels[quantity] = {
+                name: plotting.WorkPrecision(*map(np.array, zip(*points))) for name, points in series.items()
+            }
+        found = {target: recommend(self, target, by=by).row for target in targets}
+        marks = {target: 1e3 * getattr(row, by) for target, row in found.items() if row is not None}
+        return plotting.work_precision_panels(panels, marks, title=title)
+
+
+def _short(text: str, length: int = 90) -> str:
+    line = " ".join(text.split())
+    return line if len(line) <= length else line[: length - 1] + "…"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return [_plain(number) for number in value.tolist()]
+    if isinstance(value, tuple):
+        return list(value)
+    if isinstance(value, float):
+        return float(value) if np.isfinite(value) else None
+    return value
+
+
+def check_by(by: str) -> None:
+    if by not in SORTS:
+        raise ValueError(f"`by` must be one of {SORTS}, got {by!r}.")
