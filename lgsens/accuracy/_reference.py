@@ -31,6 +31,7 @@ from lgsens.integrate import GeneralizedAlpha
 TARGET = 1e-11  # an error at which a route need not go on
 _TRUSTED = 1e-3  # an error above which a route is no reference
 _LEAST_RATIO = 1 / 8
+_ROUND_OFF = 1e-12  # no error is estimated below: what the round-off of some hundred steps may leave
 _AGREEMENT = 3.0  # the difference of two routes that the sum of their estimated errors explains
 
 
@@ -189,4 +190,5 @@ def _chosen(one: _Route, other: _Route) -> Reference:
             error = tuple(map(max, error, gaps))
     else:
         evidence.append(second.sentence)
-    return Reference(best.found.value, best.found.gradient, error[0], error[1], tuple(evidence), confirmed)
+    value_error, gradient_error = (max(one, _ROUND_OFF) for one in error)
+    return Reference(best.found.value, best.found.gradient, value_error, gradient_error, tuple(evidence), confirmed)
