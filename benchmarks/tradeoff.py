@@ -3,8 +3,8 @@
     python benchmarks/tradeoff.py [--scenes top quarter-car] [--cache FOLDER] [--out benchmarks/results]
 
 Writes tradeoff_NAME.json and tradeoff_NAME.png, prints the tables, the recommendations, and those again as rows for
-README. Most of the time is compilation: with `--cache` compiled programs are kept there, so that a second run measures on a
-machine that is otherwise idle; it then keeps the compile times of the first one, which are in the files.
+README. Most of the time is compilation: with `--cache` compiled programs are kept there, so that a second run
+measures on a machine that is otherwise idle; it then keeps the compile times of the first one, which are in the files.
 """
 
 import argparse
@@ -37,7 +37,7 @@ def measure(name: str, path: Path, rounds: int, cache: str | None) -> None:
 
     from lgsens import plotting
     from lgsens._cli_tradeoff import SCENES, TARGETS, document
-    from lgsens.accuracy import recommend, work_precision
+    from lgsens.accuracy import plot, recommend, work_precision
 
     jax.config.update("jax_enable_x64", True)
     if cache is not None:
@@ -58,7 +58,7 @@ def measure(name: str, path: Path, rounds: int, cache: str | None) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps(record, indent=1, ensure_ascii=False, allow_nan=False)
     path.write_text(text + "\n", encoding="utf-8")
-    plotting.save(table.plot(TARGETS, title=scene.title), path.with_suffix(".png"))
+    plotting.save(plot(table, TARGETS, title=scene.title), path.with_suffix(".png"))
     print(table, *found, sep="\n\n")
 
 

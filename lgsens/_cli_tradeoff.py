@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from lgsens import plotting
 from lgsens._cli_report import output_folder, version
 from lgsens._index_reduced_ode import IndexReducedODE
-from lgsens.accuracy import Recommendation, Setting, Table, grid, ladder, recommend, work_precision
+from lgsens.accuracy import Recommendation, Setting, Table, grid, ladder, plot, recommend, work_precision
 from lgsens.criteria import Criterion
 from lgsens.examples import PROBLEMS, QuarterCar
 from lgsens.integrate import GeneralizedAlpha
@@ -135,7 +135,7 @@ def run(arguments: argparse.Namespace) -> int:
         found = [recommend(table, target, by=arguments.by) for target in arguments.targets]
         text = json.dumps(document(scene, table, found), indent=1, ensure_ascii=False, allow_nan=False)
         (out / "tradeoff.json").write_text(text + "\n", encoding="utf-8")
-        figure = table.plot(arguments.targets, by=arguments.by, title=scene.title)
+        figure = plot(table, arguments.targets, by=arguments.by, title=scene.title)
         plotting.save(figure, out / "tradeoff.png")
     if not arguments.quiet:
         print(table, *found, f"written to {out}: tradeoff.json, tradeoff.png", sep="\n\n")

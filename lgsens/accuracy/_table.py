@@ -1,16 +1,12 @@
 """What settings cost and lose: a table, as text, as JSON, as a figure."""
 
 import dataclasses
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from lgsens.accuracy._reference import Reference
 from lgsens.accuracy._setting import Setting
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 SORTS = ("seconds", "cpu_seconds")
 
@@ -149,36 +145,6 @@ class Table:
             | {name: _plain(getattr(row, name)) for name in fields}
             | {"below_reference": self.is_below_reference(row)}
         )
-
-    def plot(self, targets: Sequence[float] = (), *, by: str = "seconds", title: str = "") -> "Figure":
-        """Error against time, of Ψ and of dΨ/dp side by side, a curve for each family of settings.
-
-        Arguments:
-            targets: errors for which the recommended settings are marked.
-            by: "seconds" or "cpu_seconds".
-            title: over the figure.
-
-        A curve connects what is not beaten in both by another setting of its family; the others are pale. Errors below
-        that of the reference are drawn there. Raises `ImportError` without matplotlib.
-        """
-        from lgsens import plotting
-        from lgsens.accuracy._recommend import recommend
-
-        check_by(by)
-        panels = {}
-        for quantity, member in (("Ψ", "value_error"), ("dΨ/dp", "gradient_error")):
-            own, series = getattr(self.reference, member), {}
-            for row in self.rows:
-                if not row.failure:
-                    series.setdefault(row.setting.curve, []).append(
-                        (1e3 * getattr(row, by), max(getattr(row, member), own))
-                    )
-            panels[quantity] = {
-                name: plotting.WorkPrecision(*map(np.array, zip(*points))) for name, points in series.items()
-            }
-        found = {target: recommend(self, target, by=by).row for target in targets}
-        marks = {target: 1e3 * getattr(row, by) for target, row in found.items() if row is not None}
-        return plotting.work_precision_panels(panels, marks, title=title)
 
 
 def _short(text: str, length: int = 90) -> str:

@@ -98,7 +98,7 @@ def test_text_and_json(table, tmp_path):
     assert [row["num_steps"] for row in document["rows"]] == [setting.num_steps for setting in SETTINGS]
     assert document["rows"][5]["value"] is None and document["rows"][5]["failure"]
     assert document["rows"][0]["gradient_error"] == table.rows[0].gradient_error
-    figure = table.plot((1e-2, 1e-30), title="oscillator")
+    figure = accuracy.plot(table, (1e-2, 1e-30), title="oscillator")
     left, right = figure.axes
     assert left.get_ylabel() == "relative error of Ψ [–]" and right.get_ylabel() == "relative error of dΨ/dp [–]"
     names = {line.get_label() for line in left.lines if not line.get_label().startswith("_")}
