@@ -1,8 +1,10 @@
 """The dial between speed and accuracy, measured on a user's own scene and criterion.
 
-table = lg.accuracy.work_precision(criterion, build, p, t1=1.0)
-print(table, lg.accuracy.recommend(table, 1e-4))
-lg.accuracy.plot(table, targets=(1e-4,))
+    table = lg.accuracy.work_precision(criterion, build, p, t1=1.0)
+    print(table, lg.accuracy.recommend(table, 1e-4))
+    lg.accuracy.plot(table, targets=(1e-4,))
+
+`error_estimate` says of a single run how far off it is.
 """
 
 from lgsens.accuracy._error_estimate import corrected as corrected, error_estimate as error_estimate

@@ -32,6 +32,7 @@ TARGET = 1e-11  # an error at which a route need not go on
 _TRUSTED = 1e-3  # an error above which a route is no reference
 _LEAST_RATIO = 1 / 8
 _ROUND_OFF = 1e-12  # no error is estimated below: what the round-off of some hundred steps may leave
+_HOPELESS = 3  # runs without a finite number at the start, after which there is none to come
 _AGREEMENT = 3.0  # the difference of two routes that the sum of their estimated errors explains
 
 
@@ -122,6 +123,8 @@ def extrapolated(name: str, run: Callable[[int], Evaluated], start: int, levels:
         if not current[0].finite:
             row = []  # too coarse: begin again
             best = best or _Route(name, tuple(steps), current[0], (np.inf, np.inf))
+            if level + 1 == _HOPELESS:
+                break
             continue
         for j, coarser in enumerate(row, 1):
             factor = 1.0 / (2 ** (j + 1) - 1)

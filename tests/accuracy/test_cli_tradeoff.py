@@ -45,6 +45,7 @@ def run(capsys, *arguments):
     return status, *capsys.readouterr()
 
 
+@pytest.mark.slow  # nine programs
 def test_a_file_of_ones_own(tmp_path, capsys):
     """z = 1 + V/ω sin ω, ω² = 20, at t = 1 s."""
     (tmp_path / "mine.py").write_text(FILE + SETTINGS, encoding="utf-8")

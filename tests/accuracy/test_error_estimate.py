@@ -18,7 +18,7 @@ from lgsens.examples import PROBLEMS
 DATA = Path(__file__).parents[1] / "data"
 
 
-@pytest.mark.parametrize("rho_inf", [0.9, 0.2])
+@pytest.mark.parametrize("rho_inf", [pytest.param(0.9, marks=pytest.mark.slow), 0.2])
 def test_a_linear_oscillator(rho_inf):
     """The leading error of z, v and v̇, in closed form: what remains is O(h) of it, ωh = 0.045 here.
 
@@ -86,6 +86,7 @@ def check(name, rho_inf, num_steps, part):
         assert np.log2(coarse / fine) == pytest.approx(2.0, abs=0.3), key  # c₃h³ beside c₂h²
 
 
+@pytest.mark.slow
 def test_the_top():
     check("spinning_top_brulls.l_1.0_alpha0_0.785398", 0.5, 50, 0.3)
 
@@ -112,6 +113,7 @@ def test_bad_input():
         error_estimate(lg.simulate(build(P), t1=T1, num_steps=2))
 
 
+@pytest.mark.slow  # derivatives of a linearization, in both modes
 def test_it_is_traced_like_everything_else():
     """jit, vmap, and a derivative in both modes: of what is estimated, by the stiffness."""
 

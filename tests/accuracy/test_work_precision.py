@@ -1,5 +1,6 @@
 """The dial on a scene in closed form: what the table says is so, and failures are rows."""
 
+import dataclasses
 import json
 
 import diffrax
@@ -15,9 +16,7 @@ DOPRI8 = lg.IndexReducedODE(diffrax.Dopri8())
 IMPATIENT = lg.GeneralizedAlpha(max_iterations=1, factor_every=0)
 SETTINGS = (
     *grid((20, 40)),
-    Setting(20, extrapolate=True),
     Setting(10, DOPRI8),
-    Setting(40, model={"damping": 0.5}, name="damped"),
     Setting(20, IMPATIENT, name="impatient"),
     Setting(20, DOPRI8, options={"sensitivity": lg.AdjointVariable()}, name="forbidden"),
 )
@@ -25,61 +24,66 @@ SETTINGS = (
 
 @pytest.fixture(scope="module")
 def table():
-    return work_precision(CRITERION, build, P, SETTINGS, t1=T1, progress=False)
-
-
-def test_the_reference_knows_its_error(table):
-    """Against the closed form; and as good as order 8 on a sine must be."""
     value, gradient = exact_with_gradient()
-    reference = table.reference
-    assert reference.error < 1e-9 and reference.confirmed
+    reference = accuracy.Reference(value, gradient, 1e-13, 1e-13)
+    return work_precision(CRITERION, build, P, SETTINGS, t1=T1, reference=reference, progress=False)
+
+
+@pytest.mark.slow  # eight programs
+def test_the_reference_knows_its_error():
+    """Against the closed form; and a model with a damper is a row of its own, off by what the damper does."""
+    settings = [Setting(10, DOPRI8, model={"damping": 0.5}), Setting(20, extrapolate=True)]
+    found = work_precision(CRITERION, build, P, settings, t1=T1, progress=False)
+    value, gradient = exact_with_gradient()
+    reference, (row, extrapolated) = found.reference, found.rows
+    assert reference.error < 1e-9 and reference.confirmed and len(reference.evidence) == 2
     assert abs(reference.value / value - 1) <= reference.value_error
     assert np.abs(reference.gradient - gradient).max() / np.abs(gradient).max() <= reference.gradient_error
-    assert len(reference.evidence) == 2
+    # z falls as exp(−ct/2m), Ψ about as its square in the mean: 1 − exp(−ct/m) over t is 0.12
+    assert row.value_error == pytest.approx(0.12, rel=0.3) and not row.failure
+    assert row.energy_drift < 1e-6  # the work of the damper is counted
+    assert 0 < extrapolated.error < 1e-4  # (ωh)⁴/100 for ωh = 0.22, where 40 steps alone have (ωh)²/50
 
 
 def test_errors_are_those_of_the_closed_form(table):
-    """Up to the error of the reference, and round-off."""
     value, gradient = exact_with_gradient()
-    for row in table.rows[:4]:
+    coarse, fine, explicit = rows = table.rows[:3]
+    for row in rows:
         assert not row.failure
-        assert row.value == pytest.approx(value * (1 + np.sign(row.value - value) * row.value_error), rel=2e-9)
+        assert row.value_error == pytest.approx(abs(row.value / value - 1), abs=1e-15)
         actual = np.abs(row.gradient - gradient).max() / np.abs(gradient).max()
-        assert row.gradient_error == pytest.approx(actual, abs=2e-9)
-    coarse, fine, extrapolated, explicit = table.rows[:4]
+        assert row.gradient_error == pytest.approx(actual, abs=1e-15)
     # ωh = 0.22 and 0.11: the next order is (ωh)² of the leading one, and h³ has a small coefficient at ρ∞ = 0.9
     assert coarse.error / fine.error == pytest.approx(4.0, rel=0.1)
-    assert extrapolated.error < 0.1 * fine.error  # that of 40 steps is what extrapolation improves
     assert explicit.error < 1e-4 * fine.error
 
 
 def test_what_else_a_row_says(table):
-    coarse, fine, extrapolated, explicit, damped, impatient, forbidden = table.rows
-    for row in (coarse, fine, extrapolated, explicit, damped):
+    coarse, fine, explicit, impatient, forbidden = table.rows
+    for row in (coarse, fine, explicit):
         assert row.seconds > 0 and row.cpu_seconds > 0 and row.compile_seconds > 0 and row.unfinished == 0
         assert row.temporary_bytes is None or row.temporary_bytes > 0
         assert row.violation == 0.0  # no joint
         assert row.iterations >= 1
-    # Energy: of second order by the scheme; (ωh)⁹ = 7e-4⁹ … by the stages; work of the damper included
+    # of second order by the scheme, of order 8 by the stages
     assert coarse.energy_drift / fine.energy_drift == pytest.approx(4.0, rel=0.15)
-    assert explicit.energy_drift < 1e-6 * fine.energy_drift
-    assert damped.energy_drift < 3 * fine.energy_drift
-    # another model is another criterion: v²t/4·(damping t/m) or so
-    assert 0.05 < damped.value_error < 0.5
-    assert impatient.failure and "Newton" in impatient.failure and impatient.unfinished == 20
+    assert explicit.energy_drift < 1e-4 * fine.energy_drift
+    assert "Newton" in impatient.failure and impatient.unfinished == 20
     assert forbidden.failure.startswith("ValueError: `sensitivity`")
 
 
 def test_recommendations(table):
-    explicit = table.rows[3]
+    explicit = table.rows[2]
     fastest = min((row for row in table if row.error <= 0.05), key=lambda row: row.seconds)
     assert recommend(table, 0.05).row is fastest
+    vague = dataclasses.replace(table, reference=dataclasses.replace(table.reference, value_error=1e-3))
+    assert "reference itself is known to 1e-03 only" in str(recommend(vague, 1e-4))
     best = recommend(table, 2 * explicit.error + table.reference.error)
-    assert best.row is explicit and best.setting is SETTINGS[3] and best.margin > 1
+    assert best.row is explicit and best.setting is SETTINGS[2] and best.margin > 1
     assert str(explicit.setting.num_steps) in str(best) and best
-    none = recommend(table, 1e-13)
-    assert not none and none.row is None and "reference itself" in str(none)
-    with pytest.raises(ValueError, match="reference itself"):
+    none = recommend(table, 0.5 * explicit.error)
+    assert not none and none.row is None and none.margin == 0.0 and "no setting meets it; the best" in str(none)
+    with pytest.raises(ValueError, match="no setting meets it"):
         _ = none.setting
     assert recommend(table, 0.05, by="cpu_seconds")
 
@@ -96,7 +100,7 @@ def test_text_and_json(table, tmp_path):
     assert "impatient" in text and "failed: Newton" in text and "reference: Ψ" in text
     document = json.loads(json.dumps(table.document(), allow_nan=False))
     assert [row["num_steps"] for row in document["rows"]] == [setting.num_steps for setting in SETTINGS]
-    assert document["rows"][5]["value"] is None and document["rows"][5]["failure"]
+    assert document["rows"][3]["value"] is None and document["rows"][3]["failure"]
     assert document["rows"][0]["gradient_error"] == table.rows[0].gradient_error
     figure = accuracy.plot(table, (1e-2, 1e-30), title="oscillator")
     left, right = figure.axes
@@ -107,6 +111,7 @@ def test_text_and_json(table, tmp_path):
     assert lg.plotting.save(figure, tmp_path / "a.png").stat().st_size > 10_000  # an empty canvas has some 3 kB
 
 
+@pytest.mark.slow  # nine programs
 def test_a_function_of_the_trajectory_is_enough():
     """The reference is what the function gives in the limit, its own rule included, and says how well it knows it."""
     fn = lambda trajectory: lg.time_integral(trajectory.t, (trajectory.body("mass").position[:, 2] - 1.0) ** 2)
