@@ -21,23 +21,23 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=["top", "quarter-car"], help="(default: top quarter-car)")
     parser.add_argument("--rounds", type=int, default=5, help="timed calls (default: %(default)s)")
     parser.add_argument("--cache", help="folder for compiled programs (default: none)")
-    parser.add_argument("--table", action="store_true", help="print the rows for README, measure nothing")
+    parser.add_argument("--by", default="cpu_seconds", help="what a setting costs (default: %(default)s)")
+    parser.add_argument("--table", action="store_true", help="recommend and draw again from the JSON, measure nothing")
     arguments = parser.parse_args()
     os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
     for name in arguments.scenes:
         path = arguments.out / f"tradeoff_{name.replace('-', '_')}.json"
         if not arguments.table:
             measure(name, path, arguments.rounds, arguments.cache)
-        print("\n".join(markdown(json.loads(path.read_text(encoding="utf-8")))), end="\n\n")
+        report(path, arguments.by)
 
 
 def measure(name: str, path: Path, rounds: int, cache: str | None) -> None:
-    """Measure a scene and write it to `path` and beside it."""
+    """Measure a scene and write it to `path`."""
     import jax
 
-    from lgsens import plotting
-    from lgsens._cli_tradeoff import SCENES, TARGETS, document
-    from lgsens.accuracy import plot, recommend, work_precision
+    from lgsens._cli_tradeoff import SCENES, document
+    from lgsens.accuracy import work_precision
 
     jax.config.update("jax_enable_x64", True)
     if cache is not None:
@@ -51,29 +51,38 @@ def measure(name: str, path: Path, rounds: int, cache: str | None) -> None:
     table = work_precision(
         *(scene.criterion, scene.build, scene.parameters, scene.settings), t0=scene.t0, t1=scene.t1, rounds=rounds
     )
-    found = [recommend(table, target) for target in TARGETS]
-    record = document(scene, table, found)
+    record = document(scene, table, [])
     for row in record["rows"]:
         row["compile_seconds"] = before.get((row["setting"], row["num_steps"]), row["compile_seconds"])
     path.parent.mkdir(parents=True, exist_ok=True)
+    write(record, path)
+
+
+def write(record: dict, path: Path) -> None:
     text = json.dumps(record, indent=1, ensure_ascii=False, allow_nan=False)
     path.write_text(text + "\n", encoding="utf-8")
-    plotting.save(plot(table, TARGETS, title=scene.title), path.with_suffix(".png"))
-    print(table, *found, sep="\n\n")
 
 
-def markdown(record: dict) -> list[str]:
-    """The recommendations as rows of a table."""
-    lines = []
-    for found in record["recommendations"]:
-        if found["row"] is None:
-            lines.append(f"| {record['scene']} | {found['rtol']:.0e} | none | | | | |")
+def report(path: Path, by: str) -> None:
+    """Recommend, write that too, draw, and print everything."""
+    from lgsens import plotting
+    from lgsens._cli_tradeoff import TARGETS, recommendations
+    from lgsens.accuracy import Table, plot, recommend
+
+    record = json.loads(path.read_text(encoding="utf-8"))
+    table = Table.from_document(record)
+    found = [recommend(table, target, by=by) for target in TARGETS]
+    write(record | {"by": by, "recommendations": recommendations(table, found)}, path)
+    plotting.save(plot(table, TARGETS, by=by, title=record["scene"]), path.with_suffix(".png"))
+    print(table, *found, sep="\n\n", end="\n\n")
+    for one in found:
+        if one.row is None:
+            print(f"| {record['scene']} | {one.rtol:.0e} | none | | | | |")
             continue
-        row = record["rows"][found["row"]]
-        errors = " | ".join(f"{row[key]:.0e}" for key in ("value_error", "gradient_error"))
-        cells = f"`{row['setting']}` | {row['num_steps']} | {errors} | {1e3 * row['seconds']:.3g}"
-        lines.append(f"| {record['scene']} | {found['rtol']:.0e} | {cells} |")
-    return lines
+        row = one.row
+        cells = (record["scene"], f"{one.rtol:.0e}", f"`{row.setting.label}`", str(row.setting.num_steps))
+        numbers = (f"{row.value_error:.0e}", f"{row.gradient_error:.0e}", f"{1e3 * getattr(row, by):.3g}")
+        print(f"| {' | '.join((*cells, *numbers))} |")
 
 
 if __name__ == "__main__":

@@ -51,10 +51,10 @@ def top() -> Scene:
     problem = PROBLEMS["spinning_top_brulls.l_1.0_alpha0_0.785398"]
     alpha, dopri8 = GeneralizedAlpha(0.9), IndexReducedODE(diffrax.Dopri8())
     settings = (
-        *grid((25, 100, 400, 1600, 25_600, 102_400), alpha),
-        *grid((100, 400), GeneralizedAlpha(0.5)),
-        *grid((25, 50, 100, 400, 800), alpha, extrapolate=True),
-        *grid((25, 100, 400), IndexReducedODE()),
+        *grid((25, 100, 400, 1600, 102_400), alpha),
+        *grid((400,), GeneralizedAlpha(0.5)),
+        *grid((25, 100, 400), alpha, extrapolate=True),
+        *grid((25, 100), IndexReducedODE()),
         *grid((10, 15, 20, 30, 50), dopri8),
     )
     return Scene("spinning top", problem.build, problem.criteria["Psi"], problem.parameters, problem.t1, settings)
@@ -83,13 +83,12 @@ def quarter_car() -> Scene:
     heave, rods = {"chassis": "heave"}, {"chassis": "heave", "links": "rods"}
     settings = (
         *grid((28, 76), loose),
-        *grid((200, 800), alpha),
-        *grid((76,), GeneralizedAlpha(0.5, tolerance=1e-5)),
-        *grid((52, 76), loose, model=heave),
+        *grid((200,), alpha),
+        *grid((52,), loose, model=heave),
         *grid((28, 76), loose, model=rods),
         *grid((28, 52), GeneralizedAlpha(tolerance=1e-6), extrapolate=True, model=heave),
-        *grid((60, 200), IndexReducedODE()),
-        *grid((20, 40, 80), dopri8),
+        *grid((60,), IndexReducedODE()),
+        *grid((40,), dopri8),
         *grid((20, 40, 80), dopri8, model=heave),
     )
     return Scene("five-link quarter-car", build, comfort, parameters, 1.0, settings)
@@ -142,29 +141,28 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if all(found) else 1
 
 
-def document(scene: Scene, table: Table, found: list[Recommendation]) -> dict[str, Any]:
-    """Table and recommendations, with what they were measured on, as JSON."""
-    rows = list(table)
+def recommendations(table: Table, found: list[Recommendation]) -> list[dict[str, Any]]:
+    """Recommendations as JSON, with the places of their settings in the table."""
 
     def place(row) -> int | None:
-        return None if row is None else next(i for i, other in enumerate(rows) if other is row)
+        return None if row is None else next(i for i, other in enumerate(table) if other is row)
 
+    return [
+        {"rtol": one.rtol, "row": place(one.row), "cheaper": place(one.cheaper)}
+        | {"margin": one.margin, "reason": one.reason}
+        for one in found
+    ]
+
+
+def document(scene: Scene, table: Table, found: list[Recommendation]) -> dict[str, Any]:
+    """Table and recommendations, with what they were measured on, as JSON."""
     return {
         "scene": scene.title,
         "t0": scene.t0,
         "t1": scene.t1,
         "parameters": jax.tree.map(lambda leaf: jnp.asarray(leaf).tolist(), scene.parameters),
         **table.document(),
-        "recommendations": [
-            {
-                "rtol": one.rtol,
-                "row": place(one.row),
-                "cheaper": place(one.cheaper),
-                "margin": one.margin,
-                "reason": one.reason,
-            }
-            for one in found
-        ],
+        "recommendations": recommendations(table, found),
         "cores": os.cpu_count(),
         "load_average": round(os.getloadavg()[0], 1),
         "device": jax.devices()[0].platform,

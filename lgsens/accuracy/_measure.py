@@ -12,7 +12,7 @@ import numpy as np
 from lgsens._progress import progress_bar
 from lgsens._validate import as_count
 from lgsens.accuracy._balance import quality
-from lgsens.accuracy._programs import FAILURES, Program, Study, failed
+from lgsens.accuracy._programs import Program, Study, failed
 from lgsens.accuracy._reference import Reference, converge
 from lgsens.accuracy._setting import Build, Function, Setting, ladder
 from lgsens.accuracy._table import Row, Table
@@ -113,7 +113,7 @@ def _evaluated(study: Study, setting: Setting, reference: Reference) -> tuple[Ro
         program = Program(study, setting)
         found, trajectory = program.evaluate()
         about = quality(trajectory)
-    except FAILURES as error:
+    except Exception as error:  # whatever compiling and running the user's functions raises
         return Row(setting, failure=failed(study, error).failure), None
     value_error, gradient_error = found.relative(reference.evaluated)
     row = Row(

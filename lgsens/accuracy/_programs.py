@@ -13,9 +13,6 @@ from lgsens._validate import as_float
 from lgsens.accuracy._setting import Build, Function, Setting
 from lgsens.dynamics import RESULTS
 
-# What compiling and running the user's functions may raise; each is a row of the table, with its message.
-FAILURES = (ValueError, TypeError, RuntimeError, ArithmeticError, LookupError, AttributeError, MemoryError)
-
 
 class Study(NamedTuple):
     """What is differentiated: Ψ = fn(trajectory of build(p)), p ± a change of the size `scale`."""
@@ -65,15 +62,14 @@ class Evaluated(NamedTuple):
     def finite(self) -> bool:
         return bool(np.isfinite(self.value) and np.isfinite(self.gradient).all())
 
-    def relative(self, other: "Evaluated", size: "Evaluated | None" = None) -> tuple[float, float]:
-        """How far value and gradient are from the other's, relative to it, or to `size`.
+    def relative(self, other: "Evaluated") -> tuple[float, float]:
+        """How far value and gradient are from the other's, relative to it.
 
         Of the gradient the largest effect of a relative change of a parameter counts. What is zero has the size 1.
         """
-        size = other if size is None else size
-        largest = float(np.abs(size.gradient).max(initial=0.0))
+        largest = float(np.abs(other.gradient).max(initial=0.0))
         return (
-            abs(self.value - other.value) / (abs(size.value) or 1.0),
+            abs(self.value - other.value) / (abs(other.value) or 1.0),
             float(np.abs(self.gradient - other.gradient).max(initial=0.0)) / (largest or 1.0),
         )
 
@@ -119,7 +115,7 @@ def evaluate(study: Study, setting: Setting) -> Evaluated:
     """Value and gradient of a setting; a failure is data."""
     try:
         return Program(study, setting).evaluate()[0]
-    except FAILURES as error:
+    except Exception as error:  # whatever compiling and running the user's functions raises
         return failed(study, error)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from lgsens.accuracy._table import Row, Table, check_by
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Recommendation:
     """What `recommend` found; printed, a few lines, and true if a setting meets the target.
 

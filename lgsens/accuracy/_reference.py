@@ -36,7 +36,7 @@ _HOPELESS = 3  # runs without a finite number at the start, after which there is
 _AGREEMENT = 3.0  # the difference of two routes that the sum of their estimated errors explains
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Reference:
     """Ψ and dΨ/dp as good as they could be had.
 
@@ -99,7 +99,7 @@ def doubled(name: str, run: Callable[[int], Evaluated], start: int, levels: int)
             break  # beyond help: unstable, or not applicable
         if level == 0 or not (values[-1].finite and values[-2].finite):
             continue
-        changes.append(values[-1].relative(values[-2], values[-1]))
+        changes.append(values[-2].relative(values[-1]))
         error = by_doubling([pair[0] for pair in changes]), by_doubling([pair[1] for pair in changes])
         if best is None or max(error) < max(best.error):
             best = _Route(name, tuple(steps), values[-1], error)
@@ -131,7 +131,7 @@ def extrapolated(name: str, run: Callable[[int], Evaluated], start: int, levels:
             current.append(current[-1].combined(1.0 + factor, coarser, -factor))
         row = current
         if len(row) > 1:
-            error = row[-1].relative(row[-2], row[-1])
+            error = row[-2].relative(row[-1])
             if best is None or not max(error) > max(best.error):
                 best = _Route(name, tuple(steps), row[-1], error)
             if len(row) > 2 and max(error) <= enough:

@@ -125,29 +125,23 @@ def _changes(value: Any) -> list[tuple[str, Any]]:
     ]
 
 
+def _is_plain(value: Any) -> bool:
+    return not dataclasses.is_dataclass(value) or isinstance(value, type)
+
+
 def described(value: Any) -> str:
     """A value as it is written in Python, defaults left out."""
-    if not dataclasses.is_dataclass(value) or isinstance(value, type):
+    if _is_plain(value):
         return repr(value)
-    inside = ", ".join(f"{name}={described(given)}" for name, given in _changes(value))
-    return f"{type(value).__name__}({_plain(value) if _is_foreign(value) else inside})"
+    return f"{type(value).__name__}({', '.join(f'{name}={described(given)}' for name, given in _changes(value))})"
 
 
 def kind(value: Any) -> str:
     """`described` without numbers."""
-    if not dataclasses.is_dataclass(value) or isinstance(value, type):
+    if _is_plain(value):
         return repr(value)
-    inside = [kind(given) for _, given in _changes(value) if dataclasses.is_dataclass(given)]
-    return type(value).__name__ + (f"({', '.join(inside)})" if inside and not _is_foreign(value) else "")
-
-
-def _is_foreign(value: Any) -> bool:
-    """Whether it is of another library, a scheme of diffrax say, whose fields say nothing here."""
-    return not type(value).__module__.startswith("lgsens")
-
-
-def _plain(_: Any) -> str:
-    return ""
+    inside = [kind(given) for _, given in _changes(value) if not _is_plain(given)]
+    return type(value).__name__ + (f"({', '.join(inside)})" if inside else "")
 
 
 def grid(num_steps: Any, *integrators: Any, **options: Any) -> tuple[Setting, ...]:

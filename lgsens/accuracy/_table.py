@@ -1,6 +1,7 @@
 """What settings cost and lose: a table, as text, as JSON, as a figure."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from lgsens.accuracy._setting import Setting
 SORTS = ("seconds", "cpu_seconds")
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Row:
     """One setting, measured.
 
@@ -56,7 +57,7 @@ class Row:
         return f"{self.setting.label}, {self.setting.num_steps} steps"
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Table:
     """The settings in the order in which they were given; printed, a table.
 
@@ -69,6 +70,21 @@ class Table:
     rows: tuple[Row, ...]
     reference: Reference
     rounds: int
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> "Table":
+        """The table of a `document`, to be printed, drawn and asked again; settings keep their names only."""
+        rows = []
+        for entry in document["rows"]:
+            names = [field.name for field in dataclasses.fields(Row) if field.name != "setting"]
+            optional = ("temporary_bytes", "energy_drift", "iterations")
+            given = {name: _number(entry[name], name in optional) for name in names}
+            setting = Setting(entry["num_steps"], name=entry["setting"], family=entry["family"])
+            rows.append(Row(setting, **given))
+        names = [field.name for field in dataclasses.fields(Reference)]
+        reference = {name: _number(document["reference"][name]) for name in names}
+        reference["evidence"] = tuple(document["reference"]["evidence"])
+        return cls(tuple(rows), Reference(**reference), document["rounds"])
 
     def __iter__(self):
         return iter(self.rows)
@@ -150,6 +166,13 @@ class Table:
 def _short(text: str, length: int = 90) -> str:
     line = " ".join(text.split())
     return line if len(line) <= length else line[: length - 1] + "…"
+
+
+def _number(value: Any, optional: bool = False) -> Any:
+    """The inverse of `_plain`, where None stands for a number that is not finite unless it is `optional`."""
+    if isinstance(value, list):
+        return np.array([_number(number) for number in value])
+    return np.nan if value is None and not optional else value
 
 
 def _plain(value: Any) -> Any:

@@ -102,6 +102,8 @@ def test_text_and_json(table, tmp_path):
     assert [row["num_steps"] for row in document["rows"]] == [setting.num_steps for setting in SETTINGS]
     assert document["rows"][3]["value"] is None and document["rows"][3]["failure"]
     assert document["rows"][0]["gradient_error"] == table.rows[0].gradient_error
+    again = accuracy.Table.from_document(document)
+    assert str(again) == str(table) and str(recommend(again, 0.05)) == str(recommend(table, 0.05))
     figure = accuracy.plot(table, (1e-2, 1e-30), title="oscillator")
     left, right = figure.axes
     assert left.get_ylabel() == "relative error of Ψ [–]" and right.get_ylabel() == "relative error of dΨ/dp [–]"
