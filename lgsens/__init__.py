@@ -67,6 +67,7 @@ from lgsens.sensitivity import (
 )
 
 _NAMESPACES = (
+    "accuracy",
     "examples",
     "optimize",
     "plotting",

@@ -10,7 +10,7 @@ from typing import NoReturn
 
 import jax
 
-from lgsens import _cli_curves, _cli_optimize, _cli_paper, _cli_top
+from lgsens import _cli_curves, _cli_optimize, _cli_paper, _cli_top, _cli_tradeoff
 from lgsens._cli_report import version
 from lgsens._errors import SimulationError
 from lgsens.examples import PARAMETERS
@@ -155,11 +155,48 @@ def _parser() -> argparse.ArgumentParser:
     paper.add_argument("--coarse", action="store_true", help="two large steps instead of four or five: a quick look")
     paper.add_argument("--quiet", action="store_true", help="no progress bar and no tables")
     paper.set_defaults(run=_cli_paper.run)
+
+    tradeoff = commands.add_parser(
+        "tradeoff",
+        help="measure speed against accuracy",
+        description="What settings of the simulation cost on a scene, what they lose of a criterion and of its "
+        "gradient, and the cheapest for each target. A program is compiled for every setting: minutes.",
+    )
+    tradeoff.add_argument(
+        "scene",
+        metavar="SCENE",
+        help=f"{', '.join(_cli_tradeoff.SCENES)}, or FILE.py that defines `build(p)`, `criterion(trajectory)`, "
+        "`parameters` and `t1`, and if it likes `settings`, `scale` and `t0`, as in lgsens.accuracy.work_precision",
+    )
+    tradeoff.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/tradeoff"),
+        metavar="DIR",
+        help="new folder for tradeoff.json and tradeoff.png (default: %(default)s)",
+    )
+    tradeoff.add_argument("--overwrite", action="store_true", help="write into --out even if it exists")
+    tradeoff.add_argument(
+        "--targets",
+        type=_positive,
+        nargs="+",
+        default=list(_cli_tradeoff.TARGETS),
+        help="relative errors for which to recommend a setting (default: 1e-2 1e-4 1e-6 1e-8)",
+    )
+    tradeoff.add_argument("--rounds", type=_count, default=5, help="timed calls, at least 5 (default: %(default)s)")
+    tradeoff.add_argument(
+        "--by",
+        choices=["seconds", "cpu_seconds"],
+        default="seconds",
+        help="the cost: time of the clock or of the processor (default: %(default)s)",
+    )
+    tradeoff.add_argument("--quiet", action="store_true", help="no progress bar and no table")
+    tradeoff.set_defaults(run=_cli_tradeoff.run)
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit status: 0 success, 1 no feasible design, 2 bad input."""
+    """Run the command line and return its exit status: 0 success, 1 no feasible design or setting, 2 bad input."""
     # Names and units are not ASCII; a terminal that cannot show them gets a question mark, not an exception.
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

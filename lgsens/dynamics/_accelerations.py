@@ -74,6 +74,8 @@ class ConstrainedInertia(eqx.Module):
         inverse, jacobian = lax.stop_gradient((self.inertia.inverse, self.jacobian))
         f, c = rhs[: inverse.shape[0]], rhs[inverse.shape[0] :]
         free = inverse @ f
+        if c.shape[0] == 0:  # XLA compiles no triangular solve of size 0 where it cannot remove it
+            return free
         mu = self.scale * jsl.cho_solve((self.factor, True), self.scale * (jacobian @ free - c))
         return jnp.concatenate([free - inverse @ (mu @ jacobian), mu])
 

@@ -10,6 +10,7 @@ from lgsens.plotting._errors import (
     WorkPrecision as WorkPrecision,
     errors as errors,
     work_precision as work_precision,
+    work_precision_panels as work_precision_panels,
 )
 from lgsens.plotting._histories import Panel as Panel, convergence as convergence, time_histories as time_histories
 from lgsens.plotting._mechanism import mechanism as mechanism

@@ -132,8 +132,7 @@ def work_precision(
     axes = fig.add_subplot()
     unit = cost.partition("[")[2].partition("]")[0]
     for i, (name, method) in enumerate(methods.items()):
-        if not np.all(np.asarray(method.cost) > 0):
-            raise ValueError(f"`methods[{name!r}]`: costs must be positive, got {method.cost}.")
+        _check_costs(name, method)
         label = name
         if target is not None:
             price = method.cost_of(target)
@@ -142,9 +141,63 @@ def work_precision(
         x, y = (np.asarray(array, float)[order] for array in method)
         axes.loglog(x, y, label=label, **CURVES[i % len(CURVES)])
     if target is not None:
-        axes.axhline(target, color=LIMIT, linestyle=(0, (5, 3)), linewidth=1.2)
-        axes.text(0.01, target, f"target {target:g}", color=LIMIT, va="bottom", transform=axes.get_yaxis_transform())
+        _target_line(axes, target)
     plain(axes)
     axes.set(xlabel=cost, ylabel=error, title=title)
     axes.legend(frameon=False, title=None if target is None else "cost at the target")
     return fig
+
+
+def work_precision_panels(
+    panels: Mapping[str, Mapping[str, WorkPrecision]],
+    chosen: Mapping[float, float] | None = None,
+    *,
+    cost: str = "time [ms]",
+    title: str = "",
+) -> "Figure":
+    """Errors of several quantities against cost, side by side, one curve per method, in one legend below.
+
+    Arguments:
+        panels: costs and errors of the methods, by the name of the quantity and that of the method.
+        chosen: the cost of the setting that is recommended for each target.
+        cost: label of the horizontal axis, with its unit.
+        title: over the figure.
+
+    A curve connects the settings of a method of which no other is both cheaper and better; the others are pale. Raises
+    `ValueError` for costs that are not positive, `ImportError` without matplotlib.
+    """
+    fig = figure(1.6 + 4.8 * len(panels), 5.6)
+    all_axes = fig.subplots(1, len(panels), squeeze=False, sharey=True).ravel()
+    names = list(dict.fromkeys(name for methods in panels.values() for name in methods))
+    handles: dict[str, Any] = {}
+    for axes, (quantity, methods) in zip(all_axes, panels.items()):
+        axes.set(xscale="log", yscale="log", xlabel=cost, ylabel=f"relative error of {quantity} [–]")
+        for name, method in methods.items():
+            _check_costs(name, method)
+            style = CURVES[names.index(name) % len(CURVES)]
+            order = np.argsort(method.cost)
+            x, y = (np.asarray(array, float)[order] for array in method)
+            best = y < np.minimum.accumulate(np.concatenate([[np.inf], y[:-1]]))
+            (handles[name],) = axes.plot(x[best], y[best], label=name, **style)
+            axes.plot(x[~best], y[~best], **style | {"linestyle": "", "alpha": 0.3})
+        for target, price in (chosen or {}).items():
+            _target_line(axes, target, "")
+            axes.plot(price, target, marker="*", markersize=13, color=LIMIT, linestyle="", zorder=3)
+            axes.annotate(f"{target:g}", (price, target), (6, 4), textcoords="offset points", color=LIMIT)
+        plain(axes)
+    style = {"ncols": 2 if len(names) > 3 else max(len(names), 1), "frameon": False, "handlelength": 3.5}
+    fig.legend(handles=list(handles.values()), loc="outside lower center", **style)
+    if title:
+        fig.suptitle(title)
+    return fig
+
+
+def _check_costs(name: str, method: WorkPrecision) -> None:
+    if not np.all(np.asarray(method.cost) > 0):
+        raise ValueError(f"`methods[{name!r}]`: costs must be positive, got {method.cost}.")
+
+
+def _target_line(axes: "Axes", target: float, text: str = "target ") -> None:
+    axes.axhline(target, color=LIMIT, linestyle=(0, (5, 3)), linewidth=1.2 if text else 0.6)
+    if text:
+        axes.text(0.01, target, f"{text}{target:g}", color=LIMIT, va="bottom", transform=axes.get_yaxis_transform())

@@ -1,0 +1,16 @@
+"""The dial between speed and accuracy, measured on a user's own scene and criterion.
+
+    table = lg.accuracy.work_precision(criterion, build, p, t1=1.0)
+    print(table, lg.accuracy.recommend(table, 1e-4))
+    lg.accuracy.plot(table, targets=(1e-4,))
+
+`error_estimate` says of a single run how far off it is.
+"""
+
+from lgsens.accuracy._error_estimate import corrected as corrected, error_estimate as error_estimate
+from lgsens.accuracy._measure import work_precision as work_precision
+from lgsens.accuracy._plot import plot as plot
+from lgsens.accuracy._recommend import Recommendation as Recommendation, recommend as recommend
+from lgsens.accuracy._reference import Reference as Reference
+from lgsens.accuracy._setting import Setting as Setting, grid as grid, ladder as ladder
+from lgsens.accuracy._table import Row as Row, Table as Table

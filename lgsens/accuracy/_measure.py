@@ -1,0 +1,130 @@
+"""Settings side by side: time, compile time, memory, errors of Ψ and dΨ/dp."""
+
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from lgsens._progress import progress_bar
+from lgsens._validate import as_count
+from lgsens.accuracy._balance import quality
+from lgsens.accuracy._programs import Program, Study, failed
+from lgsens.accuracy._reference import Reference, converge
+from lgsens.accuracy._setting import Build, Function, Setting, ladder
+from lgsens.accuracy._table import Row, Table
+
+_LEAST_ROUNDS = 5
+_TOGETHER = 8  # programs at a time: Linux gives a process 65,530 memory maps, and a large scene takes thousands each
+
+
+def work_precision(
+    fn: Function,
+    build: Build,
+    p: Any,
+    settings: Iterable[Setting] | None = None,
+    *,
+    t0=0.0,
+    t1,
+    scale: Any = None,
+    reference: Reference | None = None,
+    rounds: int = _LEAST_ROUNDS,
+    progress: bool = True,
+) -> Table:
+    """What each setting costs on a scene, and what it loses of a criterion Ψ and of its gradient.
+
+        errors:  |Ψ − Ψ*| / |Ψ*|,     max_i |dΨ/dp_i − dΨ*/dp_i| s_i / max_i |dΨ*/dp_i| s_i
+
+    Arguments:
+        fn: the criterion, a function of a trajectory, or a `Criterion`. Integrals by
+            `time_integral(t, f, order=trajectory.order)`, or better by a `Criterion`, do not lose what a scheme of high
+            order gains; samples of a trajectory at times of one's own lose it.
+        build: p ↦ model; the options `model` of a setting come as keyword arguments.
+        p: the parameters, a pytree of floats.
+        settings: what to measure; None: `ladder()`.
+        t0, t1: initial and final time [s], shape ().
+        scale: s, the size of a large change of each parameter, a pytree as `p` of numbers or of arrays of its shapes;
+            None: the largest entry of each leaf, or 1 where it is zero.
+        reference: Ψ* and dΨ*/dp; None: two routes converge one, from the fewest steps of the settings on, with the
+            builder's default options.
+        rounds: times are medians of so many calls, at least 5, after one that warms up; settings take turns, eight at
+            a time.
+        progress: show a bar, where tqdm is installed.
+
+    One program is compiled for every setting, and half a dozen for the reference. A setting that fails is a row that
+    says why. Raises `ValueError` for bad arguments, and where no reference is found.
+    """
+    settings = tuple(ladder() if settings is None else settings)
+    if not settings or not all(isinstance(setting, Setting) for setting in settings):
+        raise ValueError("`settings` must be values of Setting, at least one; `ladder` and `grid` make them.")
+    if as_count(rounds, "rounds") < _LEAST_ROUNDS:
+        raise ValueError(f"`rounds` must be at least {_LEAST_ROUNDS}, got {rounds}: a median of fewer says little.")
+    study = Study.of(fn, build, p, scale, t0, t1)
+    if reference is not None and np.shape(reference.gradient) != study.scale.shape:
+        raise ValueError(
+            f"`reference`: its gradient must have shape {study.scale.shape}, got {np.shape(reference.gradient)}."
+        )
+    with progress_bar(len(settings) + (6 if reference is None else 0), "program", progress) as bar:
+
+        def done() -> None:
+            bar.update()
+            jax.clear_caches()
+
+        if reference is None:
+            reference = converge(study, min(setting.num_steps for setting in settings), done)
+        rows = []
+        for i in range(0, len(settings), _TOGETHER):
+            rows += _measured(study, settings[i : i + _TOGETHER], reference, rounds, bar.update)
+            jax.clear_caches()
+    return Table(tuple(rows), reference, rounds)
+
+
+def _measured(
+    study: Study, settings: Sequence[Setting], reference: Reference, rounds: int, done: Callable[[], Any]
+) -> list[Row]:
+    """The rows of a few settings, that take turns."""
+    rows, programs = [], []
+    for setting in settings:
+        row, program = _evaluated(study, setting, reference)
+        rows.append(row)
+        programs.append(program)
+        done()
+    running = [i for i, row in enumerate(rows) if not row.failure]
+    clock: dict[int, list[float]] = {i: [] for i in running}
+    processor: dict[int, list[float]] = {i: [] for i in running}
+    for _ in range(rounds):
+        for i in running:
+            started, busy = time.perf_counter(), time.process_time()
+            programs[i]()
+            clock[i].append(time.perf_counter() - started)
+            processor[i].append(time.process_time() - busy)
+    for i in running:
+        seconds, cpu_seconds = statistics.median(clock[i]), statistics.median(processor[i])
+        rows[i] = dataclasses.replace(rows[i], seconds=seconds, cpu_seconds=cpu_seconds)
+    return rows
+
+
+def _evaluated(study: Study, setting: Setting, reference: Reference) -> tuple[Row, Program | None]:
+    """A row without its times."""
+    try:
+        program = Program(study, setting)
+        found, trajectory = program.evaluate()
+        about = quality(trajectory)
+    except Exception as error:  # whatever compiling and running the user's functions raises
+        return Row(setting, failure=failed(study, error).failure), None
+    value_error, gradient_error = found.relative(reference.evaluated)
+    row = Row(
+        setting,
+        failure=found.failure,
+        compile_seconds=program.compile_seconds,
+        temporary_bytes=program.temporary_bytes,
+        value=found.value,
+        gradient=found.gradient,
+        value_error=value_error,
+        gradient_error=gradient_error,
+        **about._asdict(),
+    )
+    return row, program

@@ -1,0 +1,178 @@
+"""A setting of the dial: what is chosen between speed and accuracy, as one value."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from lgsens._index_reduced_ode import IndexReducedODE
+from lgsens._richardson import richardson
+from lgsens._simulate import simulate
+from lgsens._trajectory import Trajectory
+from lgsens._validate import as_count
+from lgsens.criteria import Criterion
+from lgsens.dynamics import RESULTS
+from lgsens.integrate import GeneralizedAlpha
+
+# A user's own function: of the trajectory, or a `Criterion`, which is one of the trajectory and the parameters.
+Function = Callable[[Trajectory], Any] | Criterion
+Build = Callable[..., Any]
+
+
+def _items(options: Any) -> tuple[tuple[str, Any], ...]:
+    if not isinstance(options, Mapping):
+        try:
+            options = dict(options)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"Setting: options must be a dict of names and values, got {options!r}.") from error
+    return tuple(sorted(options.items()))
+
+
+class Setting(eqx.Module):
+    """How a simulation is done: steps, integrator, and the version of the model.
+
+    Arguments:
+        num_steps: the number of steps, or of output intervals, of `simulate`.
+        integrator: anything that `simulate` takes.
+        extrapolate: evaluate the criterion with `num_steps` and with twice as many steps and extrapolate it, by
+            `richardson`. For schemes of second order; a criterion with a kink between two steps loses less than by
+            `integrator=Richardson(…)`, which extrapolates the states.
+        model: keyword arguments for the builder of the model, `{"links": "rods"}`: its fidelity, a linear solver.
+        options: further keyword arguments for `simulate`.
+        name: how tables call it; else what differs from the defaults.
+        family: settings of one family are one curve in the plot; else the integrator and the version of the model.
+
+    All static and hashable. Raises `ValueError` for a number of steps that is none.
+    """
+
+    num_steps: int = eqx.field(static=True)
+    integrator: Any = eqx.field(static=True, default=GeneralizedAlpha())
+    extrapolate: bool = eqx.field(static=True, default=False, kw_only=True)
+    model: Any = eqx.field(static=True, default=(), kw_only=True, converter=_items)
+    options: Any = eqx.field(static=True, default=(), kw_only=True, converter=_items)
+    name: str = eqx.field(static=True, default="", kw_only=True)
+    family: str = eqx.field(static=True, default="", kw_only=True)
+
+    def __check_init__(self):
+        as_count(self.num_steps, "num_steps", " (it is static)")
+
+    @property
+    def label(self) -> str:
+        """The name, or the integrator and the options as they are written in Python."""
+        return self.name or self._described(described(self.integrator))
+
+    @property
+    def curve(self) -> str:
+        """The family, or what the integrator and the options are without their numbers."""
+        return self.family or self._described(kind(self.integrator))
+
+    def _described(self, integrator: str) -> str:
+        options = [f"{name}={value!r}" for name, value in (*self.model, *self.options)]
+        return ", ".join(["extrapolated " * self.extrapolate + integrator, *options])
+
+    def trajectory(self, build: Build, p: Any, *, t0=0.0, t1, throw: bool = True) -> Trajectory:
+        """The motion of build(p), with `num_steps` steps; arguments as in `evaluate`."""
+        return self._run(build, p, self.num_steps, t0, t1, throw)
+
+    def _run(self, build: Build, p, num_steps: int, t0, t1, throw: bool) -> Trajectory:
+        model = build(p, **dict(self.model))
+        return simulate(
+            model,
+            t0=t0,
+            t1=t1,
+            num_steps=num_steps,
+            integrator=self.integrator,
+            throw=throw,
+            **dict(self.options),
+        )
+
+    def evaluate(self, fn: Function, build: Build, p: Any, *, t0=0.0, t1, throw: bool = True) -> Any:
+        """Ψ of the parameters p with this setting, to be differentiated as usual.
+
+        Arguments:
+            fn: the criterion, a function of a trajectory or a `Criterion`.
+            build: p ↦ model; the options `model` of the setting come as keyword arguments.
+            p: the parameters, a pytree.
+            t0, t1: initial and final time [s], shape ().
+            throw: raise if the simulation fails.
+        """
+        return self.value_and_trajectory(fn, build, p, t0=t0, t1=t1, throw=throw)[0]
+
+    def value_and_trajectory(self, fn: Function, build: Build, p, *, t0=0.0, t1, throw: bool = True):
+        """`evaluate`, and the motion behind it: of two runs the finer one, with the result of both."""
+
+        def one(num_steps: int):
+            found = self._run(build, p, num_steps, t0, t1, throw)
+            return (fn(found, p) if isinstance(fn, Criterion) else fn(found)), found
+
+        value, trajectory = one(self.num_steps)
+        if not self.extrapolate:
+            return value, trajectory
+        finer, fine = one(2 * self.num_steps)
+        value = richardson(lambda n: value if n == self.num_steps else finer, self.num_steps).value
+        result = jnp.where(trajectory.result == RESULTS.successful, fine.result, trajectory.result)
+        return value, eqx.tree_at(lambda found: found.result, fine, result)
+
+
+def _changes(value: Any) -> list[tuple[str, Any]]:
+    """The fields of a dataclass that are not the default."""
+    return [
+        (field.name, getattr(value, field.name))
+        for field in dataclasses.fields(value)
+        if getattr(value, field.name) != field.default
+    ]
+
+
+def _is_plain(value: Any) -> bool:
+    return not dataclasses.is_dataclass(value) or isinstance(value, type)
+
+
+def described(value: Any) -> str:
+    """A value as it is written in Python, defaults left out."""
+    if _is_plain(value):
+        return repr(value)
+    return f"{type(value).__name__}({', '.join(f'{name}={described(given)}' for name, given in _changes(value))})"
+
+
+def kind(value: Any) -> str:
+    """`described` without numbers."""
+    if _is_plain(value):
+        return repr(value)
+    inside = [kind(given) for _, given in _changes(value) if not _is_plain(given)]
+    return type(value).__name__ + (f"({', '.join(inside)})" if inside else "")
+
+
+def grid(num_steps: Any, *integrators: Any, **options: Any) -> tuple[Setting, ...]:
+    """Every integrator with every number of steps.
+
+    Arguments:
+        num_steps: numbers of steps, a sequence of ints.
+        integrators: values of `integrator=` of `simulate`; none: `GeneralizedAlpha()`.
+        options: `extrapolate`, `model`, `options`, `family` of all of them, as in `Setting`.
+    """
+    integrators = integrators or (GeneralizedAlpha(),)
+    return tuple(Setting(n, integrator, **options) for integrator in integrators for n in num_steps)
+
+
+def ladder(coarsest: int = 50, *, model: Mapping[str, Any] | None = None) -> tuple[Setting, ...]:
+    """A ladder of settings that covers a few digits to many: steps × ρ∞ × routes.
+
+    Arguments:
+        coarsest: the fewest steps that the motion can be resolved with: about ten in its shortest period.
+        model: options for the builder, as in `Setting`.
+
+    Seventeen settings: generalized-α with ρ∞ = 0.9 and 0.5, its criteria extrapolated, and explicit Runge–Kutta schemes
+    of order 5 and 8 on the index-reduced equations, which fail where forces are stiff. `grid` makes others.
+    """
+    import diffrax  # takes its time to import
+
+    n, options = as_count(coarsest, "coarsest"), {"model": model or {}}
+    return (
+        *grid([n * k for k in (1, 4, 16, 64)], GeneralizedAlpha(0.9), **options),
+        *grid([n * k for k in (4, 16)], GeneralizedAlpha(0.5), **options),
+        *grid([n * k for k in (1, 2, 4, 8)], GeneralizedAlpha(0.9), extrapolate=True, **options),
+        *grid([n * k for k in (1, 2, 4)], IndexReducedODE(), **options),
+        *grid([-(-n // 2), n, 2 * n, 4 * n], IndexReducedODE(diffrax.Dopri8()), **options),
+    )

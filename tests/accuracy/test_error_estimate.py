@@ -1,0 +1,129 @@
+"""The error of one run, estimated from that run, against errors that are known otherwise."""
+
+import functools
+import json
+from pathlib import Path
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oscillator import T1, P, V, build
+
+import lgsens as lg
+from lgsens.accuracy import corrected, error_estimate
+from lgsens.examples import PROBLEMS
+
+DATA = Path(__file__).parents[1] / "data"
+
+
+@pytest.mark.parametrize("rho_inf", [pytest.param(0.9, marks=pytest.mark.slow), 0.2])
+def test_a_linear_oscillator(rho_inf):
+    """The leading error of z, v and v̇, in closed form: what remains is O(h) of it, ωh = 0.045 here.
+
+    v̇ of the second half only: with ρ∞ = 0.9 transients last twenty steps.
+    """
+    scheme = lg.GeneralizedAlpha(rho_inf)
+    trajectory = lg.simulate(build(P), t1=T1, num_steps=100, integrator=scheme)
+    estimate, w = error_estimate(trajectory, scheme), np.sqrt(P["k"] / P["m"])
+    z, t = trajectory.body("mass").position[:, 2] - 1.0, trajectory.t
+    states = trajectory.states
+    true = {
+        "w": V / w * np.sin(w * t) - z,
+        "v": V * np.cos(w * t) - states.v[:, 0],
+        "vdot": -V * w * np.sin(w * t) - states.vdot[:, 0],
+    }
+    for name, error in true.items():
+        left = np.abs(getattr(estimate, name)[:, 0] - error)[50:]
+        assert left.max() < 0.1 * np.abs(error).max(), name
+
+
+@functools.cache
+def compared(name: str, rho_inf: float, num_steps: int):
+    """Errors of a reference problem's run, true and estimated, and of its criteria."""
+    problem = PROBLEMS[name]
+    scheme = lg.GeneralizedAlpha(rho_inf)
+    trajectory = problem.simulate(problem.parameters, num_steps=num_steps, integrator=scheme)
+    estimate = error_estimate(trajectory, scheme)
+    exact = explicit(name)
+    stride = (exact.t.shape[0] - 1) // num_steps
+    states, group = jax.tree.map(lambda leaf: leaf[::stride], exact.states), trajectory.system.group
+    w = jax.vmap(lambda q, exact: group.log(group.compose(group.inverse(q), exact)))(trajectory.states.q, states.q)
+    true = {"w": w} | {key: getattr(states, key) - getattr(trajectory.states, key) for key in ("v", "vdot", "lam")}
+    values = problem.evaluate(trajectory, problem.parameters)
+    better = problem.evaluate(corrected(trajectory, estimate), problem.parameters)
+    reference = problem.reference(json.loads((DATA / problem.file).read_text(encoding="utf-8")))
+    criteria = {key: (reference[key].value - value, better[key] - value) for key, value in values.items()}
+    return true, estimate, criteria
+
+
+@functools.cache
+def explicit(name: str):
+    """The motion by another method, of order 8: at these steps it is exact beside errors of 1e-4."""
+    problem = PROBLEMS[name]
+    integrator = lg.IndexReducedODE(diffrax.Dopri8())
+    return problem.simulate(problem.parameters, num_steps=200, integrator=integrator)
+
+
+def check(name, rho_inf, num_steps, part):
+    """The estimate leaves less than this part of the error, and both fall by four with half the step.
+
+    Of v̇ and λ after a quarter of the time, when the transients of the first steps have gone.
+    """
+    sizes = {}
+    for n in (num_steps, 2 * num_steps):
+        true, estimate, criteria = compared(name, rho_inf, n)
+        for key, error in true.items():
+            start = n // 4 if key in ("vdot", "lam") else 0
+            found = getattr(estimate, key)
+            assert np.abs(found - error)[start:].max() < part * np.abs(error)[start:].max(), (n, key)
+            sizes.setdefault(key, []).append(np.abs(found)[start:].max())
+        for key, (error, found) in criteria.items():
+            assert abs(found - error) < part * abs(error), (n, key)
+            sizes.setdefault(key, []).append(abs(float(found)))
+    for key, (coarse, fine) in sizes.items():
+        assert np.log2(coarse / fine) == pytest.approx(2.0, abs=0.3), key  # c₃h³ beside c₂h²
+
+
+@pytest.mark.slow
+def test_the_top():
+    check("spinning_top_brulls.l_1.0_alpha0_0.785398", 0.5, 50, 0.3)
+
+
+@pytest.mark.slow  # a closed loop: three more programs
+def test_the_four_bar():
+    check("four_bar_spring", 0.5, 100, 0.3)
+
+
+def test_an_estimate_that_is_there_is_kept():
+    trajectory = lg.simulate(build(P), t1=T1, num_steps=5, integrator=lg.Richardson())
+    assert error_estimate(trajectory) is trajectory.error
+
+
+def test_bad_input():
+    trajectory = lg.simulate(build(P), t1=T1, num_steps=5, integrator=lg.GeneralizedAlpha(0.5))
+    with pytest.raises(
+        ValueError, match=r"not one of GeneralizedAlpha\(\) in equal steps; give the one that it is from"
+    ):
+        error_estimate(trajectory)
+    with pytest.raises(ValueError, match="`integrator` must be a GeneralizedAlpha"):
+        error_estimate(trajectory, lg.IndexReducedODE())
+    with pytest.raises(ValueError, match="at least 3 steps, got 2"):
+        error_estimate(lg.simulate(build(P), t1=T1, num_steps=2))
+
+
+@pytest.mark.slow  # derivatives of a linearization, in both modes
+def test_it_is_traced_like_everything_else():
+    """jit, vmap, and a derivative in both modes: of what is estimated, by the stiffness."""
+
+    def size(k):
+        trajectory = lg.simulate(build({"k": k, "m": 2.0}), t1=T1, num_steps=5)
+        return jnp.sum(error_estimate(trajectory).w ** 2)
+
+    stiffnesses = jnp.array([40.0, 50.0])
+    forward, reverse = (jax.jit(jax.vmap(mode(size)))(stiffnesses) for mode in (jax.jacfwd, jax.grad))
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9)  # round-off over h³, twice
+    step = 1e-2
+    difference = (size(40.0 + step) - size(40.0 - step)) / (2 * step)
+    np.testing.assert_allclose(forward[0], difference, rtol=1e-5)  # (step/k)² and round-off over the step
