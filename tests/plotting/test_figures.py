@@ -144,6 +144,9 @@ def test_a_mechanism_in_a_plane_or_with_one_body_is_drawn():
     FigureCanvasAgg(fig).draw()
     (polygon, _) = fig.axes[0].collections[:2]
     assert polygon.get_facecolor().shape[0] == 1  # the hull of a plane would fail
+    (axes,) = fig.axes
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["body"]
+    assert len(axes.get_zticks()) == 0 < len(axes.get_xticks())
 
 
 def test_work_precision():
