@@ -368,6 +368,14 @@ def test_right_derivatives(modes):
         check_sensitivities(fn, at, modes=modes).raise_if_failed()
 
 
+def test_round_off_of_a_straight_line():
+    """A moment in its arm: differences are as exact as the derivative, whose own few operations remain."""
+    rng = np.random.default_rng(33)
+    turn = jnp.asarray(np.linalg.qr(rng.standard_normal((3, 3)))[0])
+    force = jnp.asarray(1e7 * rng.standard_normal(3))
+    assert check_sensitivities(lambda arm: jnp.cross(arm, turn.T @ force), np.array([0.1, 0.0, 0.0]), seed=33)
+
+
 def test_scale_and_step():
     """With a step of 1 differences say nothing of sin(30 x); the scale of x sets what a step is."""
     fn = lambda x: jnp.sin(30.0 * x)

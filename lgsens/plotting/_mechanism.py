@@ -36,13 +36,16 @@ def mechanism(models: Mapping[str, Model], title: str = "", view: tuple[float, f
         last = name == list(models)[-1]
         system = model.system()
         position, orientation = (np.asarray(array) for array in system.pose)
-        points.append(draw(axes, shapes(system), position, orientation, last))
+        scene = shapes(system)
+        points.append(draw(axes, scene, position, orientation, last))
         if not last:
             handles += axes.plot([], [], [], color=COLOURS[0], linewidth=3, label=name)
         elif len(models) > 1:
             handles += axes.plot([], [], [], color=ROLES["link"], linewidth=3, label=name)
         else:
-            handles += [axes.plot([], [], [], color=c, linewidth=3, label=role)[0] for role, c in ROLES.items()]
+            seen = {shape.role for shape in (*scene.outlines, *scene.struts)}
+            named = [(role, colour) for role, colour in ROLES.items() if role in seen]
+            handles += [axes.plot([], [], [], color=colour, linewidth=3, label=role)[0] for role, colour in named]
     frame(axes, np.concatenate(points), view)
     if handles:
         axes.legend(handles=handles, frameon=False, loc="upper center", ncols=len(handles), columnspacing=1.2)
@@ -60,9 +63,12 @@ def frame(axes: Any, points: np.ndarray, view: tuple[float, float]) -> None:
     axes.set_box_aspect(high - low + 2 * margin, zoom=0.95)
     axes.view_init(*view)
     axes.set(xlabel="x [m], forward", ylabel="y [m], left", zlabel="z [m], up")
-    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+    for axis, extent in zip((axes.xaxis, axes.yaxis, axes.zaxis), high - low):
         axis.set_pane_color((0.98, 0.98, 0.98))
         axis.labelpad = 8
+        if extent < 1e-6 * np.max(high - low):  # numbers would lie on each other
+            axis.set_ticks([])
+            axis.set_label_text("")
 
 
 def draw(axes: Any, scene: Shapes, position, orientation, coloured: bool = True) -> np.ndarray:

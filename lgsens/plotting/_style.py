@@ -1,5 +1,7 @@
 """Figures without pyplot, and how all of them look."""
 
+import functools
+import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +21,7 @@ CURVES: tuple[dict[str, Any], ...] = (
     {"color": "#b3262e", "marker": "x", "markersize": 5, "fillstyle": "full", "linestyle": ":", "linewidth": 0.8},
 )
 ROAD = "#b8a58c"
+NOTEBOOK_DPI = 80
 ROLES = {"link": "#1b62a5", "body": "#3a8a4d", "wheel": "#3c3c3c", "spring": "#d9822b", "damper": "#7a4b9a"}
 
 
@@ -28,7 +31,16 @@ def figure(width: float = 7.0, height: float = 4.5) -> "Figure":
         from matplotlib.figure import Figure
     except ImportError as error:
         raise ImportError('Figures need matplotlib: pip install "lgsens[plot]"') from error
-    return Figure(figsize=(width, height), layout="constrained")
+    fig = Figure(figsize=(width, height), layout="constrained")
+    # In a notebook matplotlib shows the figures of pyplot only; others show themselves if they have this method.
+    vars(fig)["_repr_png_"] = functools.partial(_png, fig)
+    return fig
+
+
+def _png(fig: "Figure") -> bytes:
+    buffer = io.BytesIO()
+    fig.savefig(buffer, format="png", dpi=NOTEBOOK_DPI)
+    return buffer.getvalue()
 
 
 def save(fig: "Figure", path: str | Path, dpi: int = 150) -> Path:

@@ -1,5 +1,6 @@
 """Figures: what is on them and that they are written; how they look is for the eye."""
 
+import io
 import sys
 from types import SimpleNamespace
 
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import lgsens as lg
@@ -142,6 +144,9 @@ def test_a_mechanism_in_a_plane_or_with_one_body_is_drawn():
     FigureCanvasAgg(fig).draw()
     (polygon, _) = fig.axes[0].collections[:2]
     assert polygon.get_facecolor().shape[0] == 1  # the hull of a plane would fail
+    (axes,) = fig.axes
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["body"]
+    assert len(axes.get_zticks()) == 0 < len(axes.get_xticks())
 
 
 def test_work_precision():
@@ -238,6 +243,12 @@ def test_suspension_curves():
     assert [text.get_text() for text in fig.axes[0].get_legend().get_texts()] == ["before", "after"]
     with pytest.raises(ValueError, match="`bounds`: 'cambre' is not one of"):
         plotting.suspension_curves({"a": values(1.0)}, {"cambre": band})
+
+
+def test_a_figure_shows_itself_in_a_notebook():
+    """Jupyter asks an object for this; without it there would be `<Figure size …>`."""
+    with Image.open(io.BytesIO(plotting.figure(2.0, 1.5)._repr_png_())) as image:
+        assert image.size == (160, 120)
 
 
 def test_a_missing_matplotlib_says_what_to_install(monkeypatch):
