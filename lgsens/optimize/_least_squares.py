@@ -47,11 +47,12 @@ class LineSearchGaussNewton(optimistix.AbstractGaussNewton):
     """Gauss–Newton with backtracking, of optimistix's parts: like the parameters themselves it has no scale.
 
     The damping of Levenberg–Marquardt has one: a multiple of the identity, which slows it down where the data determine some
-    combinations of parameters a hundred times better than others.
+    combinations of parameters a hundred times better than others. Ends where a step is below `rtol` of the parameters and
+    lowers |r|² by less than that; much smaller steps drown in the round-off of |r|².
     """
 
-    rtol: float = 1e-8
-    atol: float = 1e-8
+    rtol: float = 1e-5
+    atol: float = 1e-5
     norm: Callable = optimistix.max_norm
     descent: optimistix.NewtonDescent = optimistix.NewtonDescent(linear_solver=lineax.QR())
     search: optimistix.BacktrackingArmijo = optimistix.BacktrackingArmijo()

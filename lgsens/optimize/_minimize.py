@@ -115,7 +115,8 @@ def minimize(
     check_tolerances(tolerance, constraint_tolerance)
     x, unravel, box = checked_box(x0, lower, upper, log_scale)
     started = time.perf_counter()
-    carry, step = prepared(fun, x, unravel, box, tolerance, constraint_tolerance)
+    begin, step = prepared(fun, x, unravel, box, tolerance, constraint_tolerance)
+    carry = begin(x)
     step = jax.jit(step).lower(carry).compile()
     compiled = time.perf_counter()
 
@@ -174,10 +175,11 @@ def check_tolerances(tolerance: float, constraint_tolerance: float) -> None:
 
 def prepared(
     fun: Problem, x: Array, unravel: Callable, box: Box, tolerance: float, constraint_tolerance: float
-) -> tuple[method.Carry, Callable[[method.Carry], tuple[method.Carry, method.Row]]]:
-    """The carry at x and the step of a problem. Raises `ValueError` for a `fun` that returns something else."""
+) -> tuple[Callable[[Array], method.Carry], Callable[[method.Carry], tuple[method.Carry, method.Row]]]:
+    """x₀ ↦ the first carry, and the step of a problem. Raises `ValueError` for a `fun` that returns something else."""
     flat_fun = jax.jit(lambda x: fun(unravel(x)))  # jit keeps its trace: shapes and gradient come from one
     shape = jax.eval_shape(flat_fun, x)
     if not (isinstance(shape, tuple) and len(shape) == 2 and shape[0].shape == ()):
         raise ValueError(f"`fun` must return (objective of shape (), array of constraints), got {shape}.")
-    return method.start(box.scaled(x), shape[1]), method.make_step(flat_fun, box, tolerance, constraint_tolerance)
+    step = method.make_step(flat_fun, box, tolerance, constraint_tolerance)
+    return lambda x: method.start(box.scaled(x), shape[1]), step

@@ -9,7 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
-from lgsens._sweep import sweep
+from lgsens._sweep import as_designs, sweep
 from lgsens._validate import as_count
 from lgsens.optimize import _augmented_lagrangian as method
 from lgsens.optimize._box import checked_box
@@ -59,8 +59,8 @@ def multi_start(
     Arguments:
         fun, lower, upper, num_steps, log_scale, tolerance, constraint_tolerance: as of `minimize`; the bounds have the
             shapes of x, unless `starts` shows them.
-        starts: a number of random ones, uniform between the bounds (in the logarithm, where `log_scale`), or a pytree
-            of arrays with a leading axis over the starts.
+        starts: a number of random ones, uniform between the bounds (in the logarithm, where `log_scale`), or designs as
+            `sweep` takes them.
         seed: of the random ones.
         progress, batch_size, folder: as of `lgsens.sweep`, which runs the searches: compiled once, in batches over all
             devices, and with a folder not lost when the process dies. The searches of a batch last as long as its
@@ -78,15 +78,14 @@ def multi_start(
         z = jax.random.uniform(jax.random.key(seed), (count, x.size), x.dtype)
         starts = jax.vmap(lambda z: unravel(box.value(z)))(z)
     else:
-        first = jax.tree.map(lambda leaf: leaf[0], starts)
-        x, unravel, box = checked_box(first, lower, upper, log_scale)
-    _, step = prepared(fun, x, unravel, box, tolerance, constraint_tolerance)
+        starts, count = as_designs(starts)
+        for i in range(count):
+            x, unravel, box = checked_box(jax.tree.map(lambda leaf, i=i: leaf[i], starts), lower, upper, log_scale)
+    begin, step = prepared(fun, x, unravel, box, tolerance, constraint_tolerance)
 
     def search(x0: PyTree) -> dict[str, Any]:
-        x = ravel_pytree(x0)[0]
-        carry, _ = prepared(fun, x, unravel, box, tolerance, constraint_tolerance)
         running = lambda carry: (carry.ended == method.NOT_YET) & (carry.step < num_steps)
-        carry = jax.lax.while_loop(running, lambda carry: step(carry)[0], carry)
+        carry = jax.lax.while_loop(running, lambda carry: step(carry)[0], begin(ravel_pytree(x0)[0]))
         best = carry.best
         return {
             "x": unravel(box.value(best.z)),

@@ -56,14 +56,17 @@ def scipy_problem(
     Hessian-vector product a tangent of a gradient. Raises `ValueError` as `minimize` for bounds and shapes.
     """
     x, unravel, box = checked_box(x0, lower, upper, log_scale)
-    scaled = jax.jit(lambda z: fun(unravel(box.value(z))))
+    scaled = jax.jit(lambda z: fun(unravel(box.value(z))))  # jit keeps its trace for all that follows
     z0 = box.scaled(x)
     shape = jax.eval_shape(scaled, z0)
     if not (isinstance(shape, tuple) and len(shape) == 2 and shape[0].shape == ()):
         raise ValueError(f"`fun` must return (objective of shape (), array of constraints), got {shape}.")
     forward = shape[1].size > 0 if forward is None else forward
 
-    both = lambda z: (scaled(z)[0], scaled(z)[1].ravel())
+    def both(z):
+        f, g = scaled(z)
+        return f, g.ravel()
+
     values = _remembered(both)
     jacobians = _remembered(jax.jacfwd(both))
     gradient = _remembered(jax.grad(lambda z: both(z)[0]))
