@@ -130,8 +130,8 @@ def soft_maximum(values: Float[Array, " n"], sharpness: float | Float[Array, ""]
         KS_ρ(g) = ln(Σ_i exp(ρ g_i))/ρ,       max g ≤ KS_ρ(g) ≤ max g + ln(n)/ρ
 
     One constraint KS_ρ(g) ≤ 0 keeps all of g ≤ 0, at all times of a path constraint and of several, and its gradient is
-    one, the mean of theirs with weights exp(ρ (g_i − KS)). It holds the design back by up to ln(n)/ρ more than g does; a
-    larger ρ less, at the price of curvature ∼ ρ.
+    one, the mean of theirs with weights exp(ρ (g_i − KS)). It holds the design back by up to ln(n)/ρ more than g does;
+    a larger ρ less, at the price of curvature ∼ ρ.
 
     Arguments:
         values: g, any shape but empty; scaled so that 1 is large.

@@ -5,7 +5,8 @@ a multiplier μ_i ≥ 0 for each constraint (each time step of a path constraint
 turn them into equations, min over s of f + Σ μ_i (g_i + s_i) + ρ/2 (g_i + s_i)² is at s_i = max(0, −g_i − μ_i/ρ), which
 leaves
 
-    L(z; μ, ρ) = f + Σ_i [max(0, μ_i + ρ g_i)² − μ_i²] / (2ρ),     ∇L = ∇f + Σ_i μ⁺_i ∇g_i,    μ⁺_i = max(0, μ_i + ρ g_i)
+    L(z; μ, ρ) = f + Σ_i [max(0, μ_i + ρ g_i)² − μ_i²] / (2ρ)
+    ∇L = ∇f + Σ_i μ⁺_i ∇g_i,    μ⁺_i = max(0, μ_i + ρ g_i)
 
 with one gradient, in reverse mode, whatever the number of constraints. ∇L is the gradient of the Lagrangian
 with the multipliers μ⁺, so one evaluation gives all of the Karush–Kuhn–Tucker conditions of (z, μ⁺):
@@ -14,8 +15,8 @@ with the multipliers μ⁺, so one evaluation gives all of the Karush–Kuhn–T
     feasibility and complementarity   σ = max_i |max(g_i, −μ_i/ρ)| = max_i |μ⁺_i − μ_i| / ρ
 
 Inside, L is minimized to a stationarity of min(ω, θ ρ σ), the latter a fraction of what the coming change of μ does to
-∇L; then μ ← μ⁺, ω falls, and ρ grows unless σ fell. μ converges linearly, the faster the larger ρ (Nocedal & Wright 2006, §17.4; Birgin &
-Martínez 2014, Practical Augmented Lagrangian Methods, §4).
+∇L; then μ ← μ⁺, ω falls, and ρ grows unless σ fell. μ converges linearly, the faster the larger ρ (Nocedal & Wright
+2006, §17.4; Birgin & Martínez 2014, Practical Augmented Lagrangian Methods, §4).
 
 The inner method is L-BFGS of optax on the face of the box in which z may move (Bertsekas 1982, SIAM J. Control Optim.
 20:221), with a backtracking search along the projected path. Each step is one evaluation, accepted or not. Behind a
@@ -24,7 +25,7 @@ limits the next ones, which may double.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -46,7 +47,8 @@ REJECTIONS = 10  # of steps along one direction; then the memory is given up
 HOPELESS = 0.9  # of σ, with the largest ρ: constraints that contradict each other
 NOT_YET, CONVERGED, STALLED, INFEASIBLE = 0, 1, 2, 3  # whether and why a search ended
 
-LBFGS = optax.scale_by_lbfgs(memory_size=10)
+Memory = Any  # optax.ScaleByLBFGSState; its members are declared as any pytree, here they are arrays
+LBFGS: Any = optax.scale_by_lbfgs(memory_size=10)
 
 
 class Best(NamedTuple):
@@ -75,7 +77,7 @@ class Carry(NamedTuple):
     z: Float[Array, " n"]  # the last point that was accepted
     value: Float[Array, ""]  # L there
     gradient: Float[Array, " n"]  # ∇L there
-    memory: optax.ScaleByLBFGSState  # of points before z
+    memory: Memory  # of points before z
     direction: Float[Array, " n"]  # to the trial
     reach: Float[Array, ""]  # the most that an entry of it may be
     rejected: Int[Array, ""]  # trials from z
@@ -199,11 +201,11 @@ def _select(condition, yes, no):
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
-def _next_memory(carry: Carry, trial, gradient) -> optax.ScaleByLBFGSState:
+def _next_memory(carry: Carry, trial, gradient) -> Memory:
     """The memory of the points before the trial, which was accepted.
 
-    The last of them is z, unless the step shows no positive curvature or is across two Lagrangians. Then the point before
-    z is shifted so that the difference to it stays: the pair of the last step serves once more.
+    The last of them is z, unless the step shows no positive curvature or is across two Lagrangians. Then the point
+    before z is shifted so that the difference to it stays: the pair of the last step serves once more.
     """
     move, change = trial - carry.z, gradient - carry.gradient
     shifted = carry.memory._replace(params=carry.memory.params + move, updates=carry.memory.updates + change)

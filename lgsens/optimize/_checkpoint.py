@@ -4,6 +4,7 @@ import hashlib
 import os
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,11 @@ from lgsens.optimize._box import Box
 FORMAT = 1
 
 
+def columns(rows: list[Row]) -> dict[str, np.ndarray]:
+    """The members of all rows, with a leading axis over the rows."""
+    return {name: np.stack(column) for name, column in zip(Row._fields, zip(*rows))}
+
+
 class Checkpoint:
     """One `.npz` file, replaced as a whole: a process that dies while writing leaves the one before."""
 
@@ -26,8 +32,8 @@ class Checkpoint:
 
     def save(self, carry: Carry, rows: list[Row]) -> None:
         """The state after the evaluations `rows`."""
-        arrays = {f"carry_{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(carry))}
-        arrays |= {f"row_{name}": np.stack(column) for name, column in zip(Row._fields, zip(*rows))}
+        arrays: dict[str, Any] = {f"carry_{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(carry))}
+        arrays |= {f"row_{name}": column for name, column in columns(rows).items()}
         draft = self.path.with_name(self.path.name + ".draft")
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with draft.open("wb") as file:

@@ -1,9 +1,9 @@
 """Nonlinear least squares by Gauss–Newton, of optimistix, and what noise leaves of its answer.
 
-With residuals r(x) = (model(x) − data)/σ in units of the standard deviation of independent Gaussian noise, the likelihood
-of the data is ∼ exp(−½ |r|²): the least squares are the most likely parameters. The Fisher information is JᵀJ with
-J = ∂r/∂x, so that no unbiased estimate has less covariance than (JᵀJ)⁻¹ (Cramér & Rao), which this one reaches as noise
-falls: x − x_true ≈ −(JᵀJ)⁻¹ Jᵀ r(x_true), where r(x_true) has covariance 1.
+With residuals r(x) = (model(x) − data)/σ in units of the standard deviation of independent Gaussian noise, the
+likelihood of the data is ∼ exp(−½ |r|²): the least squares are the most likely parameters. The Fisher information is
+JᵀJ with J = ∂r/∂x, so that no unbiased estimate has less covariance than (JᵀJ)⁻¹ (Cramér & Rao), which this one reaches
+as noise falls: x − x_true ≈ −(JᵀJ)⁻¹ Jᵀ r(x_true), where r(x_true) has covariance 1.
 """
 
 from collections.abc import Callable
@@ -46,9 +46,9 @@ class LeastSquaresResult(NamedTuple):
 class LineSearchGaussNewton(optimistix.AbstractGaussNewton):
     """Gauss–Newton with backtracking, of optimistix's parts: like the parameters themselves it has no scale.
 
-    The damping of Levenberg–Marquardt has one: a multiple of the identity, which slows it down where the data determine some
-    combinations of parameters a hundred times better than others. Ends where a step is below `rtol` of the parameters and
-    lowers |r|² by less than that; much smaller steps drown in the round-off of |r|².
+    The damping of Levenberg–Marquardt has one: a multiple of the identity, which slows it down where the data determine
+    some combinations of parameters a hundred times better than others. Ends where a step is below `rtol` of the
+    parameters and lowers |r|² by less than that; much smaller steps drown in the round-off of |r|².
     """
 
     rtol: float = 1e-5

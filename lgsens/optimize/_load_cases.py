@@ -28,7 +28,7 @@ def load_cases(
         cases: a pytree whose arrays have a leading axis over C cases, evaluated at once under `jax.vmap`; or a list of
             C cases that are anything (scenes of other bodies, say), evaluated one after another.
         weights: w [1/unit of f_c], shape (C,); None: 1/C each for the sum, 1 each for the worst case.
-        sharpness: ρ of `soft_maximum` [–]; it exceeds the worst w_c f_c by ln C/ρ at most, so w_c f_c should be about 1.
+        sharpness: ρ of `soft_maximum` [–]; it exceeds the worst w_c f_c, which should be about 1, by ln C/ρ at most.
 
     The result is a new function: make it once, outside of `jit`. Raises `ValueError` for no cases, weights of another
     shape, and a sharpness that is not positive.

@@ -14,7 +14,7 @@ from lgsens._progress import progress_bar
 from lgsens._validate import as_count
 from lgsens.optimize import _augmented_lagrangian as method
 from lgsens.optimize._box import Box, checked_box
-from lgsens.optimize._checkpoint import Checkpoint
+from lgsens.optimize._checkpoint import Checkpoint, columns
 
 Problem = Callable[[PyTree], tuple[Float[Array, ""], Array]]
 REASONS = ("steps", "converged", "stalled", "infeasible")
@@ -28,7 +28,7 @@ class History(NamedTuple):
         worst_constraint: max g, shape (n,); −∞ without constraints.
         gradient_norm: length of the projected gradient step clip(z − ∇L) − z in the scaled variables z, shape
             (n,).
-        complementarity: σ = max |max(g, −μ/ρ)|, 0 where constraints and multipliers are those of an optimum, shape (n,).
+        complementarity: σ = max |max(g, −μ/ρ)|, 0 where g and μ are those of an optimum, shape (n,).
         design: x, its leaves with a leading axis n.
     """
 
@@ -108,8 +108,8 @@ def minimize(
 
     A step into a region where f, g or the gradient is not finite is halved until they are. Raises
     `ValueError` for bounds of another shape than x0, lower ≥ upper, x0 outside them, a logarithmic scale over
-    0, `num_steps` < 1, a tolerance that is out of range, an f or g that is not finite at x0, and a checkpoint of another
-    problem. Sources: `lgsens/optimize/_augmented_lagrangian.py`.
+    0, `num_steps` < 1, a tolerance that is out of range, an f or g that is not finite at x0, and a checkpoint of
+    another problem. Derivation and sources: `lgsens/optimize/_augmented_lagrangian.py`.
     """
     num_steps = as_count(num_steps, "num_steps")
     check_tolerances(tolerance, constraint_tolerance)
@@ -143,21 +143,21 @@ def minimize(
                 callback(len(rows) - 1, f, worst)
     finished = time.perf_counter()
 
-    columns = method.Row(*map(np.asarray, zip(*rows)))
+    found = columns(rows)
     best, step = carry.best, int(carry.best.step)
     return OptimizationResult(
-        x=unravel(jnp.asarray(columns.x[step])),
-        objective=float(columns.objective[step]),
+        x=unravel(jnp.asarray(found["x"][step])),
+        objective=float(found["objective"][step]),
         constraints=np.asarray(best.constraints),
         feasible=bool(best.worst <= constraint_tolerance),
         reason=REASONS[int(carry.ended)],
         step=step,
         history=History(
-            objective=columns.objective,
-            worst_constraint=columns.worst,
-            gradient_norm=columns.gradient_norm,
-            complementarity=columns.complementarity,
-            design=jax.tree.map(np.asarray, jax.vmap(unravel)(jnp.asarray(columns.x))),
+            objective=found["objective"],
+            worst_constraint=found["worst"],
+            gradient_norm=found["gradient_norm"],
+            complementarity=found["complementarity"],
+            design=jax.tree.map(np.asarray, jax.vmap(unravel)(jnp.asarray(found["x"]))),
         ),
         multipliers=np.asarray(carry.multipliers),
         compile_seconds=compiled - started,

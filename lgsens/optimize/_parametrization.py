@@ -101,8 +101,8 @@ def variables(parametrization: PyTree, x0: PyTree) -> tuple[Float[Array, " n"], 
     """The variables of a design as one vector, and the way back.
 
     Arguments:
-        parametrization: an `Affine`, `Log` or `Interval` for every leaf of x, or a pytree like x0 of them (a prefix of it
-            will do). None in place of one: `Affine` with the largest entry of the leaf at x0 for its scale.
+        parametrization: an `Affine`, `Log` or `Interval` for every leaf of x, or a pytree like x0 of them (a prefix of
+            it will do). None in place of one: `Affine` with the largest entry of the leaf at x0 for its scale.
         x0: the design, a pytree of arrays; a `Model` is one.
 
     Returns z0, shape (n,), and z ↦ x, a pytree as x0; both can be traced. Raises `ValueError` for a parametrization of

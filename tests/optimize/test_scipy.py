@@ -113,7 +113,7 @@ def test_least_squares_within_bounds():
 
 
 def test_bad_problems():
-    with pytest.raises(ValueError, match="`fun` must return"):
+    with pytest.raises(ValueError, match=r"`fun` must return"):
         scipy_problem(lambda x: x["rate"], X0, **BOUNDS)
-    with pytest.raises(ValueError, match="must lie within the bounds: rate = 30.0"):
+    with pytest.raises(ValueError, match=r"must lie within the bounds: rate = 30\.0"):
         scipy_problem(fun, X0, lower=BOUNDS["lower"], upper={"rate": 20.0, "p": 1.0})
