@@ -32,7 +32,7 @@ from lgsens._trajectory import (
     Trajectory as Trajectory,
 )
 from lgsens._uneven_runs import GivenSteps as GivenSteps
-from lgsens.criteria import Criterion as Criterion, time_integral as time_integral
+from lgsens.criteria import Criterion as Criterion, soft_maximum as soft_maximum, time_integral as time_integral
 from lgsens.dynamics import RESULTS as RESULTS, AbstractSystem as AbstractSystem, State as State
 from lgsens.integrate import AdaptiveSteps as AdaptiveSteps, GeneralizedAlpha as GeneralizedAlpha
 from lgsens.linear import BlockSparse as BlockSparse, DenseLU as DenseLU

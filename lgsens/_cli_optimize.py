@@ -124,7 +124,7 @@ def _optimize(design: SuspensionDesign, steps: int, progress: bool) -> Outcome:
     seconds = {
         "compilation": compiled - started + result.compile_seconds,
         "optimization": result.run_seconds,
-        "one gradient": result.run_seconds / steps,
+        "one gradient": result.run_seconds / len(result.history.objective),
         "total": time.perf_counter() - started,
     }
     return Outcome(design, result, before, after, {"start": check_before, "optimum": check_after}, seconds)

@@ -88,6 +88,7 @@ def document(outcome: Any, settings: dict[str, Any], tolerance: float) -> dict[s
         },
         "history": {
             "kept_step": result.step,
+            "ended": result.reason,
             "objective": _finite(result.history.objective),
             "worst_constraint": _finite(result.history.worst_constraint),
             "gradient_norm": _finite(result.history.gradient_norm),

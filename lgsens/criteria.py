@@ -122,3 +122,26 @@ def time_integral(t: Float[Array, " n"], f: Float[Array, " n ..."], *, order: in
     slopes = (first[1] - first[0]) + (last[1] - last[0])
     bends = (first[2] - 2.0 * first[1] + first[0]) + (last[2] - 2.0 * last[1] + last[0])
     return trapezoidal + (t[-1] - t[0]) / (t.shape[0] - 1) * (slopes / 12.0 - bends / 24.0)
+
+
+def soft_maximum(values: Float[Array, " n"], sharpness: float | Float[Array, ""]) -> Float[Array, ""]:
+    """A smooth bound of the largest value from above, the function of Kreisselmeier and Steinhauser.
+
+        KS_ρ(g) = ln(Σ_i exp(ρ g_i))/ρ,       max g ≤ KS_ρ(g) ≤ max g + ln(n)/ρ
+
+    One constraint KS_ρ(g) ≤ 0 keeps all of g ≤ 0, at all times of a path constraint and of several, and its gradient is
+    one, the mean of theirs with weights exp(ρ (g_i − KS)). It holds the design back by up to ln(n)/ρ more than g does;
+    a larger ρ less, at the price of curvature ∼ ρ.
+
+    Arguments:
+        values: g, any shape but empty; scaled so that 1 is large.
+        sharpness: ρ [1/unit of g], positive; 50 to 500 for constraints scaled to 1.
+
+    Returns KS [unit of g], shape (). Raises `ValueError` for no values or a sharpness that is not positive. Source:
+    Kreisselmeier & Steinhauser, Systematic control design by optimizing a vector performance index (IFAC 1979).
+    """
+    values, sharpness = as_float(values, None, "`values`"), as_float(sharpness, (), "`sharpness`")
+    if values.size == 0:
+        raise ValueError("`soft_maximum`: `values` is empty; there is no largest value.")
+    require(lambda rho: rho > 0, f"`soft_maximum`: `sharpness` must be positive, got {sharpness}.", sharpness)
+    return jax.nn.logsumexp(sharpness * values) / sharpness

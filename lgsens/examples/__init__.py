@@ -6,6 +6,7 @@ from lgsens.examples._curve_bounds import Band as Band, CurveBounds as CurveBoun
 from lgsens.examples._four_bar import four_bar as four_bar
 from lgsens.examples._free_rigid_body import free_rigid_body as free_rigid_body
 from lgsens.examples._heavy_top import heavy_top as heavy_top
+from lgsens.examples._identification import AccelerationTest as AccelerationTest
 from lgsens.examples._lagrange_top import lagrange_top as lagrange_top
 from lgsens.examples._linear_quarter_car import linear_quarter_car as linear_quarter_car
 from lgsens.examples._problems import (

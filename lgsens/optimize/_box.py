@@ -29,7 +29,7 @@ class Box(NamedTuple):
 
     def value(self, z):
         lower, upper = self._ends()
-        y = lower + z * (upper - lower)
+        y = (1.0 - z) * lower + z * upper  # exact at both ends
         # The clip keeps round-off of the logarithm from leaving the bounds.
         return jnp.clip(jnp.where(self.log, jnp.exp(jnp.where(self.log, y, 0.0)), y), self.lower, self.upper)
 

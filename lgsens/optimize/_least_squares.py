@@ -1,0 +1,124 @@
+"""Nonlinear least squares by Gauss–Newton, of optimistix, and what noise leaves of its answer.
+
+With residuals r(x) = (model(x) − data)/σ in units of the standard deviation of independent Gaussian noise, the
+likelihood of the data is ∼ exp(−½ |r|²): the least squares are the most likely parameters. The Fisher information is
+JᵀJ with J = ∂r/∂x, so that no unbiased estimate has less covariance than (JᵀJ)⁻¹ (Cramér & Rao), which this one reaches
+as noise falls: x − x_true ≈ −(JᵀJ)⁻¹ Jᵀ r(x_true), where r(x_true) has covariance 1.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import lineax
+import optimistix
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from lgsens._validate import as_count
+from lgsens.optimize._parametrization import variables
+
+
+class LeastSquaresResult(NamedTuple):
+    """The outcome of `least_squares`; all of it arrays, so it comes out of `jit` and `vmap`.
+
+    Attributes:
+        x: the parameters.
+        residual: r(x), shape (m,).
+        jacobian: ∂r/∂x by forward mode, the parameters in the order of `ravel_pytree`, shape (m, n).
+        covariance: (JᵀJ)⁻¹ [products of units of x], shape (n, n): for r in units of the noise, the bound of Cramér and
+            Rao. Not finite where the data leave a combination of the parameters undetermined.
+        deviation: the roots of its diagonal, a pytree as x.
+        converged: whether the last step was below the tolerances.
+        steps: number of Jacobians.
+    """
+
+    x: PyTree
+    residual: Float[Array, " m"]
+    jacobian: Float[Array, "m n"]
+    covariance: Float[Array, "n n"]
+    deviation: PyTree
+    converged: Bool[Array, ""]
+    steps: Int[Array, ""]
+
+
+class LineSearchGaussNewton(optimistix.AbstractGaussNewton):
+    """Gauss–Newton with backtracking, of optimistix's parts: like the parameters themselves it has no scale.
+
+    The damping of Levenberg–Marquardt has one: a multiple of the identity, which slows it down where the data determine
+    some combinations of parameters a hundred times better than others. Ends where a step is below `rtol` of the
+    parameters and lowers |r|² by less than that; much smaller steps drown in the round-off of |r|².
+    """
+
+    rtol: float = 1e-5
+    atol: float = 1e-5
+    norm: Callable = optimistix.max_norm
+    descent: optimistix.NewtonDescent = optimistix.NewtonDescent(linear_solver=lineax.QR())
+    search: optimistix.BacktrackingArmijo = optimistix.BacktrackingArmijo()
+    verbose: Callable = lambda **_: None
+
+
+def least_squares(
+    residual: Callable[[PyTree], PyTree],
+    x0: PyTree,
+    *,
+    parametrization: PyTree = None,
+    solver: Any = None,
+    max_steps: int = 50,
+) -> LeastSquaresResult:
+    """min ½ |r(x)|², by Gauss–Newton with Jacobians in forward mode, one simulation with n tangents each.
+
+    Arguments:
+        residual: x ↦ r, a pytree of arrays; divided by the standard deviation of the noise, if `covariance` shall be
+            that of x.
+        x0: where to start, a pytree of arrays.
+        parametrization: what is searched by, as of `variables`: `Log()` for masses and rates, `Interval(a, b)` for
+            points; None: x over its size.
+        solver: of optimistix, in the variables of the parametrization; None: `LineSearchGaussNewton()`;
+            `optimistix.LevenbergMarquardt(rtol, atol)` where data determine the parameters badly.
+        max_steps: the most steps, of which rejected ones are some.
+
+    It can be traced: `jax.jit` it for many data sets, `jax.vmap` or `lgsens.sweep` it over them. Not converging is
+    data, `LeastSquaresResult.converged`. Raises `ValueError` as `variables`, and for fewer residuals than parameters.
+    Sources: Nocedal & Wright 2006, §10.3; Kay, Fundamentals of Statistical Signal Processing I (1993), §3.
+    """
+    z0, design = variables(parametrization, x0)
+    flat_residual = lambda x: ravel_pytree(residual(x))[0]
+    count = jax.eval_shape(lambda z: flat_residual(design(z)), z0).shape[0]
+    if count < z0.size:
+        raise ValueError(
+            f"`residual` has {count} entries, fewer than the {z0.size} parameters: measure more, or free less."
+        )
+    solver = LineSearchGaussNewton() if solver is None else solver
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # optimistix is less strict
+        found = optimistix.least_squares(
+            lambda z, _: flat_residual(design(z)),
+            solver,
+            z0,
+            max_steps=as_count(max_steps, "max_steps"),
+            throw=False,
+        )
+    x = design(found.value)
+    flat, unravel = ravel_pytree(x)
+    twice = lambda x: (flat_residual(unravel(x)),) * 2
+    jacobian, left = jax.jacfwd(twice, has_aux=True)(flat)
+    bound = covariance(jacobian)
+    return LeastSquaresResult(
+        x=x,
+        residual=left,
+        jacobian=jacobian,
+        covariance=bound,
+        deviation=unravel(jnp.sqrt(jnp.diagonal(bound))),
+        converged=found.result == optimistix.RESULTS.successful,
+        steps=found.stats["num_steps"],
+    )
+
+
+def covariance(jacobian: Float[Array, "m n"]) -> Float[Array, "n n"]:
+    """(JᵀJ)⁻¹, from J = Q R: R⁻¹ R⁻ᵀ with half the digits lost that JᵀJ would lose; columns scaled to 1 before."""
+    size = jnp.linalg.norm(jacobian, axis=0)
+    size = jnp.where(size > 0, size, 1.0)
+    triangle = jnp.linalg.qr(jacobian / size[None], mode="r")
+    inverse = jax.scipy.linalg.solve_triangular(triangle, jnp.eye(size.size, dtype=size.dtype)) / size[:, None]
+    return inverse @ inverse.T

@@ -1,0 +1,61 @@
+"""Several load cases as one problem."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from lgsens._validate import as_float
+from lgsens.criteria import soft_maximum
+
+
+def load_cases(
+    fun: Callable[[PyTree, Any], tuple[Float[Array, ""], Array]],
+    cases: Any,
+    *,
+    weights: Any = None,
+    sharpness: float | None = None,
+) -> Callable[[PyTree], tuple[Float[Array, ""], Float[Array, " m"]]]:
+    """One problem for `minimize` of several load cases: x ↦ (f, g).
+
+        f = Σ w_c f_c,     or with `sharpness` ρ the worst case,  f = KS_ρ(w_c f_c) ≥ max w_c f_c
+        g = the constraints of all cases in a row
+
+    Arguments:
+        fun: (x, case) ↦ (f_c, g_c), as `minimize` wants them for one case.
+        cases: a pytree whose arrays have a leading axis over C cases, evaluated at once under `jax.vmap`; or a list of
+            C cases that are anything (scenes of other bodies, say), evaluated one after another.
+        weights: w [1/unit of f_c], shape (C,); None: 1/C each for the sum, 1 each for the worst case.
+        sharpness: ρ of `soft_maximum` [–]; it exceeds the worst w_c f_c, which should be about 1, by ln C/ρ at most.
+
+    The result is a new function: make it once, outside of `jit`. Raises `ValueError` for no cases, weights of another
+    shape, and a sharpness that is not positive.
+    """
+    listed = isinstance(cases, Sequence)
+    lengths = {len(cases)} if listed else {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(cases)}
+    if len(lengths) != 1 or lengths & {0, (), (0,)}:
+        raise ValueError(
+            f"`cases` must be a list, or arrays of one leading axis over the cases, got {lengths or 'none'}."
+        )
+    (length,) = lengths
+    count = length if isinstance(length, int) else length[0]
+    if sharpness is not None and not sharpness > 0:
+        raise ValueError(f"`sharpness` must be positive, got {sharpness}.")
+    if weights is None:
+        weights = jnp.full(count, 1.0 if sharpness is not None else 1.0 / count, jnp.result_type(float))
+    weights = as_float(weights, (count,), "`weights`")
+
+    def combined(x):
+        if listed:
+            found = [fun(x, case) for case in cases]
+            f = jnp.stack([f for f, _ in found])
+            g = jnp.concatenate([g.ravel() for _, g in found])
+        else:
+            f, g = jax.vmap(fun, in_axes=(None, 0))(x, cases)
+            g = g.ravel()
+        weighted = weights * f
+        return (jnp.sum(weighted) if sharpness is None else soft_maximum(weighted, sharpness)), g
+
+    return combined

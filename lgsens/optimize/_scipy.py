@@ -1,0 +1,137 @@
+"""A problem as `scipy.optimize` wants it: functions of a flat vector of 64-bit floats."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import PyTree
+
+from lgsens.optimize._box import checked_box
+from lgsens.optimize._minimize import Problem
+
+
+class ScipyProblem(NamedTuple):
+    """A problem in variables z scaled to [0, 1] between the bounds; NumPy arrays.
+
+    Attributes:
+        z0: the start, shape (n,).
+        bounds: (0, 1) for each variable, as `scipy.optimize.minimize` takes them.
+        fun, jac, hessp: f(z), its gradient (n,), and its Hessian times a vector, (z, p) ↦ (n,).
+        constraints, constraints_jac: g(z), shape (m,), and its Jacobian (m, n); g ≤ 0 is wanted.
+        x: z ↦ the design, a pytree.
+    """
+
+    z0: np.ndarray
+    bounds: list[tuple[float, float]]
+    fun: Callable[[np.ndarray], float]
+    jac: Callable[[np.ndarray], np.ndarray]
+    hessp: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    constraints: Callable[[np.ndarray], np.ndarray]
+    constraints_jac: Callable[[np.ndarray], np.ndarray]
+    x: Callable[[np.ndarray], PyTree]
+
+
+def scipy_problem(
+    fun: Problem, x0: PyTree, *, lower: PyTree, upper: PyTree, log_scale: PyTree = False, forward: bool | None = None
+) -> ScipyProblem:
+    """A problem of `minimize` for `scipy.optimize.minimize`, with value, gradient and Hessian-vector product.
+
+    ```python
+    p = lg.optimize.scipy_problem(fun, x0, lower=lower, upper=upper)
+    found = scipy.optimize.minimize(
+        p.fun, p.z0, jac=p.jac, bounds=p.bounds, method="SLSQP",
+        constraints={"type": "ineq", "fun": lambda z: -p.constraints(z), "jac": lambda z: -p.constraints_jac(z)},
+    )
+    p.x(found.x)
+    ```
+
+    Arguments:
+        fun, x0, lower, upper, log_scale: as of `minimize`.
+        forward: whether the gradient of f comes by forward mode together with the Jacobian of g, one simulation with n
+            tangents, or by reverse mode; None: forward where there are constraints.
+
+    What one z gives is computed once and kept until another z is asked for. The Jacobian of g costs n tangents, the
+    Hessian-vector product a tangent of a gradient. Raises `ValueError` as `minimize` for bounds and shapes.
+    """
+    x, unravel, box = checked_box(x0, lower, upper, log_scale)
+    scaled = jax.jit(lambda z: fun(unravel(box.value(z))))  # jit keeps its trace for all that follows
+    z0 = box.scaled(x)
+    shape = jax.eval_shape(scaled, z0)
+    if not (isinstance(shape, tuple) and len(shape) == 2 and shape[0].shape == ()):
+        raise ValueError(f"`fun` must return (objective of shape (), array of constraints), got {shape}.")
+    forward = shape[1].size > 0 if forward is None else forward
+
+    def both(z):
+        f, g = scaled(z)
+        return f, g.ravel()
+
+    values = _remembered(both)
+    jacobians = _remembered(jax.jacfwd(both))
+    gradient = _remembered(jax.grad(lambda z: both(z)[0]))
+    product = jax.jit(lambda z, p: jax.jvp(jax.grad(lambda z: both(z)[0]), (z,), (p,))[1])
+    as_array = lambda z: np.asarray(z, z0.dtype)
+    return ScipyProblem(
+        z0=np.asarray(z0, np.float64),
+        bounds=[(0.0, 1.0)] * z0.size,
+        fun=lambda z: float(values(z)[0]),
+        jac=lambda z: jacobians(z)[0] if forward else gradient(z),
+        hessp=lambda z, p: np.asarray(product(as_array(z), as_array(p)), np.float64),
+        constraints=lambda z: values(z)[1],
+        constraints_jac=lambda z: jacobians(z)[1],
+        x=lambda z: unravel(box.value(as_array(z))),
+    )
+
+
+class ScipyLeastSquares(NamedTuple):
+    """Residuals in variables z scaled to [0, 1] between the bounds, for `scipy.optimize.least_squares`; NumPy arrays.
+
+    Attributes:
+        z0: the start, shape (n,).
+        bounds: the lower and the upper bounds of z, as `scipy.optimize.least_squares` takes them.
+        fun, jac: r(z), shape (m,), and its Jacobian by forward mode (m, n).
+        x: z ↦ the parameters, a pytree.
+    """
+
+    z0: np.ndarray
+    bounds: tuple[np.ndarray, np.ndarray]
+    fun: Callable[[np.ndarray], np.ndarray]
+    jac: Callable[[np.ndarray], np.ndarray]
+    x: Callable[[np.ndarray], PyTree]
+
+
+def scipy_least_squares(
+    residual: Callable[[PyTree], PyTree], x0: PyTree, *, lower: PyTree, upper: PyTree, log_scale: PyTree = False
+) -> ScipyLeastSquares:
+    """Residuals as of `least_squares` for `scipy.optimize.least_squares`, which keeps parameters within bounds.
+
+    `p = scipy_least_squares(…)`, then `scipy.optimize.least_squares(p.fun, p.z0, jac=p.jac, bounds=p.bounds)` and
+    `p.x(found.x)`. Arguments and errors as of `scipy_problem`.
+    """
+    x, unravel, box = checked_box(x0, lower, upper, log_scale)
+    scaled = jax.jit(lambda z: ravel_pytree(residual(unravel(box.value(z))))[0])
+    z0 = box.scaled(x)
+    return ScipyLeastSquares(
+        z0=np.asarray(z0, np.float64),
+        bounds=(np.zeros(z0.size), np.ones(z0.size)),
+        fun=_remembered(scaled),
+        jac=_remembered(jax.jacfwd(scaled)),
+        x=lambda z: unravel(box.value(np.asarray(z, z0.dtype))),
+    )
+
+
+def _remembered(function: Callable) -> Callable[[np.ndarray], PyTree]:
+    """`function`, compiled, of NumPy arrays; what it was for the last argument is not computed again."""
+    compiled = jax.jit(function)
+    last: dict[bytes, PyTree] = {}
+
+    def call(z):
+        key = np.ascontiguousarray(z, np.float64).tobytes()
+        if key not in last:
+            found = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), compiled(np.asarray(z)))
+            last.clear()
+            last[key] = found
+        return last[key]
+
+    return call
