@@ -34,7 +34,9 @@ in the corner of K_c leaves ε^k of the error after k iterations (proximal point
 
 import abc
 from collections.abc import Callable
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jax import lax
@@ -80,6 +82,7 @@ def refined(product: Callable, solve: Callable, rhs):
     return solution
 
 
+@partial(jax.jit, inline=True)  # one program where it is not called inside another
 def least_norm(system: AbstractSystem, q, lam: Float[Array, " m"]) -> Float[Array, " m"]:
     """The multipliers of least Σ d_i λ_i² with the same Bᵀλ, at one instant; λ itself if none may be redundant."""
     compliance = system.compliance if isinstance(system, AbstractRedundantSystem) else None
