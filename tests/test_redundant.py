@@ -1,7 +1,5 @@
 """Redundant constraints: motion, multipliers of least norm, gradients; against mechanisms without them and NumPy."""
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
