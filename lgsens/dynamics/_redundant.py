@@ -12,8 +12,9 @@ S is regular: the Schur complement −B T A⁻¹ Bᵀ − diag(c) is negative de
 exchanges stays possible too). For n above, n·Φ(q) = O(Φ²), therefore n·(c λ) = 0 to the round-off of Φ: among all λ of
 the same Bᵀλ the step takes the one of least Σ c_i λ_i². Joints give way by Φ = βh² c λ, which moves the solution by
 O(ε h²), ε the size of c relative to B M⁻¹ Bᵀ: ε times what the scheme itself leaves. This system is differentiated, and
-not its limit: the sensitivities have −c λ' in row (26) and nothing else that is new but h, of which Φ/(βh²) is no
-longer independent at the solution. As λ enters the motion through Bᵀλ only, c is a constant for all derivatives.
+not its limit: row (26) of the sensitivities has −c λ' in addition, and −2Φ h'/(βh³), as Φ is not zero at the solution.
+λ enters the motion through Bᵀλ only, so c is a constant for all derivatives. The start moves the joints by what they
+give way; else ε would be excited in accelerations (5e-6 of the four-bar's at ε = 1e-7, for tens of steps).
 
 Multipliers. The round-off of Φ leaves eps/(βh²)/ε of n in λ. Nobody asks for λ along n before it is read, so it
 is made there what it is said to be, the multipliers that minimize Σ d_i λ_i² for given Bᵀλ. With λ̂ = √d λ and
@@ -34,7 +35,9 @@ in the corner of K_c leaves ε^k of the error after k iterations (proximal point
 
 import abc
 from collections.abc import Callable
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jax import lax
@@ -80,6 +83,7 @@ def refined(product: Callable, solve: Callable, rhs):
     return solution
 
 
+@partial(jax.jit, inline=True)  # one program where it is not called inside another
 def least_norm(system: AbstractSystem, q, lam: Float[Array, " m"]) -> Float[Array, " m"]:
     """The multipliers of least Σ d_i λ_i² with the same Bᵀλ, at one instant; λ itself if none may be redundant."""
     compliance = system.compliance if isinstance(system, AbstractRedundantSystem) else None
