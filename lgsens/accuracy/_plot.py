@@ -24,15 +24,16 @@ def plot(table: Table, targets: Sequence[float] = (), *, by: str = "seconds", ti
     of the reference are drawn there. Raises `ImportError` without matplotlib.
     """
     check_by(by)
-    panels = {}
+    found = {target: recommend(table, target, by=by).row for target in targets}
+    panels, chosen = {}, {target: {} for target, row in found.items() if row is not None}
     for quantity, member in (("Ψ", "value_error"), ("dΨ/dp", "gradient_error")):
         own, series = getattr(table.reference, member), {}
+        places = {id(row): (1e3 * getattr(row, by), max(getattr(row, member), own)) for row in table if not row.failure}
         for row in table:
             if not row.failure:
-                cost, error = series.setdefault(row.setting.curve, ([], []))
-                cost.append(1e3 * getattr(row, by))
-                error.append(max(getattr(row, member), own))
-        panels[quantity] = {name: plotting.WorkPrecision(*points) for name, points in series.items()}
-    rows = {target: recommend(table, target, by=by).row for target in targets}
-    chosen = {target: 1e3 * getattr(row, by) for target, row in rows.items() if row is not None}
-    return plotting.work_precision_panels(panels, chosen, title=title)
+                series.setdefault(row.setting.curve, []).append(places[id(row)])
+        panels[quantity] = {name: plotting.WorkPrecision(*zip(*points)) for name, points in series.items()}
+        for target in chosen:
+            chosen[target][quantity] = places[id(found[target])]
+    cost = "time [ms]" if by == "seconds" else "processor time [ms]"
+    return plotting.work_precision_panels(panels, chosen, cost=cost, title=title)

@@ -150,7 +150,7 @@ def work_precision(
 
 def work_precision_panels(
     panels: Mapping[str, Mapping[str, WorkPrecision]],
-    chosen: Mapping[float, float] | None = None,
+    chosen: Mapping[float, Mapping[str, tuple[float, float]]] | None = None,
     *,
     cost: str = "time [ms]",
     title: str = "",
@@ -159,7 +159,8 @@ def work_precision_panels(
 
     Arguments:
         panels: costs and errors of the methods, by the name of the quantity and that of the method.
-        chosen: the cost of the setting that is recommended for each target.
+        chosen: cost and error of the setting that is recommended for each target, by the name of the quantity; it is
+            starred, and a line leads there from the target.
         cost: label of the horizontal axis, with its unit.
         title: over the figure.
 
@@ -180,10 +181,11 @@ def work_precision_panels(
             best = y < np.minimum.accumulate(np.concatenate([[np.inf], y[:-1]]))
             (handles[name],) = axes.plot(x[best], y[best], label=name, **style)
             axes.plot(x[~best], y[~best], **style | {"linestyle": "", "alpha": 0.3})
-        for target, price in (chosen or {}).items():
-            _target_line(axes, target, "")
-            axes.plot(price, target, marker="*", markersize=13, color=LIMIT, linestyle="", zorder=3)
-            axes.annotate(f"{target:g}", (price, target), (6, 4), textcoords="offset points", color=LIMIT)
+        for target, points in (chosen or {}).items():
+            price, reached = points[quantity]
+            _target_line(axes, target, linewidth=0.6, side="right")
+            axes.plot([price, price], [target, reached], color=LIMIT, linewidth=0.9, zorder=3)
+            axes.plot(price, reached, marker="*", markersize=11, color=LIMIT, linestyle="", zorder=3)
         plain(axes)
     style = {"ncols": 2 if len(names) > 3 else max(len(names), 1), "frameon": False, "handlelength": 3.5}
     fig.legend(handles=list(handles.values()), loc="outside lower center", **style)
@@ -197,7 +199,7 @@ def _check_costs(name: str, method: WorkPrecision) -> None:
         raise ValueError(f"`methods[{name!r}]`: costs must be positive, got {method.cost}.")
 
 
-def _target_line(axes: "Axes", target: float, text: str = "target ") -> None:
-    axes.axhline(target, color=LIMIT, linestyle=(0, (5, 3)), linewidth=1.2 if text else 0.6)
-    if text:
-        axes.text(0.01, target, f"{text}{target:g}", color=LIMIT, va="bottom", transform=axes.get_yaxis_transform())
+def _target_line(axes: "Axes", target: float, linewidth: float = 1.2, side: str = "left") -> None:
+    axes.axhline(target, color=LIMIT, linestyle=(0, (5, 3)), linewidth=linewidth)
+    style = {"color": LIMIT, "ha": side, "va": "bottom", "transform": axes.get_yaxis_transform()}
+    axes.text({"left": 0.01, "right": 0.99}[side], target, f"target {target:g}", **style)

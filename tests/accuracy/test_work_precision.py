@@ -109,7 +109,7 @@ def test_text_and_json(table, tmp_path):
     assert left.get_ylabel() == "relative error of Ψ [–]" and right.get_ylabel() == "relative error of dΨ/dp [–]"
     names = {line.get_label() for line in left.lines if not line.get_label().startswith("_")}
     assert names == {row.setting.curve for row in table if not row.failure}
-    assert [note.get_text() for note in left.texts] == ["0.01"]  # nothing meets the other target
+    assert [note.get_text() for note in left.texts] == ["target 0.01"]  # nothing meets the other target
     assert lg.plotting.save(figure, tmp_path / "a.png").stat().st_size > 10_000  # an empty canvas has some 3 kB
 
 
