@@ -33,5 +33,5 @@ def test_both_find_the_same_stiffness_and_damping():
     # Constraints are met to 1e-6 by both, times multipliers of 4 and |f(x₀)|/f of 2.3.
     assert found.objective == pytest.approx(scale * other.fun, rel=2e-5)
     for name, value in problem.x(other.x).items():
-        # ∇L of 1e-6 along the constraint, where f/|f(x₀)| is flat: its curvature is some 0.1
-        assert float(found.x[name]) == pytest.approx(float(value), rel=1e-3)
+        # Along the constraint f/|f(x₀)| is flat, of curvature 2e-3 in the box: ∇L of 1e-6 and f of 1e-10 are 5e-4 of it.
+        assert float(found.x[name]) == pytest.approx(float(value), rel=5e-3)
