@@ -26,7 +26,7 @@ from lgsens.optimize import minimize, scipy_problem
 RESULTS = Path(__file__).parent / "results" / "design.json"
 NEAR = -0.2  # of its scale: trust-constr is spared constraints that never come nearer than this
 NEARLY = 0.1  # of the scale: the violation of designs that are nearly feasible
-GRID = 13  # points along each axis of each grid
+GRID = 9  # points along each axis of each grid
 LEVELS = 5
 ZOOM = 0.3  # of the width, around the best feasible point
 
@@ -70,7 +70,7 @@ def by_scipy(design: SuspensionDesign, method: str, samples: np.ndarray) -> dict
         options = {"ftol": 1e-9}
     else:
         given = scipy.optimize.NonlinearConstraint(constraints, -np.inf, 0.0, jac=jacobian, hess=scipy.optimize.BFGS())
-        options = {"gtol": 1e-6, "xtol": 1e-8, "barrier_tol": 1e-7, "maxiter": 150}
+        options = {"gtol": 1e-6, "xtol": 1e-8, "barrier_tol": 1e-7, "maxiter": 60}
     started = time.perf_counter()
     found = scipy.optimize.minimize(
         lambda z: problem.fun(z) / scale,
@@ -125,7 +125,7 @@ def table(methods: dict) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, default=1000, help="of each simulation over 2 s")
+    parser.add_argument("--steps", type=int, default=400, help="of each simulation over 2 s")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     design = SuspensionDesign.load(num_steps=options.steps)

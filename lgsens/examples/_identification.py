@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens._simulate import simulate
+from lgsens._validate import as_float
 from lgsens.examples._four_bar import four_bar
 
 
@@ -21,7 +22,7 @@ class AccelerationTest(eqx.Module):
         t1: duration [s]. num_steps: steps of the simulation, static; a reading at each time.
     """
 
-    deviation: Float[Array, ""] = eqx.field(default=0.05, converter=lambda value: jnp.asarray(value, float))
+    deviation: Float[Array, ""] = eqx.field(default=0.05, converter=lambda value: as_float(value, (), "`deviation`"))
     t1: float = eqx.field(static=True, default=0.75)
     num_steps: int = eqx.field(static=True, default=150)
 

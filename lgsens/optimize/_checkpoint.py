@@ -25,9 +25,9 @@ def columns(rows: list[Row]) -> dict[str, np.ndarray]:
 class Checkpoint:
     """One `.npz` file, replaced as a whole: a process that dies while writing leaves the one before."""
 
-    def __init__(self, path: str | os.PathLike, box: Box, x0: Float[Array, " n"]):
+    def __init__(self, path: str | os.PathLike, box: Box, x0: Float[Array, " n"], tolerances: tuple[float, float]):
         self.path = Path(path)
-        numbers = b"".join(np.ascontiguousarray(leaf).tobytes() for leaf in (*box, x0))
+        numbers = b"".join(np.ascontiguousarray(leaf).tobytes() for leaf in (*box, x0, tolerances))
         self.problem = f"{FORMAT} {hashlib.sha256(numbers).hexdigest()}"
 
     def save(self, carry: Carry, rows: list[Row]) -> None:
@@ -65,8 +65,8 @@ class Checkpoint:
         )
         if not same:
             raise ValueError(
-                f"`checkpoint` {str(self.path)!r} belongs to another start, other bounds or another number of "
-                f"constraints; {remedy}"
+                f"`checkpoint` {str(self.path)!r} belongs to another start, other bounds or tolerances, or "
+                f"another number of constraints; {remedy}"
             )
         rows = [Row(*row) for row in zip(*(arrays[f"row_{name}"] for name in Row._fields))]
         # Another machine or version rounds otherwise, which a motion may enlarge: half of the digits are compared.

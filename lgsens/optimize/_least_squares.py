@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import lineax
 import optimistix
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
@@ -54,7 +53,7 @@ class LineSearchGaussNewton(optimistix.AbstractGaussNewton):
     rtol: float = 1e-5
     atol: float = 1e-5
     norm: Callable = optimistix.max_norm
-    descent: optimistix.NewtonDescent = optimistix.NewtonDescent(linear_solver=lineax.QR())
+    descent: optimistix.NewtonDescent = optimistix.NewtonDescent()
     search: optimistix.BacktrackingArmijo = optimistix.BacktrackingArmijo()
     verbose: Callable = lambda **_: None
 

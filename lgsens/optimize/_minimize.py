@@ -128,7 +128,7 @@ def minimize(
         )
     rows, store = [], None
     if checkpoint is not None:
-        store = Checkpoint(checkpoint, box, x)
+        store = Checkpoint(checkpoint, box, x, (tolerance, constraint_tolerance))
         carry, rows = store.load(carry, first)
     with progress_bar(num_steps, "step", progress, initial=len(rows)) as bar:
         while len(rows) < num_steps and not int(carry.ended):

@@ -82,7 +82,7 @@ def test_a_half_written_file_does_not_replace_the_last(tmp_path, whole, monkeypa
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"start": 0.6}, "belongs to another start, other bounds or another number of constraints"),
+        ({"start": 0.6}, "belongs to another start, other bounds or tolerances, or another"),
         ({"fun": lambda x: (problem(x)[0], problem(x)[1][:2])}, "another number of constraints"),
         ({"fun": lambda x: (2 * problem(x)[0], problem(x)[1])}, "belongs to another `fun`: objective at `x0`"),
     ],
