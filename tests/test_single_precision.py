@@ -1,0 +1,34 @@
+"""Without 64-bit floats: gradients of both modes, and where smaller steps do harm."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lgsens.examples import PROBLEMS
+
+SINGLE = float(np.finfo(np.float32).eps)
+TOP, FOUR_BAR = "spinning_top_brulls.l_1.0_reproduces_published_number", "four_bar_spring"
+
+
+def slopes(name: str, num_steps: int, mode) -> np.ndarray:
+    """p dΨ/dp of all criteria, rows, and all parameters, relative to the largest of each row."""
+    problem = PROBLEMS[name]
+    parameters = {key: jnp.asarray(value, dtype=float) for key, value in problem.parameters.items()}
+    psi = lambda p: problem.evaluate(problem.simulate(p, num_steps=num_steps), p)
+    found = jax.jit(mode(psi))(parameters)
+    rows = np.array([[own[key] * value for key, value in problem.parameters.items()] for own in found.values()])
+    assert all(leaf.dtype == jnp.zeros(()).dtype for leaf in jax.tree.leaves(found))
+    return rows / np.abs(rows).max(axis=1, keepdims=True)
+
+
+@pytest.mark.filterwarnings("ignore:lgsens runs in single precision")
+@pytest.mark.parametrize("name", [TOP, pytest.param(FOUR_BAR, marks=pytest.mark.slow)])
+def test_gradients(name):
+    num_steps = 20
+    expected = slopes(name, num_steps, jax.jacrev)
+    with jax.enable_x64(False):
+        for mode in (jax.jacrev, jax.jacfwd):
+            difference = np.abs(slopes(name, num_steps, mode) - expected).max(axis=1)
+            print(mode, difference / SINGLE)
+            assert (difference < 1e-2).all()
