@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 import lgsens as lg
 from lgsens.dynamics import Tangents
-from lgsens.examples import PROBLEMS
+from lgsens.examples import PROBLEMS, spinning_top
 from lgsens.liegroups import Rn
 
 SCHEME = lg.GeneralizedAlpha(rho_inf=0.8)
@@ -135,6 +135,26 @@ def test_derivatives_on_a_given_grid():
         shifted = lambda s, i=i, d=direction: both(*(x + s * d if j == i else x for j, x in enumerate(point)))[0]
         # differences: δ⁶ = 1e-18 × seventh derivative; λ carries round-off/(βh²)/δ = 1e-12/1e-3 of its weight 0.01
         np.testing.assert_allclose(jnp.sum(forward[i] * direction), central(shifted, 1e-3), rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_top_on_a_given_grid():
+    """Rotations: by the initial angle and by the sizes of the steps, reverse mode against differences."""
+
+    def psi(alpha0, fractions):
+        integrator = lg.GivenSteps(fractions, SCHEME)
+        run = lg.simulate(spinning_top(alpha0), t1=0.3, num_steps=fractions.shape[0], integrator=integrator)
+        top = run.body("top")
+        return lg.time_integral(run.t, top.position[:, 0] ** 2) + top.velocity[-1, 0]
+
+    alpha0, sizes = jnp.asarray(0.7), jnp.asarray(np.append(uneven(20), [0.0, 0.0]))
+    both = jax.jit(jax.value_and_grad(psi, argnums=(0, 1)))
+    _, (by_angle, by_sizes) = both(alpha0, sizes)
+    # differences: δ⁶ = 1e-18 × seventh derivative, round-off 1e-15/1e-3
+    np.testing.assert_allclose(by_angle, central(lambda s: both(alpha0 + s, sizes)[0], 1e-3), rtol=1e-8)
+    direction = jnp.asarray(np.random.default_rng(1).normal(size=22)) * sizes
+    slope = central(lambda s: both(alpha0, sizes + s * direction)[0], 1e-3)
+    np.testing.assert_allclose(by_sizes @ direction, slope, rtol=1e-7)  # a tenth of the sum's terms is left of them
 
 
 @pytest.mark.slow
