@@ -149,7 +149,8 @@ assert all(leaf.dtype == jnp.float64 for leaf in leaves)
 
 
 def test_namespaces_are_attributes():
-    """`lgsens.examples`, `.optimize`, `.plotting` and `.testing` without an import of their own; other names raise."""
+    """`lgsens.accuracy`, `.examples` and the others need no import of their own; other names raise."""
+    assert callable(lgsens.accuracy.work_precision)
     assert callable(lgsens.examples.spinning_top)
     assert callable(lgsens.optimize.minimize)
     assert lgsens.plotting.__name__ == "lgsens.plotting"
