@@ -1,7 +1,12 @@
 """What precision costs and what it loses: mixed precision beside double, and single precision over the step.
 
-    python benchmarks/precision.py [--parts mixed single] [--cache FOLDER] [--out benchmarks/results]
+    python benchmarks/precision.py [--parts kernels mixed single] [--cache FOLDER] [--out benchmarks/results]
     python benchmarks/precision.py --readme   # the table of precision.json, into benchmarks/README.md; measures nothing
+
+kernels: what a step does with its matrix, of 9 unknowns (the top), 35 and 94 (the quarter-car, reduced and whole) and
+208, random ones of condition 5e2: factors and one solution, one more solution, 32 columns, and the product with the
+inverse that an iteration of modified Newton is (with its share of an inverse made every 50); the fastest of many rounds
+of 50 in a scan, and medians.
 
 mixed: simulations and gradients by all numbers of the assembled system, in reverse mode, with factors in single
 precision (`DenseLU(mixed=True)`, `BlockSparse(mixed=True)`) and in double. The programs of a scene take turns; medians
@@ -26,7 +31,8 @@ from pathlib import Path
 from benchmark import SINGLE_THREAD, circumstances, environment, interleaved, options, write
 from rival_tables import put_into
 
-PARTS = ("mixed", "single")
+PARTS = ("kernels", "mixed", "single")
+LOOPS = 50
 STEPS = (10, 20, 40, 80, 160, 320, 640, 1280, 2560)  # per second
 PROBLEMS = {"top": "spinning_top_brulls.l_1.0_reproduces_published_number", "four-bar": "four_bar_spring"}
 
@@ -42,6 +48,52 @@ def scenes() -> dict:
         ("quarter-car", lg.DenseLU): (car, "chassis", 500),
         ("chain of 64", lg.BlockSparse): (spatial_chain(64, spin=24.0 / 64), "link63", 100),
     }
+
+
+def measure_kernels(repeats: int) -> Iterator[dict]:
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+    from jax import lax
+
+    from lgsens.linear import LU, Inverse
+    from lgsens.linear._mixed import factors_of
+
+    def looped(solve, rhs):
+        """`solve(rhs)` again and again, each waiting for the one before."""
+        again = lambda last, _: (solve(rhs + 1e-13 * last).ravel()[0], None)
+        return lax.scan(again, jnp.zeros(()), None, length=LOOPS)[0]
+
+    def once(matrix, rhs, mixed):
+        return looped(lambda rhs: factors_of(matrix + 1e-13 * rhs[0], LU, mixed=mixed).solve(rhs), rhs)
+
+    def more(kind):
+        return lambda matrix, rhs, mixed: looped(factors_of(matrix, kind, mixed=mixed).solve, rhs)
+
+    works = {
+        "factors and a solution": (once, ()),
+        "one more solution": (more(LU), ()),
+        "32 columns more": (more(LU), (32,)),
+        "product with the inverse": (more(Inverse), ()),
+    }
+    rng = np.random.default_rng(0)
+    for unknowns in (9, 35, 94, 208):
+        left, right = (np.linalg.qr(rng.normal(size=(unknowns, unknowns)))[0] for _ in range(2))
+        matrix, calls = jnp.asarray(left * np.geomspace(1.0, 1.0 / 5e2, unknowns) @ right), {}
+        for work, (function, columns) in works.items():
+            rhs = jnp.asarray(rng.normal(size=(unknowns, *columns)))
+            for mixed in (False, True):
+                program = jax.jit(function, static_argnums=2).lower(matrix, rhs, mixed).compile()
+                calls[work, mixed] = lambda run=program, given=(matrix, rhs): jax.block_until_ready(run(*given))
+                calls[work, mixed]()
+        times = interleaved(calls, repeats, seconds=1.0)
+        for work in works:
+            row: dict = {"unknowns": unknowns, "work": work}
+            for mixed, name in ((False, "double"), (True, "mixed")):
+                taken = times[work, mixed].wall
+                row[f"{name}_us"] = statistics.median(taken) / LOOPS * 1e6
+                row[f"{name}_fastest_us"] = min(taken) / LOOPS * 1e6
+            yield row
 
 
 def measure_mixed(repeats: int) -> Iterator[dict]:
@@ -124,6 +176,12 @@ def fit(steps: list[float], errors: list[float]) -> dict:
     return {"C": float(c), "epsilon": float(eps), "p": float(p), "optimum": float(optimum), "least": float(least)}
 
 
+def measure(part: str, repeats: int) -> Iterator[dict]:
+    if part == "kernels":
+        return measure_kernels(repeats)
+    return measure_mixed(repeats) if part == "mixed" else measure_single()
+
+
 def plot(rows: list[dict], path: Path) -> None:
     from lgsens.plotting import ErrorPanel, errors, save
 
@@ -137,6 +195,21 @@ def plot(rows: list[dict], path: Path) -> None:
 
 def table(document: dict) -> str:
     lines = []
+    if "kernels" in document:
+        part = document["kernels"]
+        lines += [
+            f"{circumstances(part['environment'])} The fastest of many rounds, medians in brackets.",
+            "",
+            "| unknowns | work | double [µs] | mixed [µs] | mixed / double |",
+            "|---|---|---|---|---|",
+        ]
+        for row in part["rows"]:
+            cells = [f"{row[f'{name}_fastest_us']:.2f} ({row[f'{name}_us']:.2f})" for name in ("double", "mixed")]
+            ratios = [row[f"mixed{kind}_us"] / row[f"double{kind}_us"] for kind in ("_fastest", "")]
+            lines.append(
+                f"| {row['unknowns']} | {row['work']} | {' | '.join(cells)} | {ratios[0]:.2f} ({ratios[1]:.2f}) |"
+            )
+        lines.append("")
     if "mixed" in document:
         part = document["mixed"]
         lines += [
@@ -187,7 +260,7 @@ def main() -> None:
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         for part in arguments.parts:
             document[part] = {"environment": environment(SINGLE_THREAD), "rows": []}
-            for row in measure_mixed(arguments.repeats) if part == "mixed" else measure_single():
+            for row in measure(part, arguments.repeats):
                 print(row, flush=True)
                 document[part]["rows"].append(row)
                 write(path, document)

@@ -1,4 +1,4 @@
-"""Without 64-bit floats: gradients of both modes, and where smaller steps do harm."""
+"""Without 64-bit floats: gradients of both modes."""
 
 import jax
 import jax.numpy as jnp
@@ -30,5 +30,6 @@ def test_gradients(name):
     with jax.enable_x64(False):
         for mode in (jax.jacrev, jax.jacfwd):
             difference = np.abs(slopes(name, num_steps, mode) - expected).max(axis=1)
-            print(mode, difference / SINGLE)
-            assert (difference < 1e-2).all()
+            # a step is solved to 64 round-offs; the sensitivities themselves add ten
+            assert (difference > 0.0).all()
+            assert (difference < num_steps * 64 * SINGLE).all()

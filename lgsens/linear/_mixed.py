@@ -9,6 +9,9 @@ each turn multiplies the error by about κ ε₃₂, κ the condition of S: 1e-5
 nothing but last digits, or where corrections have stopped to fall; what then is not small means a condition beyond
 1/ε₃₂, and the solution is NaN. Modified Newton takes Ŝ⁻¹ as it is: its residuals are in double, and its matrix is off
 by more than round-off anyway.
+
+Two turns are what the matrix of a step needs: three solutions in single precision and two products for one in double,
+besides S itself that must be kept. Factors in single precision save as much from about 200 unknowns on only.
 """
 
 from functools import partial

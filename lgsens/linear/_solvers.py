@@ -23,8 +23,10 @@ class DenseLU(AbstractLinearSolver):
 
     Arguments:
         mixed: factors in single precision, solutions refined in double: motion and sensitivities are those of double
-            precision to 1e-9. A matrix that cannot be refined (a condition above 1e6) fails the step. Without effect
-            where everything is in single precision. `benchmarks/precision.py` measures what it costs.
+            precision to 1e-9. No gain on a CPU so far, which is why it is not the default: of 94 unknowns, factors with
+            one solution take 1.2 times as long, every further solution 3 times; iterations of modified Newton 0.6 times
+            (`benchmarks/precision.py`). A matrix that cannot be refined (a condition above 1e6) fails the step.
+            Without effect where everything is in single precision.
 
     Raises `ValueError` where `mixed` is not True or False.
     """
