@@ -1,4 +1,4 @@
-"""The suspension's design by the augmented Lagrangian and by SLSQP of SciPy, which shares no more than the simulation."""
+"""The suspension by the augmented Lagrangian and by SLSQP of SciPy, which share no more than the simulation."""
 
 import numpy as np
 import pytest
@@ -33,5 +33,5 @@ def test_both_find_the_same_stiffness_and_damping():
     # Constraints are met to 1e-6 by both, times multipliers of 4 and |f(x₀)|/f of 2.3.
     assert found.objective == pytest.approx(scale * other.fun, rel=2e-5)
     for name, value in problem.x(other.x).items():
-        # Along the constraint f/|f(x₀)| is flat, of curvature 2e-3 in the box: ∇L of 1e-6 and f of 1e-10 are 5e-4 of it.
+        # Along the constraint f/|f(x₀)| is flat, of curvature 2e-3: ∇L of 1e-6 and f of 1e-10 are 5e-4 of the box.
         assert float(found.x[name]) == pytest.approx(float(value), rel=5e-3)
