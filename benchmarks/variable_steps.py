@@ -31,7 +31,7 @@ CASES = [
     ("equal", ALPHA, 500),
     ("equal", ALPHA, 1000),
     *((f"tolerance {tolerance:g}", lg.AdaptiveSteps(ALPHA, tolerance=tolerance), n) for tolerance, n in (
-        (2e-2, 200), (5e-3, 300), (1e-3, 600),
+        (1e-4, 200), (1e-5, 320), (1e-6, 600),
     )),
 ]  # fmt: skip
 COMFORT = lg.Criterion(integrand=lambda s, p: s.body("chassis").acceleration[2] ** 2)
