@@ -20,7 +20,7 @@ from lgsens.liegroups import Rn
 
 SCHEME = lg.GeneralizedAlpha(rho_inf=0.8)
 DATA = Path(__file__).parent / "data"
-CARS = [("quarter_car_linear", 1e-5, 200), ("five_link_quarter_car", 1e-5, 400)]
+CARS = [("quarter_car_linear", 1e-5, 250), ("five_link_quarter_car", 1e-6, 500)]
 P = (1.3, 0.8, 40.0, 0.5)
 
 
@@ -87,7 +87,7 @@ def uneven(n):
 
 
 @functools.cache
-def adaptive(tolerance=1e-5, capacity=200, sensitivity=lg.DirectDifferentiation(), **settings):
+def adaptive(tolerance=1e-5, capacity=250, sensitivity=lg.DirectDifferentiation(), **settings):
     """One program for all values of the parameters."""
     integrator = lg.AdaptiveSteps(SCHEME, tolerance=tolerance, **settings)
     settings = {"num_steps": capacity, "integrator": integrator, "sensitivity": sensitivity}
@@ -176,13 +176,13 @@ def test_error_control():
     """Grid, statistics, and what repeats after the last step."""
     run = adaptive()(jnp.array(P))
     steps, sizes = int(run.stats.steps), np.diff(run.t)
-    assert run.result == lg.RESULTS.successful and 50 <= steps < 200
+    assert run.result == lg.RESULTS.successful and 50 <= steps < 250
     assert np.all(sizes[:steps] > 0) and np.all(sizes[steps:] == 0)
     assert sizes.max() <= 0.02 * (1 + 1e-12)  # `longest`
     np.testing.assert_allclose(run.t[-1], 1.2, rtol=1e-14)
     assert np.all(run.stats.error <= 1e-5) and np.all(run.stats.error[steps:] == 0)
     assert np.all(run.stats.converged) and np.all((run.stats.iterations > 0) == (sizes > 0))
-    assert run.stats.rejected.shape == (200,) and np.all(run.stats.rejected[steps:] == 0)
+    assert run.stats.rejected.shape == (250,) and np.all(run.stats.rejected[steps:] == 0)
     for leaf in map(np.asarray, jax.tree.leaves(run.states)):
         assert np.all(np.isfinite(leaf)) and np.all(leaf[steps:] == leaf[steps])
 
@@ -191,8 +191,8 @@ def test_error_control():
 def test_errors_fall_with_the_tolerance():
     p = jnp.array(P)
     exact = observed(lg.simulate(make(p), t0=0.2, t1=1.2, num_steps=4000, integrator=SCHEME))
-    errors = [abs(float(observed(adaptive(tolerance, n)(p)) - exact)) for tolerance, n in ((1e-5, 200), (1e-7, 800))]
-    assert errors[1] < errors[0] / 10, errors  # tolerance^(2/3): 21
+    errors = [abs(float(observed(adaptive(tolerance, n)(p)) - exact)) for tolerance, n in ((1e-5, 250), (1e-7, 1000))]
+    assert 10 < errors[0] / errors[1] < 40, errors  # tolerance^(2/3): 21
 
 
 def differentiated(p):
@@ -236,9 +236,10 @@ def test_lanes_have_grids_of_their_own():
     assert runs.stats.steps[0] > runs.stats.steps[1] + 5
     for lane, p in enumerate((stiff, soft)):
         (one, run), slope = DIFFERENTIATED(p)
-        np.testing.assert_allclose(runs.t[lane], run.t, rtol=1e-9)  # sizes follow from errors that carry round-off/h²
-        np.testing.assert_allclose(values[lane], one, rtol=1e-9)
-        np.testing.assert_allclose(slopes[lane], slope, rtol=1e-7)
+        # sizes follow from (a_{n+1} − a_n)/h, whose round-off is 1e-16/h³ = 1e-10, and more of it where it is small
+        np.testing.assert_allclose(runs.t[lane], run.t, rtol=1e-7)
+        np.testing.assert_allclose(values[lane], one, rtol=1e-7)
+        np.testing.assert_allclose(slopes[lane], slope, rtol=1e-6)
 
 
 EXHAUSTED = says("needs more steps", "`num_steps`", "`tolerance`", "t = 0.", "of 1.2 s in 30 steps", "`throw=False`")

@@ -9,15 +9,16 @@ and kept below the tolerance. It is that of a step and not of a unit of time: lo
 ∫ dt/h steps, and for a given sum the steps are fewest where h³ |c| is the same in all. The size of the next one follows
 from the errors of the last two, E = |e|/tolerance, by the filter
 
-    ρ = (θ/E_n)^{3/(5·3)} (θ/E_{n−1})^{−1/(5·3)},      h ← h (1 + κ arctan((ρ − 1)/κ)).
+    ρ = (θ/E_n)^{1/(4·3)} (θ/E_{n−1})^{1/(4·3)} (h_n/h_{n−1})^{−1/4},      h_{n+1} = h_n (1 + κ arctan((ρ − 1)/κ)).
 
+It does not answer to what alternates from step to step, as accelerations do after a change, with (−ρ∞)ⁿ.
 Sizes so chosen change smoothly, which matters: in the constraint directions the velocity carries an error of O(h²) that
 belongs to the step size (see `_start.py`), and where this changes by a factor r multipliers are off by O(r² − 1) h.
 
 The derivative is that of the scheme on the grid found, so nothing here is differentiated.
 
 Sources: Géradin & Cardona, Flexible Multibody Dynamics (2001), §11; Söderlind, ACM Transactions on Mathematical
-Software 29 (2003), doi:10.1145/641876.641877 (filter PI.4.2); Söderlind & Wang, Journal of Computational and Applied
+Software 29 (2003), doi:10.1145/641876.641877 (filter H211b); Söderlind & Wang, Journal of Computational and Applied
 Mathematics 185 (2006), doi:10.1016/j.cam.2005.03.008 (limiter).
 """
 
@@ -146,7 +147,7 @@ def integrate_controlled(
 
     def relative(v, vdot, jerk, h):
         missed = missed_increment(scheme, system, v, vdot, jerk)
-        return jnp.max(jnp.abs(h**3 * missed) / scale) / tolerance
+        return h**3 * jnp.max(jnp.abs(missed) / scale) / tolerance
 
     def fitted(h, remaining):
         """No longer than what remains, and no rest that is much shorter than a step."""
@@ -186,10 +187,11 @@ def integrate_controlled(
         trial = lax.while_loop(
             lambda trial: trial.trying, attempt, _Trial(wanted, nothing, h * 0.0, none, none, active)
         )
-        done = steps.after(begins(trial.h), trial.found, trial.h)
+        begun = begins(trial.h)
+        done = steps.after(begun, trial.found, trial.h)
         progress = chosen(active, done._replace(inverse=None), ready._replace(inverse=None))
         error = jnp.maximum(trial.error, _LEAST)
-        rho = (_AIM / error) ** 0.2 * (_AIM / before) ** (-1.0 / 15.0)
+        rho = (_AIM / error * _AIM / before) ** (1.0 / 12.0) * (begun.h / trial.h) ** 0.25
         grown = trial.h * (1.0 + _LIMIT * jnp.arctan((rho - 1.0) / _LIMIT))
         elapsed = jnp.where(active, jnp.where(trial.h >= remaining, total, elapsed + trial.h), elapsed)
         h_taken = jnp.where(active | ~progress.running, trial.h, 0.0)
