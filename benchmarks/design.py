@@ -129,16 +129,20 @@ def main() -> None:
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     design = SuspensionDesign.load(num_steps=options.steps)
-    methods = {"augmented Lagrangian": by_augmented_lagrangian(design)}
-    grid, nearest = by_grid(design)
-    methods["SLSQP"] = by_scipy(design, "SLSQP", np.arange(nearest.size))
-    methods["trust-constr"] = by_scipy(design, "trust-constr", np.flatnonzero(nearest > NEAR))
-    methods["grid"] = grid
     evaluate = jax.jit(design)
-    for row in methods.values():
+
+    def judged(name: str, row: dict) -> dict:
         objective, constraints = evaluate(row["x"])
         row |= {"objective": float(objective), "worst_constraint": float(np.max(constraints))}
         row["x"] = {name: float(value) for name, value in row["x"].items()}
+        print(name, row, flush=True)
+        return {name: row}
+
+    methods = judged("augmented Lagrangian", by_augmented_lagrangian(design))
+    grid, nearest = by_grid(design)
+    methods |= judged("grid", grid)
+    methods |= judged("SLSQP", by_scipy(design, "SLSQP", np.arange(nearest.size)))
+    methods |= judged("trust-constr", by_scipy(design, "trust-constr", np.flatnonzero(nearest > NEAR)))
     packages = ("lgsens", "jax", "jaxlib", "numpy", "scipy", "optax")
     record = {
         "date": time.strftime("%Y-%m-%d"),
