@@ -20,7 +20,7 @@ from lgsens.liegroups import Rn
 
 SCHEME = lg.GeneralizedAlpha(rho_inf=0.8)
 DATA = Path(__file__).parent / "data"
-CARS = [("quarter_car_linear", 1e-5, 250), ("five_link_quarter_car", 1e-6, 500)]
+CARS = [("quarter_car_linear", 1e-5, 250)]
 P = (1.3, 0.8, 40.0, 0.5)
 
 

@@ -63,8 +63,9 @@ class AdaptiveSteps(eqx.Module):
 
     The derivative is that of the numerical solution on the grid found, exactly, in both modes; under `vmap` each lane
     has its own. The sizes themselves change a little with the parameters, which the derivative leaves out: finite
-    differences agree with it on the same grid (`GivenSteps.of`). Steps are chosen for the motion alone; the scheme is
-    stable at every step size for the motion and so for its linearization.
+    differences agree with it on the same grid (`GivenSteps.of`). **Sensitivities**: their errors are not controlled,
+    but the scheme is stable at any step size for the motion and so for its linearization: across a bump gradients by
+    hardpoints converge as Ψ does (`benchmarks/variable_steps.py`). The criterion's trapezoidal rule sees the grid too.
 
     All static and hashable. Raises `ValueError` for settings out of range.
     """
@@ -150,9 +151,9 @@ def integrate_controlled(
         return h**3 * jnp.max(jnp.abs(missed) / scale) / tolerance
 
     def fitted(h, remaining):
-        """No longer than what remains, and no rest that is much shorter than a step."""
-        h = jnp.minimum(h, settings.longest * total)
-        return jnp.where(h >= remaining, remaining, jnp.where(2.0 * h > remaining, remaining / 2.0, h))
+        """A whole number of such steps for what remains: none at the end that differs from those before."""
+        least = remaining / (settings.longest * total)
+        return remaining / jnp.ceil(jnp.maximum(remaining / h - 0.1, least * (1.0 - 1e-9)))
 
     def step(carry, n):
         progress, proposed, before, elapsed = carry
