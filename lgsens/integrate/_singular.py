@@ -8,11 +8,12 @@ Let y be a fixed displacement, and S [x; μ] = [0; B y], that is B A⁻¹ Bᵀ �
 values σ_i of B A^{-1/2} and its singular vectors μ is the sum of the u_i (v_i · A^{1/2} y)/σ_i: where the smallest
 falls to zero, so does the margin
 
-    m = 1/|μ| ∝ σ_min,
+    m = |B y|/|μ| ∝ σ_min,
 
 linearly in time on both sides of the singular point, without any part along redundant equations. Two successive steps
 with 2 m_n ≤ m_{n−1} say that it would be zero before the next one. A motion that passes a singular configuration at
-a distance has a minimum of m instead, which steps that resolve it see as such.
+a distance has a minimum of m instead, which steps that resolve it see as such. m lies between the squares of the
+smallest and the largest σ, wherever B y points: 1/|μ| alone would have peaks where B y is small.
 
 m costs one product with the inverse that many steps share. Where m falls so fast that it would be zero before two such
 inverses are over, every step has its own.
@@ -34,8 +35,9 @@ def margin_of(factors: Factors, jacobian: Matrix, scale: Float[Array, " k"]) -> 
     if not jacobian.shape[0]:
         return jnp.full((), jnp.inf, scale.dtype)
     y = scale * jnp.asarray(np.random.default_rng(0).normal(size=scale.shape), scale.dtype)
-    _, mu = factors.solve(jnp.zeros_like(scale), jacobian @ y)
-    return 1.0 / jnp.sqrt(jnp.sum(mu**2))
+    moved = jacobian @ y
+    _, mu = factors.solve(jnp.zeros_like(scale), moved)
+    return jnp.sqrt(jnp.sum(moved**2) / jnp.sum(mu**2))
 
 
 class Watch(NamedTuple):
