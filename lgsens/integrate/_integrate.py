@@ -140,7 +140,7 @@ def take_step(
         measured = (iterate.iterations > 1) & (iterate.before > _ROUGH * eps)
         ratio = jnp.sqrt(size / jnp.where(measured, iterate.before, 1.0))
         contraction = jnp.where(measured, jnp.maximum(ratio, _FASTEST), iterate.contraction)
-        rough = (size <= _ROUGH * eps) & (size > 4.0 * contraction**2 * iterate.before)
+        rough = (size <= _ROUGH * eps) & (size > jnp.maximum(4.0 * contraction**2, 0.01) * iterate.before)
         settled = (iterate.increment * iterate.contraction**2 <= target) | rough
         largest, count = jnp.max(jnp.abs(residual)), iterate.iterations + 1
         return _Iterate(
