@@ -75,6 +75,8 @@ def error_estimate(trajectory: Trajectory, integrator: GeneralizedAlpha = Genera
     states, num_steps = trajectory.states, trajectory.t.shape[0] - 1
     if not isinstance(integrator, GeneralizedAlpha):
         raise ValueError(f"`integrator` must be a GeneralizedAlpha, got {integrator!r}.")
+    if integrator.stabilized:
+        raise ValueError("`integrator`: the estimate is for index 3; leave `stabilized` out, or halve the step to see.")
     if num_steps < _LEAST_STEPS:
         raise ValueError(f"`error_estimate` needs at least {_LEAST_STEPS} steps, got {num_steps}.")
     scheme, eps = integrator, float(jnp.finfo(states.v.dtype).eps)

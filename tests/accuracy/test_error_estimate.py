@@ -109,6 +109,8 @@ def test_bad_input():
         error_estimate(trajectory)
     with pytest.raises(ValueError, match="`integrator` must be a GeneralizedAlpha"):
         error_estimate(trajectory, lg.IndexReducedODE())
+    with pytest.raises(ValueError, match="for index 3; leave `stabilized` out"):
+        error_estimate(trajectory, lg.GeneralizedAlpha(stabilized=True))
     with pytest.raises(ValueError, match="at least 3 steps, got 2"):
         error_estimate(lg.simulate(build(P), t1=T1, num_steps=2))
 
