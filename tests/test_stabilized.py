@@ -110,7 +110,7 @@ def test_iteration_matrix():
     def matrix_and_factors(h):
         step = Constants.of(system, stabilized=True).step(STABILIZED, system, state, h)
         defect = lambda x: jnp.concatenate(step.defect(step.motion(x[:6], x[6:]), x[6:], t))
-        factors = step.factors(step.motion(unknowns[:6], unknowns[6:]), unknowns[6:], t)
+        factors, _ = step.factors(step.motion(unknowns[:6], unknowns[6:]), unknowns[6:], t)
         matrix = jax.jacfwd(defect)(unknowns)
         columns = jax.vmap(lambda x: jnp.concatenate(factors.solve(x[:6], x[6:])), 1, 1)
         rows = jax.vmap(lambda x: jnp.concatenate(factors.solve(x[:6], x[6:], transposed=True)))

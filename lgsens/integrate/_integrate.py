@@ -6,8 +6,9 @@ it takes three or four to round-off, each a tenth of a full one. Motion and mult
 chain contracts by 0.3 and by 1e-4 alternately: what counts is κ² = d_i/d_{i−2}, with d_i the increments. The next
 iteration leaves an error of about κ² d_i. Where that is the square of the tolerance, or a fraction of round-off
 (the errors of a thousand steps add up), the next iteration is the last: to ask for smaller increments instead would be
-to ask for what the round-off of the constraints does not allow. That round-off grows with the scene (a hundred ε in a
-chain of 512 links), so an iteration is also the last where increments of that size no longer fall as they did.
+to ask for what the round-off of the constraints does not allow. That round-off grows with the scene (to 500 ε in a
+chain of 512 links), so an iteration is also the last where increments of that size no longer fall: of at most one ε for
+each coordinate.
 """
 
 from collections.abc import Callable
@@ -30,7 +31,7 @@ _MODIFIED_LIMIT = 12  # iterations; more cost as much as a full one
 SLOW = 0.1  # the contraction from which on a new matrix pays, in the next step
 _STALLED = 0.3  # that from which on two full iterations cost less
 _FASTEST = 0.02  # contractions measured close to round-off are no better than this
-_ROUGH = 4096  # round-offs: increments below say nothing of the contraction, and one that falls slower than it is noise
+_ROUGH = 64  # round-offs: increments below say nothing of the contraction, and are noise where they fall no longer
 
 
 class Stats(NamedTuple):
@@ -130,6 +131,7 @@ def take_step(
     eps = float(jnp.finfo(scale.dtype).eps)
     tolerance = max(scheme.tolerance, 64 * eps)
     target = max(tolerance**2, 0.04 * eps)
+    noise = max(_ROUGH, len(scale)) * eps
 
     def corrected(factors: Solver | None, iterate: _Iterate) -> _Iterate:
         motion = equations.motion(iterate.u, iterate.lam)
@@ -137,10 +139,10 @@ def take_step(
         solver, margin = equations.factors(motion, iterate.lam, t) if factors is None else (factors, iterate.margin)
         du, dlam = solver.solve(residual, violation)
         size = jnp.max(equations.change(du, dlam) * (scheme.beta * h**2) / scale)
-        measured = (iterate.iterations > 1) & (iterate.before > _ROUGH * eps)
+        measured = (iterate.iterations > 1) & (iterate.before > noise)
         ratio = jnp.sqrt(size / jnp.where(measured, iterate.before, 1.0))
         contraction = jnp.where(measured, jnp.maximum(ratio, _FASTEST), iterate.contraction)
-        rough = (size <= _ROUGH * eps) & (size > jnp.maximum(4.0 * contraction**2, 0.01) * iterate.before)
+        rough = (size <= noise) & (size > 0.25 * iterate.before)
         settled = (iterate.increment * iterate.contraction**2 <= target) | rough
         largest, count = jnp.max(jnp.abs(residual)), iterate.iterations + 1
         return _Iterate(
