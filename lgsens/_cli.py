@@ -74,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     optimize.add_argument("--t1", type=_positive, default=2.0, help="duration [s] (default: %(default)s)")
     optimize.add_argument("--dt", type=_positive, default=2e-3, help="step size [s] (default: %(default)s)")
     optimize.add_argument(
-        "--steps", type=_count, default=60, help="most gradients that the optimizer takes (default: %(default)s)"
+        "--steps", type=_count, default=300, help="most gradients that the optimizer takes (default: %(default)s)"
     )
     optimize.add_argument(
         "--wheel",

@@ -50,7 +50,10 @@ def systems(name: str):
     return [dataclasses.replace(system, linear_solver=solver) for solver in (lg.DenseLU(), lg.BlockSparse())]
 
 
-@pytest.fixture(scope="module", params=SCENES)
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("chain", "four_bar")]
+
+
+@pytest.fixture(scope="module", params=["branched", *SLOW])
 def pair(request):
     """A system, dense and sparse, and a point off its constraints."""
     dense, sparse = systems(request.param)
