@@ -209,6 +209,7 @@ def two_hinges(*, apart: bool) -> lg.Model:
     return lg.Model(chain.bodies | bodies, chain.joints | hinges, chain.forces, linear_solver=lg.BlockSparse())
 
 
+@pytest.mark.slow
 def test_redundant_constraints_are_found_and_named():
     good, bad = (two_hinges(apart=apart).system() for apart in (True, False))
     assert not is_redundant(good, good.sparse_constraint_jacobian(good.pose))

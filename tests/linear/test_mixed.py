@@ -109,10 +109,10 @@ SCENES = {
     "quarter_car": (car, "chassis", 100, 2e-3, lg.DenseLU),
     "quarter_car, blocks": (car, "chassis", 100, 2e-3, lg.BlockSparse),
 }
-FAST = ("top",)
 
 
-@pytest.mark.parametrize("name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in SCENES])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
 def test_gradients_by_every_number_are_those_of_double_precision(name):
     """Of motion and of accelerations: reverse mode by all numbers, and forward mode along one direction.
 
