@@ -87,7 +87,7 @@ def quarter_car(bushings: Sequence[str] = ()) -> Scene:
     if bushings:
         settings = (
             *grid((28, 76, 200), loose, model=heave),
-            *grid((400, 1600), alpha, model=heave),
+            *grid((400, 1600, 6400), alpha, model=heave),
             *grid((28, 52), GeneralizedAlpha(tolerance=1e-6), extrapolate=True, model=heave),
             *grid((200, 800), alpha, extrapolate=True, model=heave),
             *grid((8000,), IndexReducedODE(), model=heave),

@@ -5,11 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import says
 
 import lgsens as lg
 from lgsens.examples import four_bar
 from lgsens.integrate import singular_steps
-from tests.helpers import says
 
 Z = np.array([0.0, 0.0, 1.0])
 EXACT = lg.GeneralizedAlpha(0.8, tolerance=1e-13)

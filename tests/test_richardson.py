@@ -73,6 +73,7 @@ def test_order_of_a_function():
     assert np.all(errors[0] / errors[1] > 12.0), errors
 
 
+@pytest.mark.slow
 def test_order_of_a_trajectory():
     """The criterion by Gregory's rule on the coarse times, likewise; and the trapezoidal rule would spoil it."""
     finer = extrapolate_runs(top_run(100)[2], top_run(200)[2])

@@ -23,6 +23,7 @@ def slopes(name: str, num_steps: int, mode) -> np.ndarray:
 
 
 @pytest.mark.filterwarnings("ignore:lgsens runs in single precision")
+@pytest.mark.slow
 def test_gradients_of_the_top():
     num_steps = 20
     expected = slopes(TOP, num_steps, jax.jacrev)

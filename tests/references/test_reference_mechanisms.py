@@ -80,6 +80,7 @@ def test_motion_of_the_slider_crank():
             np.testing.assert_allclose(observed[key][0], expected[key], rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_the_slider_crank_moves_in_its_plane():
     """One degree of freedom, 17 independent equations; nothing leaves the plane or turns out of it."""
     system = slider_crank().system()
@@ -110,6 +111,7 @@ def test_published_output_of_idas():
         np.testing.assert_allclose(slope, published[f"dG_d{name}"], rtol=1e-5 * value, atol=5e-6)
 
 
+@pytest.mark.slow
 def test_motion_of_the_four_bar():
     p = PROBLEMS["four_bar_spring"].parameters
 
