@@ -25,6 +25,18 @@ class _Parser(argparse.ArgumentParser):
         self.exit(BAD_INPUT, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
 
+def _add_out(parser: argparse.ArgumentParser, default: str, what: str) -> None:
+    """`--out` and `--overwrite`."""
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path(default),
+        metavar="DIR",
+        help=f"new folder for {what} (default: %(default)s)",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="write into --out even if it exists")
+
+
 def _positive(text: str) -> float:
     value = float(text)
     if not (value > 0 and math.isfinite(value)):
@@ -51,14 +63,7 @@ def _parser() -> argparse.ArgumentParser:
         "road and its spring within its travel (Sonneville & Brüls 2014, §9).",
     )
     optimize.add_argument("problem", choices=["quarter-car"], help="what to optimize")
-    optimize.add_argument(
-        "--out",
-        type=Path,
-        default=Path("out/quarter-car"),
-        metavar="DIR",
-        help="new folder for result.json and the figures (default: %(default)s)",
-    )
-    optimize.add_argument("--overwrite", action="store_true", help="write into --out even if it exists")
+    _add_out(optimize, "out/quarter-car", "result.json and the figures")
     optimize.add_argument(
         "--hardpoints",
         type=Path,
@@ -106,14 +111,7 @@ def _parser() -> argparse.ArgumentParser:
         "figure, a table, and a page on which it moves.",
     )
     curves.add_argument("suspension", choices=["quarter-car"], help="which suspension")
-    curves.add_argument(
-        "--out",
-        type=Path,
-        default=Path("out/curves"),
-        metavar="DIR",
-        help="new folder for curves.png, curves.csv and travel.html (default: %(default)s)",
-    )
-    curves.add_argument("--overwrite", action="store_true", help="write into --out even if it exists")
+    _add_out(curves, "out/curves", "curves.png, curves.csv and travel.html")
     curves.add_argument(
         "--hardpoints",
         type=Path,
@@ -143,14 +141,7 @@ def _parser() -> argparse.ArgumentParser:
         "independent integrator: the spinning top (Sonneville & Brüls 2014, Fig. 2) and the quarter-car (Fig. 4). "
         "Most of the ten minutes is compilation.",
     )
-    paper.add_argument(
-        "--out",
-        type=Path,
-        default=Path("out/paper"),
-        metavar="DIR",
-        help="new folder for paper.json and the figures (default: %(default)s)",
-    )
-    paper.add_argument("--overwrite", action="store_true", help="write into --out even if it exists")
+    _add_out(paper, "out/paper", "paper.json and the figures")
     paper.add_argument("--only", choices=list(_cli_paper.STUDIES), help="one of the figures (default: all)")
     paper.add_argument("--coarse", action="store_true", help="two large steps instead of four or five: a quick look")
     paper.add_argument("--quiet", action="store_true", help="no progress bar and no tables")
@@ -168,14 +159,7 @@ def _parser() -> argparse.ArgumentParser:
         help=f"{', '.join(_cli_tradeoff.SCENES)}, or FILE.py that defines `build(p)`, `criterion(trajectory)`, "
         "`parameters` and `t1`, and if it likes `settings`, `scale` and `t0`, as in lgsens.accuracy.work_precision",
     )
-    tradeoff.add_argument(
-        "--out",
-        type=Path,
-        default=Path("out/tradeoff"),
-        metavar="DIR",
-        help="new folder for tradeoff.json and tradeoff.png (default: %(default)s)",
-    )
-    tradeoff.add_argument("--overwrite", action="store_true", help="write into --out even if it exists")
+    _add_out(tradeoff, "out/tradeoff", "tradeoff.json and tradeoff.png")
     tradeoff.add_argument(
         "--targets",
         type=_positive,

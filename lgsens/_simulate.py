@@ -13,7 +13,7 @@ from lgsens._index_reduced_ode import IndexReducedODE, integrate_ode, ode_failur
 from lgsens._richardson import Richardson, extrapolate_runs
 from lgsens._start import Begin, begin
 from lgsens._trajectory import Instant, Saved, Trajectory
-from lgsens._uneven_runs import GivenSteps, check_uneven, run_uneven
+from lgsens._uneven_runs import UnevenIntegrator, check_uneven, run_uneven
 from lgsens._validate import as_count, as_float, require
 from lgsens.dynamics import (
     RESULTS,
@@ -23,7 +23,7 @@ from lgsens.dynamics import (
     equilibrium as _equilibrium,
     initial_state as _initial,
 )
-from lgsens.integrate import AdaptiveSteps, GeneralizedAlpha, Stats, singular_steps
+from lgsens.integrate import GeneralizedAlpha, Stats, singular_steps
 from lgsens.model import Model
 from lgsens.sensitivity import AbstractSensitivity, DirectDifferentiation, Parameters, saved_run, times
 
@@ -102,7 +102,7 @@ def _checked(system: AbstractSystem, initial: Initial, throw: bool) -> State:
     return throw_if_failed(initial.state, initial.result, details, system.constraint_names)
 
 
-Integrator = GeneralizedAlpha | Richardson | IndexReducedODE | AdaptiveSteps | GivenSteps
+Integrator = GeneralizedAlpha | Richardson | IndexReducedODE | UnevenIntegrator
 Save = Callable[[Instant], Any]
 
 
@@ -178,7 +178,7 @@ def simulate(
     """
     system = as_system(model)
     warn_of_single_precision(system)
-    if not isinstance(integrator, Richardson | IndexReducedODE | AdaptiveSteps | GivenSteps):
+    if not isinstance(integrator, Richardson | IndexReducedODE | UnevenIntegrator):
         check_integrator(integrator)
     if isinstance(integrator, IndexReducedODE) and sensitivity != DirectDifferentiation():
         raise ValueError(
@@ -190,7 +190,7 @@ def simulate(
             f"{sensitivity!r}; ContinuousAdjoint() needs a Criterion, see `differentiate`."
         )
     num_steps = as_count(num_steps, "num_steps", " (it is static)")
-    if isinstance(integrator, AdaptiveSteps | GivenSteps):
+    if isinstance(integrator, UnevenIntegrator):
         check_uneven(integrator, num_steps, sensitivity, save)
     if save is not None and not (callable(save) and isinstance(integrator, GeneralizedAlpha)):
         raise ValueError(
@@ -210,7 +210,7 @@ def check_integrator(integrator: GeneralizedAlpha) -> None:
     advice = ""
     if isinstance(integrator, Richardson):
         advice = " Extrapolate what it finds: `richardson(lambda n: differentiate(…, num_steps=n)[:2], num_steps)`."
-    elif isinstance(integrator, IndexReducedODE | AdaptiveSteps | GivenSteps):
+    elif isinstance(integrator, IndexReducedODE | UnevenIntegrator):
         advice = " `jax.grad` and `jax.jacfwd` of a criterion of `simulate` differentiate this one."
     raise ValueError(f"`integrator` must be a GeneralizedAlpha, got {integrator!r}.{advice}")
 
@@ -227,7 +227,7 @@ def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, sa
     initial = None if state0 is not None else _initial(system, t0)
     if isinstance(integrator, IndexReducedODE):
         return _run_ode(system, state0, initial, t0, (t1 - t0) / num_steps, num_steps, integrator)
-    if isinstance(integrator, AdaptiveSteps | GivenSteps):
+    if isinstance(integrator, UnevenIntegrator):
         return _run_uneven(integrator, system, state0, initial, t0, t1, num_steps, sensitivity)
 
     def started(scheme, num_steps):
@@ -289,7 +289,7 @@ def run(system: AbstractSystem, start: Begin, t0, t1, num_steps: int, integrator
     return Trajectory(t=t, states=states, result=result, stats=stats, system=system), details
 
 
-def _run_uneven(integrator: AdaptiveSteps | GivenSteps, system, state0, initial, t0, t1, num_steps: int, sensitivity):
+def _run_uneven(integrator: UnevenIntegrator, system, state0, initial, t0, t1, num_steps: int, sensitivity):
     """`run` with steps of different sizes."""
     found = run_uneven(integrator, system, state0, initial, t0, t1, num_steps, sensitivity)
     result, details = outcome(integrator.integrator, found.start, found.newton, t0, (t1 - t0) / num_steps)
