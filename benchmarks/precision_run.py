@@ -54,13 +54,20 @@ LGSENS = {
             *(explicit(diffrax.Dopri8(), n) for n in (24, 40)),
         ],
     },
+    # Bushings of 1e8 N/m: explicit steps are stable up to about 0.2 ms.
+    "stiff_quarter_car": {
+        "lgsens, generalized-α": [alpha(28, 1e-5), alpha(76, 1e-5)],
+        "lgsens, Richardson": [richardson(52, 1e-6), richardson(200, 1e-8), richardson(400, 1e-9)],
+        "lgsens, IndexReducedODE": [explicit(diffrax.Dopri8(), 5000)],
+    },
 }
-CASADI_STEPS = {"quarter_car": (44, 68, 104, 288)}
+CASADI_STEPS = {"quarter_car": (44, 68, 104, 288), "stiff_quarter_car": (5000, 6000, 8000)}
 SUNDIALS = {
     "quarter_car": {
         "Adams": (1e-2, 3e-3, 3e-4, 5e-5, 3e-6, 5e-8),
         "IDAS": (6e-5, 5e-8),
-    }
+    },
+    "stiff_quarter_car": {"IDAS": (6e-5, 5e-8)},
 }
 
 
@@ -126,6 +133,7 @@ DIFFRAX: dict[str, list[tuple]] = {
         *((diffrax.Tsit5, n, 0.0, 0.0) for n in (44,)),
         *((diffrax.Dopri8, n, 0.0, 0.0) for n in (24, 40)),
     ],
+    "stiff_quarter_car": [(diffrax.Tsit5, 8000, 0.0, 0.0), (diffrax.Dopri8, 5000, 0.0, 0.0)],
 }
 
 

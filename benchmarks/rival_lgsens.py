@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -29,8 +30,15 @@ def common_entries(scene: Scene, gradient: lg.Model):
 
 
 def reference(scene: Scene) -> tuple[float, list[float]]:
-    """Ψ and dΨ/dp of the motion itself: the index-reduced equations, by diffrax's Dopri8 at a tolerance of 1e-12."""
+    """Ψ and dΨ/dp of the motion itself: the index-reduced equations, by diffrax's Dopri8 at a tolerance of 1e-12 or in
+    the scene's equal steps."""
     body, quantity, axis = scene.observed
+    if scene.reference_steps is not None:
+        psi = lg.Criterion(integrand=lambda s, _: getattr(s.body(body), quantity)[axis] ** 2)
+        route = {"num_steps": scene.reference_steps, "integrator": lg.IndexReducedODE(diffrax.Dopri8())}
+        of_p = lambda p: psi(lg.simulate(scene.model(p), t1=scene.t1, **route))
+        value, gradient = jax.jit(jax.value_and_grad(of_p))(jnp.asarray(scene.start))
+        return float(value), gradient.tolist()
     found = lg.differentiate(
         lg.Criterion(integrand=lambda s, p: getattr(s.body(body), quantity)[axis] ** 2),
         scene.model,

@@ -67,6 +67,7 @@ class Scene(NamedTuple):
     subsets: tuple[tuple[str, tuple[int, ...]], ...] = ()  # entries of p for forward mode
     batch: int = 0  # designs in a batch, if batches are measured
     all_numbers: bool = True  # whether the gradient with respect to all numbers is measured
+    reference_steps: int | None = None  # equal steps of the reference, where error control would take too long
 
     def arrays(self) -> Numbers:
         """The numbers at the start, as NumPy arrays."""
@@ -229,6 +230,7 @@ def quarter_car(bushings: Sequence[str] = ()) -> Scene:
         observed=("chassis", "acceleration", 2),
         breaks=(0.25,),
         subsets=(("2 parameters", (0, 1)), ("30 hardpoint coordinates", tuple(range(2, 32)))),
+        reference_steps=10_000 if bushings else None,
     )
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from benchmark import SINGLE_THREAD, options
 
-SCENES = ("top", "quarter_car", *(f"chain_{n}" for n in (2, 8, 32, 128, 512)))
+SCENES = ("top", "quarter_car", "stiff_quarter_car", *(f"chain_{n}" for n in (2, 8, 32, 128, 512)))
 RIVALS = ("plain_jax", "exudyn", "casadi", "diffrax", "mujoco")
 
 

@@ -1,6 +1,6 @@
 """Work against precision: Ψ and its gradient on the quarter-car, by lgsens and by its rivals.
 
-    python benchmarks/work_precision.py [--scenes quarter_car] [--cache FOLDER] [--out benchmarks/results]
+    python benchmarks/work_precision.py [--scenes quarter_car …] [--cache FOLDER] [--out benchmarks/results]
     python benchmarks/work_precision.py --table     # table and plot again, from work_precision.json; measures nothing
     python benchmarks/work_precision.py --readme    # and the table into benchmarks/README.md
 
@@ -19,7 +19,7 @@ from pathlib import Path
 
 from benchmark import SINGLE_THREAD, options
 
-SCENES = ("quarter_car",)
+SCENES = ("quarter_car", "stiff_quarter_car")
 
 
 def main() -> None:

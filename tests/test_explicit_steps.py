@@ -16,9 +16,8 @@ from lgsens.examples import four_bar, spinning_top
 STEPS = 3
 
 
-@pytest.mark.parametrize(
-    "model", [spinning_top(0.7), pytest.param(four_bar(), marks=pytest.mark.slow)], ids=["top", "four_bar"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("model", [spinning_top(0.7), four_bar()], ids=["top", "four_bar"])
 def test_derivative_by_hand(model):
     """Every output of the steps, forwards and transposed, against JAX's derivative of the loop itself.
 
@@ -54,7 +53,10 @@ def test_derivative_by_hand(model):
     assert abs(products[0] - products[1]) < 1e6 * EPS * size
 
 
-@pytest.mark.parametrize(("solver", "counts", "order"), [(diffrax.Tsit5(), (8, 16), 5), (diffrax.Dopri8(), (4, 8), 8)])
+@pytest.mark.parametrize(
+    ("solver", "counts", "order"),
+    [pytest.param(diffrax.Tsit5(), (8, 16), 5, marks=pytest.mark.slow), (diffrax.Dopri8(), (4, 8), 8)],
+)
 def test_quadrature_of_the_stages(solver, counts, order):
     """∫ of the square of an acceleration, which Gregory's rule of order 4 would spoil, falls as the motion does.
 

@@ -87,6 +87,7 @@ def two_zeros(p, system, state, t):
     return jnp.zeros(2)
 
 
+@pytest.mark.slow
 def test_four_bar():
     """A closed loop: a criterion of the position and one of the acceleration, twelve parameters."""
     p = jnp.array([BAR["params"][name] for name in BAR_NAMES])

@@ -141,6 +141,7 @@ def test_gradients_equal_differences_of_the_closed_solution(mode):
         np.testing.assert_allclose(found, expected, rtol=0, atol=2e-10, err_msg=name)  # h⁴/30 f⁽⁵⁾, f⁽⁵⁾ to 1e3
 
 
+@pytest.mark.slow
 def test_second_derivatives_and_batches():
     """A Hessian through the rule, and the rule under vmap: differences of the gradient, one design at a time."""
     angles = jnp.asarray(ANGLES[:3])

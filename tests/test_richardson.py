@@ -87,6 +87,7 @@ def test_order_of_a_trajectory():
     assert abs(trapezoidal - TOP) > 10.0 * errors[1]
 
 
+@pytest.mark.slow
 def test_the_derivative_is_extrapolated_exactly():
     """What is linear in the extrapolated quantities: value and derivative are (4 ψ_{h/2} − ψ_h)/3, to round-off.
 

@@ -163,7 +163,9 @@ def height(push):
 PUSHES = np.array([0.0, 100.0, 0.0, -200.0])
 
 
-@pytest.mark.parametrize("kind", ["value", "value and gradient", "gradient only", "forward mode"])
+@pytest.mark.parametrize(
+    "kind", ["value", "value and gradient", "gradient only", pytest.param("forward mode", marks=pytest.mark.slow)]
+)
 def test_failed_designs_are_marked_and_the_others_kept(kind):
     fn = {
         "value": height,

@@ -139,9 +139,8 @@ def objective(body: str):
     return psi
 
 
-@pytest.mark.parametrize(
-    ("name", "body"), [("chain", "link8"), pytest.param("branched", "lower1", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "body"), [("chain", "link8"), ("branched", "lower1")])
 def test_gradient_of_every_number(name, body):
     """Both solvers factorize the same matrices: value and gradient agree to round-off of the accelerations."""
     dense, sparse = systems(name)
@@ -228,6 +227,7 @@ def test_the_solver_is_chosen_by_size_and_can_be_given():
         lg.Model(chain.bodies, chain.joints, linear_solver="sparse")
 
 
+@pytest.mark.slow
 def test_single_precision_after_double():
     """What is kept of a topology serves both: the factors of each solve to their own round-off."""
     for enabled in (True, False):

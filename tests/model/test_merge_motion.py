@@ -221,6 +221,7 @@ def test_transformations_and_saved_runs():
     np.testing.assert_allclose([values[0], slopes[0]], [found.value, found.gradient], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_states_are_those_of_the_merged_body():
     """A simulation continues from its last state, and other names are refused as ever."""
     merged, _ = top(count=2)

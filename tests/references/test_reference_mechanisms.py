@@ -9,18 +9,13 @@ from reference_runs import check_criteria, check_invariants, check_states, docum
 from lgsens.examples import PROBLEMS, four_bar, slider_crank
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "simple_pendulum_A01",
-        pytest.param("slider_crank_sundials", marks=pytest.mark.slow),
-        pytest.param("four_bar_spring", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["simple_pendulum_A01", "slider_crank_sundials", "four_bar_spring"])
 def test_criteria_and_gradients(name):
     check_criteria(name)
 
 
+@pytest.mark.slow
 def test_motion_of_the_pendulum():
     """Elliptic functions; the multiplier is the tension of the rod, m (l θ̇² + g cos θ)."""
     p = PROBLEMS["simple_pendulum_A01"].parameters
@@ -98,6 +93,7 @@ def test_the_slider_crank_moves_in_its_plane():
     assert float(jnp.linalg.svd(jacobians, compute_uv=False)[:, -1].min()) > 0.1
 
 
+@pytest.mark.slow
 def test_published_output_of_idas():
     """G, dG/dk and dG/dc as IDAS prints them, at its tolerance of 1e-6 on states, sensitivities and quadratures."""
     published = document("slider_crank_sundials.json")["published"]

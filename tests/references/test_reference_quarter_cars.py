@@ -35,6 +35,7 @@ def observe_linear_car(trajectory):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LINEAR)
 def test_motion_of_the_linear_quarter_car(name):
     """The matrix exponential, at those of its times that this run reaches on its grid."""

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from differences import central
 from jaxtyping import Array, Float
 
@@ -77,6 +78,7 @@ def value(p, sensitivity):
     return lg.time_integral(trajectory.t, integrand)
 
 
+@pytest.mark.slow
 def test_sensitivities():
     p = jnp.array(P)
     compiled = jax.jit(lambda p: value(p, lg.DirectDifferentiation()))

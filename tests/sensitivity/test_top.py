@@ -70,6 +70,7 @@ def test_error_and_order(slopes):
     np.testing.assert_allclose(rate, 2.0, atol=0.03)  # the h⁴ term is 1e-3 of the h² term here
 
 
+@pytest.mark.slow
 def test_error_with_the_simple_start():
     """With a₀ = v̇₀ the errors are those of the paper's scheme, 9.9e-5 and 6.2e-6."""
     integrator = lg.GeneralizedAlpha(0.9, second_order_start=False)
@@ -80,6 +81,7 @@ def test_error_with_the_simple_start():
 PARAMETERS = {"mass": 15.0, "length": 1.0, "spin": 10.0, "gravity": 9.81}
 
 
+@pytest.mark.slow
 def test_scalar_parameters():
     """m, l, ω₀ and g in both modes against differences of the discrete scheme."""
     values = {name: jnp.asarray(value) for name, value in PARAMETERS.items()}
