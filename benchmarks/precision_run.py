@@ -26,11 +26,17 @@ KIND = "gradient, p"
 
 
 class Point(NamedTuple):
-    """An lgsens route: a title for its settings, the integrator, the number of steps."""
+    """An lgsens route: a title for its settings, the integrator, the number of steps, settings of the model."""
 
     title: str
     integrator: Any
     num_steps: int
+    model: tuple[tuple[str, str], ...] = ()
+
+
+def heaving(*points: Point) -> list[Point]:
+    """With a chassis that has one coordinate instead of six and a slider: the same mechanism."""
+    return [point._replace(title=f"{point.title}, `chassis=heave`", model=(("chassis", "heave"),)) for point in points]
 
 
 def alpha(num_steps: int, tolerance: float, rho: float = 0.9) -> Point:
@@ -48,15 +54,16 @@ def explicit(scheme, num_steps: int) -> Point:
 
 LGSENS = {
     "quarter_car": {
-        "lgsens, generalized-α": [alpha(28, 1e-5), alpha(76, 1e-5)],
+        "lgsens, generalized-α": [alpha(n, 1e-5) for n in (32, 76)],
+        "lgsens, generalized-α, heave": heaving(*(alpha(n, 1e-5) for n in (32, 76))),
         "lgsens, Richardson": [richardson(52, 1e-6)],
-        "lgsens, IndexReducedODE": [
-            *(explicit(diffrax.Dopri8(), n) for n in (24, 40)),
-        ],
+        "lgsens, Richardson, heave": heaving(richardson(52, 1e-6)),
+        "lgsens, IndexReducedODE": [explicit(diffrax.Dopri8(), n) for n in (24, 40)],
+        "lgsens, IndexReducedODE, heave": heaving(*(explicit(diffrax.Dopri8(), n) for n in (24, 40))),
     },
     # Bushings of 1e8 N/m: explicit steps are stable up to about 0.2 ms.
     "stiff_quarter_car": {
-        "lgsens, generalized-α": [alpha(28, 1e-5), alpha(76, 1e-5)],
+        "lgsens, generalized-α": [alpha(n, 1e-5) for n in (32, 76)],
         "lgsens, Richardson": [richardson(52, 1e-6), richardson(200, 1e-8), richardson(400, 1e-9)],
         "lgsens, IndexReducedODE": [explicit(diffrax.Dopri8(), 5000)],
     },
@@ -77,7 +84,8 @@ def lgsens_program(family: str, scene: Scene, point: Point) -> Program:
     rate = lambda s: getattr(s.body(body), quantity)[..., axis] ** 2
 
     def psi(p, num_steps=point.num_steps, integrator=point.integrator):
-        trajectory = lg.simulate(scene.model(p), t1=scene.t1, num_steps=num_steps, integrator=integrator, throw=False)
+        model = scene.model(p, **dict(point.model))
+        trajectory = lg.simulate(model, t1=scene.t1, num_steps=num_steps, integrator=integrator, throw=False)
         if trajectory.stages is not None:
             return lg.Criterion(integrand=lambda s, _: rate(s))(trajectory)
         return lg.time_integral(trajectory.t, rate(trajectory), order=trajectory.order)

@@ -58,7 +58,7 @@ class Scene(NamedTuple):
     num_steps: int
     start: np.ndarray  # p
     names: tuple[str, ...]  # of p
-    model: Callable[[Any], lg.Model]
+    model: Callable[..., lg.Model]  # of p, and of the settings of `QuarterCar.model`
     numbers: Callable[[Any], Numbers]
     topology: Topology
     bodies: tuple[str, ...]
@@ -157,10 +157,11 @@ def quarter_car(bushings: Sequence[str] = ()) -> Scene:
     x, y, z = np.eye(3)
     parts = [getattr(car, name) for name in bodies[:3]]
 
-    def model(p):
+    def model(p, **settings):
         ends = lambda c: [getattr(c.links[n], end) for end in ("chassis", "knuckle") for n in links]
         where = lambda c: [c.spring.rate, c.damper.rate, *ends(c)]
-        return eqx.tree_at(where, car, [p[0], p[1], *p[2:].reshape(10, 3)]).model(wheel="locked", bushings=bushings)
+        moved = eqx.tree_at(where, car, [p[0], p[1], *p[2:].reshape(10, 3)])
+        return moved.model(wheel="locked", bushings=bushings, **settings)
 
     def numbers(p):
         inner, outer = p[2:17].reshape(5, 3), p[17:].reshape(5, 3)
