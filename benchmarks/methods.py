@@ -75,7 +75,7 @@ class Scene:
             lambda p: lg.simulate(problem.build(p), t1=problem.t1, num_steps=problem.num_steps, throw=False).states
         )
         p = jax.tree.map(np.float64, problem.parameters)
-        return median_seconds(lambda: forward(p))
+        return median_seconds(lambda: forward(p))[0]
 
 
 def compare(name: str, progress) -> dict:
@@ -126,7 +126,7 @@ def compare(name: str, progress) -> dict:
 
 def cost(scene: Scene, method, num_steps: int, integrator, unit: float) -> float:
     """Of value and gradient of all criteria, in simulations."""
-    return median_seconds(lambda: scene.run(method, num_steps, integrator).gradient) / unit
+    return median_seconds(lambda: scene.run(method, num_steps, integrator).gradient)[0] / unit
 
 
 def report(name: str, record: dict) -> None:

@@ -3,14 +3,13 @@
 import statistics
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
-from lgsens._advice import Costs
+from lgsens._advice import TYPICAL, Costs
 from lgsens._differentiate import differentiate
 from lgsens._simulate import simulate
 from lgsens._validate import as_count
@@ -18,15 +17,16 @@ from lgsens.criteria import Criterion
 from lgsens.sensitivity import AdjointVariable, DirectDifferentiation
 
 
-def median_seconds(function: Callable[[], Any], repeats: int = 5) -> float:
-    """The wall time of a call, the median of several after one that compiles."""
-    jax.block_until_ready(function())
-    taken = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        jax.block_until_ready(function())
-        taken.append(time.perf_counter() - started)
-    return statistics.median(taken)
+def median_seconds(*functions: Callable[[], Any], repeats: int = 5) -> list[float]:
+    """The wall time of each call, the median of several rounds in which they take turns, after one that compiles."""
+    taken: list[list[float]] = [[] for _ in functions]
+    for turn in range(1 + repeats):
+        for function, times in zip(functions, taken):
+            started = time.perf_counter()
+            jax.block_until_ready(function())
+            if turn:
+                times.append(time.perf_counter() - started)
+    return [statistics.median(times) for times in taken]
 
 
 def measure_costs(
@@ -40,16 +40,16 @@ def measure_costs(
         settings: t0, t1, num_steps, integrator, as in `differentiate`.
 
     Each method runs with all parameters and criteria and with one; the difference is the cost of each further one.
-    Times are divided by that of `simulate` with the same settings, compiled. Raises as `differentiate`.
+    Where the noise of the machine is larger than that difference, or there is but one, the share of `TYPICAL` counts: a
+    further parameter or criterion that seems to cost nothing would decide every choice. Times are divided by that of
+    `simulate` with the same settings, compiled. Raises as `differentiate`.
     """
     repeats = as_count(repeats, "repeats")
     leaves = jax.tree.leaves(criteria, is_leaf=lambda leaf: isinstance(leaf, Criterion))
     flat, unravel = ravel_pytree(p)
 
-    seconds = partial(median_seconds, repeats=repeats)
-
-    def gradient(method, criteria, build, p) -> float:
-        return seconds(lambda: differentiate(criteria, build, p, method=method, **settings).gradient)
+    def gradient(method, criteria, build, p):
+        return lambda: differentiate(criteria, build, p, method=method, **settings).gradient
 
     def with_first(first):
         return unravel(flat.at[0].set(first))
@@ -61,17 +61,25 @@ def measure_costs(
     build_one = lambda first: build(with_first(first))
 
     forward = jax.jit(lambda p: simulate(build(p), throw=False, **settings).states)
-    unit = seconds(lambda: forward(p))
     direct, adjoint = DirectDifferentiation(), AdjointVariable()
-    direct_all = gradient(direct, criteria, build, p) / unit
-    direct_one = gradient(direct, one, build_one, flat[0]) / unit if flat.size > 1 else direct_all
-    adjoint_all = gradient(adjoint, criteria, build, p) / unit
-    adjoint_one = gradient(adjoint, leaves[0], build, p) / unit if len(leaves) > 1 else adjoint_all
-    per_parameter = max(direct_all - direct_one, 0.0) / max(flat.size - 1, 1)
-    per_criterion = max(adjoint_all - adjoint_one, 0.0) / max(len(leaves) - 1, 1)
+    unit, *times = median_seconds(
+        lambda: forward(p),
+        gradient(direct, criteria, build, p),
+        gradient(direct, one, build_one, flat[0]),
+        gradient(adjoint, criteria, build, p),
+        gradient(adjoint, leaves[0], build, p),
+        repeats=repeats,
+    )
+    direct_all, direct_one, adjoint_all, adjoint_one = (seconds / unit for seconds in times)
+    per_parameter = _share(direct_all - direct_one, flat.size - 1, TYPICAL.direct_per_parameter)
+    per_criterion = _share(adjoint_all - adjoint_one, len(leaves) - 1, TYPICAL.adjoint_per_criterion)
     return Costs(
         direct_fixed=direct_all - per_parameter * flat.size,
         direct_per_parameter=per_parameter,
         adjoint_fixed=adjoint_all - per_criterion * len(leaves),
         adjoint_per_criterion=per_criterion,
     )
+
+
+def _share(difference: float, others: int, typical: float) -> float:
+    return difference / others if others > 0 and difference > 0.0 else typical
