@@ -120,7 +120,8 @@ class UnevenSteps(eqx.Module):
         if shared is not None and chord is not None:
             made = chord.due
             shared = _Shared(chord.solver, jnp.where(made, h, shared.h), jnp.where(made, 0, shared.age) + 1)
-        return Attempt(state, guess.contraction, stats, shared)
+        # margins of steps of different sizes cannot be compared as `singular_steps` does
+        return Attempt(state, guess.contraction, stats._replace(margin=jnp.full_like(h, jnp.nan)), shared)
 
     def _predicted(self, progress: Progress, h):
         """u and λ from the parabolas through the last three v̇ and λ; u by eq. (29), whatever sizes they had."""
