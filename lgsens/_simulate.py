@@ -87,7 +87,7 @@ def equilibrium(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) ->
 
 @eqx.filter_jit
 def _initial_jit(system, t0) -> Initial:
-    return _initial(system, t0)
+    return _initial(system, t0)._replace(factors=None)
 
 
 @eqx.filter_jit

@@ -63,7 +63,7 @@ def _started(integrator: GeneralizedAlpha, system: AbstractSystem, initial: Init
     if integrator.stabilized:
         return dataclasses.replace(state, a=a)
     missed = missed_increment(integrator, system, state.v, state.vdot, initial.jerk)
-    _, normal = split_velocity(system, state.q, missed)
+    _, normal = split_velocity(system, state.q, missed, initial.factors)
     return State(
         q=given_way(system, state.q, state.lam, integrator.beta * h**2),
         v=state.v + h**2 * normal,

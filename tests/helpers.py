@@ -1,11 +1,13 @@
 """What several test modules need: random bodies and poses, differences, a scene with everything."""
 
 import re
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import jaxprs_in_params
 from scipy.spatial.transform import Rotation
 
 import lgsens as lg
@@ -168,6 +170,14 @@ def random_point(system, rng, t=0.17) -> Point:
         jnp.asarray(rng.normal(size=m)),
         jnp.asarray(t),
     )
+
+
+def equations(jaxpr) -> Iterator[Any]:
+    """The equations of a program, in all its parts."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for inner in jaxprs_in_params(equation.params):
+            yield from equations(inner)
 
 
 def says(*parts):

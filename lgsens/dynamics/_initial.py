@@ -13,7 +13,7 @@ from lgsens.dynamics._redundant import softness
 from lgsens.dynamics._results import RESULTS
 from lgsens.dynamics._state import State
 from lgsens.dynamics._system import AbstractSystem
-from lgsens.linear import Inverse, Matrix, SparseMatrix, diagonal
+from lgsens.linear import Factors, Inverse, Matrix, SparseMatrix, diagonal
 
 _MAX_ITERATIONS = 30
 
@@ -25,14 +25,17 @@ class Initial(NamedTuple):
     jerk: Float[Array, " k"]  # v̈ at the initial time
     result: Int[Array, ""]  # a value of RESULTS
     violation: Float[Array, " m"]  # Φ after assembly
+    factors: Factors | None = None  # of `ConstrainedMass` there
 
 
-def split_velocity(system: AbstractSystem, q, v) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+def split_velocity(
+    system: AbstractSystem, q, v, factors: Factors | None = None
+) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
     """v as the sum of what the constraints allow and what they do not, M-orthogonal to each other.
 
     [[M, Bᵀ], [B, 0]] [v_tangential; μ] = [M v; 0]
     """
-    kkt = ConstrainedMass.of(system, q)
+    kkt = ConstrainedMass.of(system, q, factors)
     tangential, _ = kkt.solve(kkt.mass @ v, jnp.zeros(kkt.jacobian.shape[0], v.dtype))
     return tangential, v - tangential
 
@@ -46,12 +49,12 @@ def given_way(system: AbstractSystem, q, lam, share):
     return system.group.retract(q, x)
 
 
-def accelerations(system: AbstractSystem, q, v, t):
+def accelerations(system: AbstractSystem, q, v, t, factors: Factors | None = None):
     """v̇ and λ of the motion through (q, v) at time t, eq. (41).
 
     M v̇ + Bᵀλ = ad(v)ᵀ M v − f(q, v, t),     B v̇ = −Ḃ v = −D(B v)·(q ṽ)|_v
     """
-    kkt = ConstrainedMass.of(system, q)
+    kkt = ConstrainedMass.of(system, q, factors)
     zero, lam_zero = jnp.zeros_like(v), jnp.zeros(kkt.jacobian.shape[0], v.dtype)
     # The derivative along q ṽ is taken in the arrays of q: differentiating retract(q, s v) at s = 0 gives the same
     # numbers, and compiles the derivatives of exp, which took half of the compile time.
@@ -60,10 +63,10 @@ def accelerations(system: AbstractSystem, q, v, t):
     return kkt.solve(force, -rate)
 
 
-def acceleration_and_jerk(system: AbstractSystem, q, v, t):
+def acceleration_and_jerk(system: AbstractSystem, q, v, t, factors: Factors | None = None):
     """v̇, λ and v̈ of the motion through (q, v): v̈ is the derivative of `accelerations` along q ṽ, v̇ and 1."""
 
-    (vdot, lam), derivative = jax.linearize(partial(accelerations, system), q, v, t)
+    (vdot, lam), derivative = jax.linearize(partial(accelerations, system, factors=factors), q, v, t)
     return vdot, lam, derivative(system.group.to_ambient(q, v), vdot, jnp.ones_like(t))[0]
 
 
@@ -159,8 +162,9 @@ def initial_state(system: AbstractSystem, t) -> Initial:
     """
     q, violation = assemble(system)
     _, v_ref = system.reference()
-    v, _ = split_velocity(system, q, v_ref)
-    vdot, lam, vddot = acceleration_and_jerk(system, q, v, t)
+    factors = ConstrainedMass.of(system, q).factors
+    v, _ = split_velocity(system, q, v_ref, factors)
+    vdot, lam, vddot = acceleration_and_jerk(system, q, v, t, factors)
     state = State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
     dtype = v.dtype
     redundant = softness(system) is None and is_redundant(system, constraint_jacobian(system, q))
@@ -172,4 +176,4 @@ def initial_state(system: AbstractSystem, t) -> Initial:
         jnp.where(redundant, RESULTS.redundant_constraints, RESULTS.successful),
         RESULTS.assembly_failed,
     ).astype(jnp.int32)
-    return Initial(state, vddot, result, violation)
+    return Initial(state, vddot, result, violation, factors)

@@ -107,11 +107,12 @@ class ConstrainedMass(eqx.Module):
     soft: bool = eqx.field(static=True)  # whether they are those of K_c (`_redundant`)
 
     @classmethod
-    def of(cls, system: AbstractSystem, q) -> "ConstrainedMass":
+    def of(cls, system: AbstractSystem, q, factors: Factors | None = None) -> "ConstrainedMass":
+        """`factors`: those at q, if they are known: to compile them is most of what this costs."""
         mass, jacobian = mass_matrix(system), constraint_jacobian(system, q)
         soft = softness(system)
-        if _sparse(system) is None and soft is None:
-            return cls(mass, jacobian, None, False)
+        if factors is not None or (_sparse(system) is None and soft is None):
+            return cls(mass, jacobian, factors, soft is not None)
         fixed, border = lax.stop_gradient((mass, jacobian))
         factors = factorized(system, fixed, border.T, border, mass_scale(mass), softness=soft)
         return cls(mass, jacobian, factors, soft is not None)

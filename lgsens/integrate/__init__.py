@@ -7,13 +7,16 @@ from lgsens.integrate._adaptive import (
     integrate_controlled as integrate_controlled,
 )
 from lgsens.integrate._integrate import (
-    Constants as Constants,
-    Guess as Guess,
     Mark as Mark,
-    Stats as Stats,
     integrate as integrate,
     integrate_onward as integrate_onward,
     integrate_outputs as integrate_outputs,
+)
+from lgsens.integrate._newton import (
+    Chord as Chord,
+    Constants as Constants,
+    Guess as Guess,
+    Stats as Stats,
     take_step as take_step,
 )
 from lgsens.integrate._scheme import (

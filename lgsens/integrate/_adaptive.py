@@ -32,7 +32,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.dynamics import AbstractSystem, State
-from lgsens.integrate._integrate import Stats
+from lgsens.integrate._lanes import in_any_lane
+from lgsens.integrate._newton import Stats
 from lgsens.integrate._scheme import GeneralizedAlpha, missed_increment
 from lgsens.integrate._uneven import Attempt, Progress, UnevenSteps, chosen, moved
 
@@ -136,6 +137,12 @@ class _Trial(NamedTuple):
     rejected: Int[Array, ""]
     trying: Bool[Array, ""]
 
+    def chosen(self, which, other: "_Trial") -> "_Trial":
+        """`self` where `which`, else `other`; but the matrix of `self` in any case."""
+        less = lambda trial: trial._replace(found=trial.found._replace(shared=None))
+        small = chosen(which, less(self), less(other))
+        return small._replace(found=small.found._replace(shared=self.found.shared))
+
 
 def integrate_controlled(
     settings: AdaptiveSteps, num_steps: int, system: AbstractSystem, first: FirstState, t0, h
@@ -160,14 +167,17 @@ def integrate_controlled(
         active = progress.running & (elapsed < total)
         remaining = jnp.where(active, total - elapsed, h)
         wanted = fitted(proposed, remaining)
-        ready = steps.renewed(progress, wanted, active)
 
-        def begins(h) -> Progress:
+        def begins(trial: _Trial) -> Progress:
             """A first step begins with the state that belongs to its size."""
-            return ready._replace(state=chosen(n == 0, first.at(h), ready.state), h=jnp.where(n == 0, h, ready.h))
+            return progress._replace(
+                state=chosen(n == 0, first.at(trial.h), progress.state),
+                h=jnp.where(n == 0, trial.h, progress.h),
+                shared=trial.found.shared,
+            )
 
         def attempt(trial: _Trial) -> _Trial:
-            progress = begins(trial.h)
+            progress = begins(trial)
             start = moved(progress.state, trial.h / progress.h)
             found = steps.tried(progress, trial.h, trial.trying)
             error = relative(start.v, start.vdot, (found.state.a - start.a) / trial.h, trial.h)
@@ -181,23 +191,24 @@ def integrate_controlled(
                 state=jax.tree.map(lambda leaf: jnp.where(given_up, jnp.nan, leaf), found.state),
                 stats=found.stats._replace(converged=found.stats.converged & ~given_up),
             )
-            return _Trial(jnp.where(again, trial.h * shorter, trial.h), found, error, iterations, rejected, again)
+            new = _Trial(jnp.where(again, trial.h * shorter, trial.h), found, error, iterations, rejected, again)
+            return new.chosen(trial.trying, trial)
 
         none = jnp.zeros((), jnp.int32)
-        nothing = Attempt(ready.state, ready.contraction, Stats(none, h * 0.0, h * 0.0, progress.running, jnp.nan * h))
+        stats = Stats(none, h * 0.0, h * 0.0, progress.running, jnp.nan * h)
+        nothing = Attempt(progress.state, progress.contraction, stats, progress.shared)
         trial = lax.while_loop(
-            lambda trial: trial.trying, attempt, _Trial(wanted, nothing, h * 0.0, none, none, active)
+            lambda trial: in_any_lane(trial.trying), attempt, _Trial(wanted, nothing, h * 0.0, none, none, active)
         )
-        begun = begins(trial.h)
-        done = steps.after(begun, trial.found, trial.h)
-        progress = chosen(active, done._replace(inverse=None), ready._replace(inverse=None))
+        begun = begins(trial)
+        progress = steps.after(begun, trial.found, trial.h).chosen(active, progress)
         error = jnp.maximum(trial.error, _LEAST)
         rho = (_AIM / error * _AIM / before) ** (1.0 / 12.0) * (begun.h / trial.h) ** 0.25
         grown = trial.h * (1.0 + _LIMIT * jnp.arctan((rho - 1.0) / _LIMIT))
         elapsed = jnp.where(active, jnp.where(trial.h >= remaining, total, elapsed + trial.h), elapsed)
         h_taken = jnp.where(active | ~progress.running, trial.h, 0.0)
         stats = trial.found.stats._replace(iterations=trial.iterations)
-        carry = (progress._replace(inverse=ready.inverse), grown, error, elapsed)
+        carry = (progress, grown, error, elapsed)
         return carry, (h_taken, progress.state, stats, trial.error * tolerance, trial.rejected)
 
     jerk = first.a_1 / (scheme.alpha_m - scheme.alpha_f)

@@ -22,17 +22,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.dynamics import AbstractSystem, State
-from lgsens.integrate._integrate import (
-    SLOW,
-    Constants,
-    Guess,
-    Solver,
-    Stats,
-    inverse_at,
-    no_inverse,
-    renewed_where,
-    take_step,
-)
+from lgsens.integrate._newton import SLOW, Chord, Constants, Guess, Solver, Stats, no_solver, take_step
 from lgsens.integrate._scheme import GeneralizedAlpha
 
 _SAME = 2.0  # the change of h up to which modified Newton keeps its matrix
@@ -46,6 +36,14 @@ class _Past(NamedTuple):
     lam: Float[Array, "2 m"]
 
 
+class _Shared(NamedTuple):
+    """The matrix that modified Newton keeps."""
+
+    solver: Solver
+    h: Float[Array, ""]  # of the step that it was made for
+    age: Int[Array, ""]  # attempts with it
+
+
 class Progress(NamedTuple):
     """The last state, and what the next step needs of those before."""
 
@@ -54,10 +52,12 @@ class Progress(NamedTuple):
     h: Float[Array, ""]  # of the step that the state's a belongs to
     past: _Past
     contraction: Float[Array, ""]
-    inverse: Solver | None
-    inverse_h: Float[Array, ""]
-    age: Int[Array, ""]  # steps with this inverse
+    shared: _Shared | None
     running: Bool[Array, ""]
+
+    def chosen(self, which, other: "Progress") -> "Progress":
+        """`self` where `which`, else `other`; but the matrix of `self`, which is large, in any case."""
+        return chosen(which, self._replace(shared=None), other._replace(shared=None))._replace(shared=self.shared)
 
 
 class Attempt(NamedTuple):
@@ -66,6 +66,7 @@ class Attempt(NamedTuple):
     state: State
     contraction: Float[Array, ""]
     stats: Stats
+    shared: _Shared | None
 
 
 def moved(state: State, ratio) -> State:
@@ -84,9 +85,6 @@ class UnevenSteps(eqx.Module):
     def of(cls, scheme: GeneralizedAlpha, system: AbstractSystem) -> "UnevenSteps":
         return cls(scheme, system, Constants.of(system))
 
-    def _inverse(self, state: State, t, h) -> Solver:
-        return inverse_at(self.scheme, self.system, self.constants, state, t, h)[0]
-
     def first(self, state0: State, t0, h) -> Progress:
         """Before the first step, to whose size h the a of `state0` belongs."""
         twice = lambda leaf: jnp.stack([leaf, leaf])
@@ -97,34 +95,33 @@ class UnevenSteps(eqx.Module):
             # times that differ: weights that add up to one give the same value at any
             past=_Past(t0 - h * jnp.asarray([1.0, 2.0], h.dtype), twice(state0.vdot), twice(state0.lam)),
             contraction=jnp.ones_like(h),
-            inverse=no_inverse(self._inverse, state0, t0, h) if self.scheme.factor_every else None,
-            inverse_h=h,
-            age=jnp.asarray(self.scheme.factor_every, jnp.int32),
+            shared=self._not_yet(state0, t0, h) if self.scheme.factor_every else None,
             running=jnp.all(jnp.isfinite(state0.a)),
         )
 
-    def renewed(self, progress: Progress, h, active) -> Progress:
-        """With an inverse that serves a step of size h, for modified Newton."""
-        earlier = progress.inverse
-        if earlier is None:
-            return progress
-        old = (progress.age >= self.scheme.factor_every) | ((progress.contraction >= SLOW) & (progress.age > 1))
-        other = (h > _SAME * progress.inverse_h) | (_SAME * h < progress.inverse_h)
-        due = active & (old | other)
-        start = lambda: self._inverse(moved(progress.state, h / progress.h), progress.t, h)
-        return progress._replace(
-            inverse=renewed_where(due, start, earlier),
-            inverse_h=jnp.where(due, h, progress.inverse_h),
-            age=jnp.where(due, 0, progress.age) + 1,
-        )
+    def _not_yet(self, state0: State, t0, h) -> _Shared:
+        zeros = no_solver(self.scheme, self.system, self.constants, state0, t0, h)
+        return _Shared(zeros, h, jnp.asarray(self.scheme.factor_every, jnp.int32))
+
+    def _due(self, progress: Progress, shared: _Shared, h):
+        """Whether a step of size h wants a new matrix."""
+        old = (shared.age >= self.scheme.factor_every) | ((progress.contraction >= SLOW) & (shared.age > 1))
+        return old | (h > _SAME * shared.h) | (_SAME * h < shared.h)
 
     def tried(self, progress: Progress, h, active) -> Attempt:
         """The state that a step of size h reaches; NaN unless `active` and converged."""
         start = moved(progress.state, h / progress.h)
         guess = Guess((start.a, start.a), (start.lam, start.lam), progress.contraction, self._predicted(progress, h))
-        t = progress.t + h
-        found = take_step(self.scheme, self.system, self.constants, start, guess, progress.inverse, active, t, h)
-        return Attempt(found[0], found[1].contraction, found[2])
+        shared, t = progress.shared, progress.t + h
+        chord = None if shared is None else Chord(shared.solver, self._due(progress, shared, h))
+        state, guess, stats, chord = take_step(
+            self.scheme, self.system, self.constants, start, guess, chord, active, t, h
+        )
+        if shared is not None and chord is not None:
+            made = chord.due
+            shared = _Shared(chord.solver, jnp.where(made, h, shared.h), jnp.where(made, 0, shared.age) + 1)
+        # margins of steps of different sizes cannot be compared as `singular_steps` does
+        return Attempt(state, guess.contraction, stats._replace(margin=jnp.full_like(h, jnp.nan)), shared)
 
     def _predicted(self, progress: Progress, h):
         """u and λ from the parabolas through the last three v̇ and λ; u by eq. (29), whatever sizes they had."""
@@ -155,6 +152,7 @@ class UnevenSteps(eqx.Module):
             h=h,
             past=_Past(earlier(progress.t, past.t), earlier(state.vdot, past.vdot), earlier(state.lam, past.lam)),
             contraction=found.contraction,
+            shared=found.shared,
             running=found.stats.converged,
         )
 
@@ -176,17 +174,15 @@ def integrate_uneven(scheme: GeneralizedAlpha, system: AbstractSystem, state0: S
     def step(progress: Progress, h):
         active = progress.running & (h != 0.0)
         safe = jnp.where(active, h, progress.h)
-        ready = steps.renewed(progress, safe, active)
-        found = steps.tried(ready, safe, active)
-        done = steps.after(ready, found, safe)
+        found = steps.tried(progress, safe, active)
+        done = steps.after(progress, found, safe)
         failed = ~progress.running
         stats = found.stats._replace(
             increment=jnp.where(active | failed, found.stats.increment, 0.0),
             residual=jnp.where(active | failed, found.stats.residual, 0.0),
             converged=jnp.where(active, found.stats.converged, progress.running),
         )
-        kept = ready._replace(inverse=None)
-        progress = chosen(active, done._replace(inverse=None), kept)._replace(inverse=ready.inverse)
+        progress = done.chosen(active, progress)
         return progress, (progress.state, stats)
 
     _, (later, stats) = lax.scan(step, steps.first(state0, t0, h[0]), h)

@@ -18,7 +18,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import State
-from lgsens.integrate import Constants, GeneralizedAlpha, Guess, Stats, margin_of, take_step
+from lgsens.integrate import Chord, Constants, GeneralizedAlpha, Guess, Stats, margin_of, take_step
+from lgsens.linear import LU
 from lgsens.sensitivity._criterion_terms import Functional
 from lgsens.sensitivity._direct import direct_step
 from lgsens.sensitivity._linearization import (
@@ -74,8 +75,8 @@ def direct_on_the_fly(
     def step(carry, n):
         previous, guess, factors, running, delta, total = carry
         t = parameters.t0 + (n + 1) * h
-        earlier = factors if scheme.factor_every else None
-        state, guess, stats = take_step(scheme, system, constants, previous, guess, earlier, running, t, h)
+        chord = Chord(factors, n == 0) if scheme.factor_every else None
+        state, guess, stats, _ = take_step(scheme, system, constants, previous, guess, chord, running, t, h, LU)
         converged, prepared = linearized_at(previous, state, t)
         margin = margin_of(prepared.factors, prepared.tangents.constraint_jacobian, constants.scale)
         stats = stats._replace(margin=margin)
@@ -93,9 +94,10 @@ def direct_on_the_fly(
 
     delta0 = jax.vmap(lambda tangent: to_algebra(group, state0, tangent))(d_state0)
     first = with_derivative(functional.rate, state0, parameters.t0, delta0)
-    _, prepared = linearized_at(state0, state0, parameters.t0)
     half = jax.tree.map(lambda f: h / 2 * f, first)
-    start = (state0, Guess.first(state0), prepared.factors, jnp.ones((), bool), delta0, half)
+    shapes = jax.eval_shape(lambda: linearized_at(state0, state0, parameters.t0)[1].factors)
+    factors = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)  # of no step yet
+    start = (state0, Guess.first(state0), factors, jnp.ones((), bool), delta0, half)
     (state, *_, delta, integral), stats = lax.scan(step, start, jnp.arange(num_steps, dtype=p.dtype))
     final = with_derivative(functional.final, state, parameters.t0 + num_steps * h, delta)
     value, derivative = jax.tree.map(jnp.add, integral, final)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import equations
 
 import lgsens as lg
 from lgsens.dynamics import State
@@ -125,3 +126,22 @@ def test_modified_newton_is_full_newton(scene, factor_every):
     for a, b in zip(jax.tree.leaves(modified.states), jax.tree.leaves(full.states)):
         # round-off as in the continuation above, relative to accelerations of 7 m/s²
         np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-7 * float(jnp.abs(b).max()))
+
+
+@pytest.mark.parametrize("factor_every", [0, 20])
+def test_what_makes_a_matrix_is_compiled_once(factor_every):
+    """One factorization in the program, of modified and full Newton together. Of the loops that carry its inverse, only
+    that which makes it selects between the lanes of a batch."""
+    system, zero = heavy_top().system(), jnp.zeros(6)
+    state = State(q=system.reference()[0], v=zero, vdot=zero, lam=zero[:3], a=zero)
+    scheme = lg.GeneralizedAlpha(0.9, factor_every=factor_every)
+    steps = lambda state: integrate(scheme, 3, system, state, jnp.zeros(()), jnp.asarray(1e-3))
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf])[None], state)
+    program = list(equations(jax.make_jaxpr(jax.vmap(jax.vmap(steps)))(batch).jaxpr))
+    assert [each.invars[0].aval.shape for each in program if each.primitive.name == "lu"] == [(1, 2, 9, 9)]
+    carrying = [
+        each.params["cond_jaxpr"].out_avals[0].shape
+        for each in program
+        if each.primitive.name == "while" and (1, 2, 9, 9) in [leaf.aval.shape for leaf in each.outvars]
+    ]
+    assert carrying == ([(), (1, 2)] if factor_every else [])

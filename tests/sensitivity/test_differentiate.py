@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import says
+from helpers import equations, says
 
 import lgsens as lg
 from lgsens.examples import spinning_top
@@ -143,16 +143,9 @@ def test_one_factorization_for_all_parameters_and_criteria(method, monkeypatch):
 
 
 def _lu_shapes(jaxpr):
-    """The shapes of the matrices that the program factorizes, in all its parts."""
-    for equation in jaxpr.eqns:
-        if equation.primitive.name == "lu" and equation.invars[0].aval.shape[-1] == 9:  # 6 coordinates + 3 constraints
-            yield equation.invars[0].aval.shape
-        for value in jax.tree.leaves(
-            equation.params, is_leaf=lambda leaf: hasattr(leaf, "eqns") or hasattr(leaf, "jaxpr")
-        ):
-            inner = getattr(value, "jaxpr", value)
-            if hasattr(inner, "eqns"):
-                yield from _lu_shapes(inner)
+    """The shapes of the matrices of 6 coordinates and 3 constraints that the program factorizes."""
+    shapes = (equation.invars[0].aval.shape for equation in equations(jaxpr) if equation.primitive.name == "lu")
+    return [shape for shape in shapes if shape[-1] == 9]
 
 
 def test_advice():

@@ -1,0 +1,32 @@
+"""Loops that the lanes of a batch share.
+
+JAX batches a `while_loop` whose predicate differs between lanes by a selection between old and new of all that the loop
+carries, in every turn: of the inverse of a matrix too, which costs as much as an iteration with it.
+"""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+Found = TypeVar("Found")
+
+
+@jax.custom_batching.custom_vmap
+def in_any_lane(flag):
+    """A flag that is the same in all lanes of a batch: whether it is raised in any. The predicate of a loop whose body
+    leaves lanes alone that are done."""
+    return flag
+
+
+@in_any_lane.def_vmap
+def _of_all_lanes(axis_size, in_batched, flag):
+    return in_any_lane(jnp.any(flag)), False  # a batch of batches comes here again
+
+
+def renewed_where(due, new: Callable[[], Found], earlier: Found) -> Found:
+    """`new()` where it is due. A loop of no or one turn, because `cond` would copy what is large."""
+    renewed = lambda carry: (jnp.zeros((), bool), new())
+    return lax.while_loop(lambda carry: carry[0], renewed, (due, earlier))[1]
