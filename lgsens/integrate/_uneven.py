@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from lgsens.dynamics import AbstractSystem, State
+from lgsens.dynamics import AbstractSystem, State, constraint_jacobian
 from lgsens.integrate._integrate import (
     SLOW,
     Constants,
@@ -34,6 +34,7 @@ from lgsens.integrate._integrate import (
     take_step,
 )
 from lgsens.integrate._scheme import GeneralizedAlpha
+from lgsens.integrate._singular import Watch, margin_by_mass
 
 _SAME = 2.0  # the change of h up to which modified Newton keeps its matrix
 
@@ -57,6 +58,9 @@ class Progress(NamedTuple):
     inverse: Solver | None
     inverse_h: Float[Array, ""]
     age: Int[Array, ""]  # steps with this inverse
+    watch: Watch  # margins by time
+    watched: Float[Array, ""]  # when
+    margin: Float[Array, ""]  # of this step, NaN where that was not looked at
     running: Bool[Array, ""]
 
 
@@ -84,8 +88,11 @@ class UnevenSteps(eqx.Module):
     def of(cls, scheme: GeneralizedAlpha, system: AbstractSystem) -> "UnevenSteps":
         return cls(scheme, system, Constants.of(system))
 
-    def _inverse(self, state: State, t, h) -> Solver:
-        return inverse_at(self.scheme, self.system, self.constants, state, t, h)[0]
+    def _inverse(self, state: State, t, h) -> tuple[Solver, Float[Array, ""]]:
+        """The inverse, and a margin (`_singular`) that can be compared with those of other step sizes."""
+        inverse, _ = inverse_at(self.scheme, self.system, self.constants, state, t, h)
+        jacobian = constraint_jacobian(self.system, state.q)
+        return inverse, margin_by_mass(self.system, self.constants.mass, jacobian, self.constants.scale)
 
     def first(self, state0: State, t0, h) -> Progress:
         """Before the first step, to whose size h the a of `state0` belongs."""
@@ -97,9 +104,12 @@ class UnevenSteps(eqx.Module):
             # times that differ: weights that add up to one give the same value at any
             past=_Past(t0 - h * jnp.asarray([1.0, 2.0], h.dtype), twice(state0.vdot), twice(state0.lam)),
             contraction=jnp.ones_like(h),
-            inverse=no_inverse(self._inverse, state0, t0, h) if self.scheme.factor_every else None,
+            inverse=no_inverse(self._inverse, state0, t0, h)[0] if self.scheme.factor_every else None,
             inverse_h=h,
             age=jnp.asarray(self.scheme.factor_every, jnp.int32),
+            watch=Watch.first(h.dtype),
+            watched=t0,
+            margin=jnp.full_like(h, jnp.nan),
             running=jnp.all(jnp.isfinite(state0.a)),
         )
 
@@ -110,10 +120,15 @@ class UnevenSteps(eqx.Module):
             return progress
         old = (progress.age >= self.scheme.factor_every) | ((progress.contraction >= SLOW) & (progress.age > 1))
         other = (h > _SAME * progress.inverse_h) | (_SAME * h < progress.inverse_h)
-        due = active & (old | other)
+        passed = jnp.maximum(progress.t - progress.watched, h)
+        due = active & (old | other | progress.watch.ends_within(passed + 2.0 * self.scheme.factor_every * h))
         start = lambda: self._inverse(moved(progress.state, h / progress.h), progress.t, h)
+        inverse, margin = renewed_where(due, start, (earlier, progress.margin))
         return progress._replace(
-            inverse=renewed_where(due, start, earlier),
+            inverse=inverse,
+            watch=chosen(due, progress.watch.after(margin, passed), progress.watch),
+            watched=jnp.where(due, progress.t, progress.watched),
+            margin=jnp.where(due, margin, jnp.nan),
             inverse_h=jnp.where(due, h, progress.inverse_h),
             age=jnp.where(due, 0, progress.age) + 1,
         )
@@ -124,7 +139,8 @@ class UnevenSteps(eqx.Module):
         guess = Guess((start.a, start.a), (start.lam, start.lam), progress.contraction, self._predicted(progress, h))
         t = progress.t + h
         found = take_step(self.scheme, self.system, self.constants, start, guess, progress.inverse, active, t, h)
-        return Attempt(found[0], found[1].contraction, found[2])
+        stats = found[2] if progress.inverse is None else found[2]._replace(margin=progress.margin)
+        return Attempt(found[0], found[1].contraction, stats)
 
     def _predicted(self, progress: Progress, h):
         """u and λ from the parabolas through the last three v̇ and λ; u by eq. (29), whatever sizes they had."""
