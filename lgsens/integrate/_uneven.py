@@ -89,10 +89,13 @@ class UnevenSteps(eqx.Module):
         return cls(scheme, system, Constants.of(system))
 
     def _inverse(self, state: State, t, h) -> tuple[Solver, Float[Array, ""]]:
-        """The inverse, and a margin (`_singular`) that can be compared with those of other step sizes."""
         inverse, _ = inverse_at(self.scheme, self.system, self.constants, state, t, h)
+        return inverse, self._margin(state)
+
+    def _margin(self, state: State) -> Float[Array, ""]:
+        """A margin (`_singular`) that can be compared with those of other step sizes."""
         jacobian = constraint_jacobian(self.system, state.q)
-        return inverse, margin_by_mass(self.system, self.constants.mass, jacobian, self.constants.scale)
+        return margin_by_mass(self.system, self.constants.mass, jacobian, self.constants.scale)
 
     def first(self, state0: State, t0, h) -> Progress:
         """Before the first step, to whose size h the a of `state0` belongs."""
@@ -139,8 +142,8 @@ class UnevenSteps(eqx.Module):
         guess = Guess((start.a, start.a), (start.lam, start.lam), progress.contraction, self._predicted(progress, h))
         t = progress.t + h
         found = take_step(self.scheme, self.system, self.constants, start, guess, progress.inverse, active, t, h)
-        stats = found[2] if progress.inverse is None else found[2]._replace(margin=progress.margin)
-        return Attempt(found[0], found[1].contraction, stats)
+        margin = self._margin(found[0]) if progress.inverse is None else progress.margin
+        return Attempt(found[0], found[1].contraction, found[2]._replace(margin=margin))
 
     def _predicted(self, progress: Progress, h):
         """u and λ from the parabolas through the last three v̇ and λ; u by eq. (29), whatever sizes they had."""
