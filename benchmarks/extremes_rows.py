@@ -16,17 +16,13 @@ EPS = float(np.finfo(np.float64).eps)
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One line of the table: `measured` is right if it is at most `bound`; `why` says where the bound comes from.
-
-    `limit`: it is known to be beyond its bound, and a limit to be told rather than a mistake.
-    """
+    """One line of the table: `measured` is right if it is at most `bound`; `why` says where the bound comes from."""
 
     extreme: str
     measures: str
     measured: float
     bound: float
     why: str
-    limit: bool = False
 
     @property
     def holds(self) -> bool:
@@ -34,8 +30,6 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        if self.limit:
-            return "LIMIT" if not self.holds else "WRONG: no limit any more"
         return "right" if self.holds else "WRONG"
 
 

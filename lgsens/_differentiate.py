@@ -240,7 +240,8 @@ def _on_the_fly(task: _Task, p) -> _Found:
         return (started.state, Parameters(system, task.t0, task.h)), started
 
     run = direct_on_the_fly(task.integrator, task.num_steps, start, _stacked(task.criteria, task.unravel), p)
-    return _Found(run.value, run.gradient, *outcome(task.integrator, run.begun, run.stats, task.t0, task.h))
+    turns = task.h * run.rates
+    return _Found(run.value, run.gradient, *outcome(task.integrator, run.begun, run.stats, turns, task.t0, task.h))
 
 
 def _through_the_trajectory(task: _Task, p, method: AbstractSensitivity) -> _Found:

@@ -67,6 +67,13 @@ def describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> st
             f"{code.message} It does so about step {int(details['step'])} of {int(details['num_steps'])}, "
             f"t = {details['time']:.6g} s. `throw=False` returns the data, which follow one branch."
         )
+    if code is RESULTS.turn_not_resolved:
+        num_steps, turn = int(details["num_steps"]), float(details["turn"])
+        return (
+            f"{code.message} It turns by {turn:.3g} rad in step {int(details['step'])} of {num_steps}, "
+            f"t = {details['time']:.6g} s: try num_steps = {np.ceil(num_steps * turn / 0.3):.0f}. "
+            "`throw=False` returns the data."
+        )
     if code is RESULTS.position_failed:
         violation = np.abs(details["violation"])
         worst = int(np.argmax(np.where(np.isfinite(violation), violation, np.inf)))

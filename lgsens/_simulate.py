@@ -22,6 +22,7 @@ from lgsens.dynamics import (
     State,
     equilibrium as _equilibrium,
     initial_state as _initial,
+    unsteady_rate,
 )
 from lgsens.integrate import GeneralizedAlpha, Stats, singular_steps
 from lgsens.model import Model
@@ -173,8 +174,9 @@ def simulate(
     times is that of the numerical solution, to round-off.
 
     Raises `ValueError` for bad arguments, a mechanism that cannot be assembled or has redundant constraints,
-    and `SimulationError` for a step that does not converge; inside `jit`, JAX's runtime error with the
-    same message. Source: Sonneville & Brüls (2014), §4 and §6.2.
+    and `SimulationError` for a step that does not converge, a singular configuration, or a body that turns by more
+    than π in a step while its angular velocity changes; inside `jit`, JAX's runtime error with the same message.
+    Source: Sonneville & Brüls (2014), §4 and §6.2.
     """
     system = as_system(model)
     warn_of_single_precision(system)
@@ -258,13 +260,16 @@ def _run_ode(system: AbstractSystem, state0, initial, t0, h, num_steps: int, int
     return found, details
 
 
-def outcome(integrator: GeneralizedAlpha, start: Begin, stats: Stats, t0, h):
-    """The result code of a simulation, and what its message needs."""
+def outcome(integrator: GeneralizedAlpha, start: Begin, stats: Stats, turns, t0, h):
+    """The result code of a simulation, and what its message needs; `turns`: h `unsteady_rate` of each step."""
     failed = jnp.argmin(stats.converged)  # the first step that did not converge, 0 if all did
     newton = jnp.where(jnp.all(stats.converged), RESULTS.successful, RESULTS.newton_failed)
     singular = singular_steps(stats.margin)
     newton = jnp.where(jnp.any(singular), RESULTS.singular_configuration, newton)
     failed = jnp.where(jnp.any(singular), jnp.argmax(singular), failed)
+    unresolved = jnp.any(turns > jnp.pi) & (newton != RESULTS.newton_failed)  # which may look singular later
+    newton = jnp.where(unresolved, RESULTS.turn_not_resolved, newton)
+    failed = jnp.where(unresolved, jnp.argmax(turns > jnp.pi), failed)
     result = jnp.where(start.result == RESULTS.successful, newton, start.result).astype(jnp.int32)
     details = {
         "violation": start.violation,
@@ -275,6 +280,7 @@ def outcome(integrator: GeneralizedAlpha, start: Begin, stats: Stats, t0, h):
         "iterations": stats.iterations[failed],
         "increment": stats.increment[failed],
         "residual": stats.residual[failed],
+        "turn": turns[failed],
         "tolerance": jnp.asarray(integrator.tolerance),
     }
     return result, jax.lax.stop_gradient(details)
@@ -284,15 +290,21 @@ def run(system: AbstractSystem, start: Begin, t0, t1, num_steps: int, integrator
     """`simulate` without its checks: the trajectory, and what the message of a failure needs."""
     parameters = Parameters(system, t0, (t1 - t0) / num_steps)
     states, stats = sensitivity.trajectory(integrator, num_steps, start.state, parameters)
-    result, details = outcome(integrator, start, stats, t0, parameters.h)
+    turns = parameters.h * _rates_after_steps(system, states)
+    result, details = outcome(integrator, start, stats, turns, t0, parameters.h)
     t = times(num_steps, parameters)
     return Trajectory(t=t, states=states, result=result, stats=stats, system=system), details
+
+
+def _rates_after_steps(system: AbstractSystem, states: State):
+    return unsteady_rate(system, states.v[1:], states.vdot[1:])
 
 
 def _run_uneven(integrator: UnevenIntegrator, system, state0, initial, t0, t1, num_steps: int, sensitivity):
     """`run` with steps of different sizes."""
     found = run_uneven(integrator, system, state0, initial, t0, t1, num_steps, sensitivity)
-    result, details = outcome(integrator.integrator, found.start, found.newton, t0, (t1 - t0) / num_steps)
+    turns = jnp.diff(found.t) * _rates_after_steps(system, found.states)
+    result, details = outcome(integrator.integrator, found.start, found.newton, turns, t0, (t1 - t0) / num_steps)
     stopped = ~found.reached & (result == RESULTS.successful)
     result = jnp.where(stopped, RESULTS.steps_exhausted, result).astype(jnp.int32)
     time = jnp.where(stopped, found.t[-1], found.t[details["step"]])
@@ -305,15 +317,16 @@ def _run_saved(system, start: Begin, t0, t1, num_steps: int, integrator, sensiti
     """`run` without a trajectory."""
     parameters = Parameters(system, t0, (t1 - t0) / num_steps)
     output = _Output(save)
-    values, final, stats = saved_run(sensitivity, output, integrator, num_steps, start.state, parameters)
-    result, details = outcome(integrator, start, stats, t0, parameters.h)
+    run = saved_run(sensitivity, output, integrator, num_steps, start.state, parameters)
+    (values, rates), final, stats = run
+    result, details = outcome(integrator, start, stats, parameters.h * rates[1:], t0, parameters.h)
     return Saved(times(num_steps, parameters), values, final, result, stats), details
 
 
 class _Output(eqx.Module):
-    """`save` as a function of the state; equal, for one compilation, where `save` is."""
+    """`save` as a function of the state, and how fast it turns; equal, for one compilation, where `save` is."""
 
     save: Save = eqx.field(static=True)
 
     def __call__(self, system, state: State, t):
-        return self.save(Instant(t=t, state=state, system=system))
+        return self.save(Instant(t=t, state=state, system=system)), unsteady_rate(system, state.v, state.vdot)

@@ -58,6 +58,8 @@ CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, -1, 0), (1, -1, 1), (0, -1, 1), (0
 def bricard(mass=1.0, size=1.0, relaxed=None, redundant="minimum_norm"):
     """The Bricard mechanism of the IFToMM benchmarks: five rods on edges of a cube and the ground, six revolute joints.
 
+    The rods are a tenth as thick as long.
+
     Each of the axes is orthogonal to both rods; `relaxed`: the joint that is cylindrical instead.
     """
     corners = size * jnp.asarray(CORNERS)
@@ -69,7 +71,7 @@ def bricard(mass=1.0, size=1.0, relaxed=None, redundant="minimum_norm"):
         kind = lg.CylindricalJoint if i == relaxed else lg.RevoluteJoint
         joints[f"hinge {i}"] = kind(names[i - 1], name, at=corners[i], axis=jnp.cross(rods[i - 1], rods[i]))
         if name is not None:
-            inertia = mass * size**2 / 12.0 * (jnp.eye(3) - 0.99 * jnp.outer(along, along))
+            inertia = mass * size**2 / 12.0 * (1.01 * jnp.eye(3) - 0.99 * jnp.outer(along, along))
             bodies[name] = lg.RigidBody(mass, inertia, (corners[i] + corners[(i + 1) % 6]) / 2.0)
     return lg.Model(bodies, joints, {"gravity": lg.Gravity((0.0, -9.81, 0.0))}, redundant=redundant)
 
@@ -276,6 +278,34 @@ def test_a_parallelogram_through_its_dead_centre_is_said_to_be_singular(factor_e
     assert lg.simulate(linkage(2.8), t1=0.06, num_steps=100, integrator=scheme).result == 0
     near = lg.simulate(linkage(2.8, 0.88, 0.322), t1=0.1, num_steps=100, integrator=scheme)
     assert jnp.nanmin(near.stats.margin) < 0.5 * jnp.nanmax(near.stats.margin)
+
+
+OTHERS = {
+    "adaptive": lg.AdaptiveSteps(lg.GeneralizedAlpha(0.8), tolerance=1e-5),
+    "given": lg.GivenSteps(1.0 + 0.3 * np.sin(np.arange(100.0) / 8.0), lg.GeneralizedAlpha(0.8)),
+    "given, full Newton": lg.GivenSteps(np.ones(100), lg.GeneralizedAlpha(0.8, factor_every=0)),
+    "stabilized": lg.GeneralizedAlpha(0.8, stabilized=True),
+}
+
+
+@pytest.mark.parametrize(
+    "name", ["adaptive", *(pytest.param(n, marks=pytest.mark.slow) for n in OTHERS if n != "adaptive")]
+)
+def test_other_steps_are_watched_too(name):
+    run = lambda model, t1: lg.simulate(model, t1=t1, num_steps=100, integrator=OTHERS[name], throw=False)
+    found = run(linkage(2.8), 0.1)
+    assert found.result == lg.RESULTS.singular_configuration
+    near = found.t[int(jnp.argmax(singular_steps(found.stats.margin)))]
+    assert abs(near - (np.pi - 2.8) / 5.0) < 0.005  # two steps, of 2 ms at most
+    assert run(linkage(2.8), 0.06).result == 0
+    assert run(linkage(2.8, 0.88, 0.322), 0.1).result == 0
+
+
+@pytest.mark.parametrize("factor_every", [1, 0])
+def test_without_joints_nothing_is_singular(factor_every):
+    scheme = lg.GeneralizedAlpha(factor_every=factor_every)
+    stone = lg.Model({"stone": lg.RigidBody(1.0, (1.0, 1.0, 1.0), free="z")}, {}, {"g": lg.Gravity((0.0, 0.0, -9.81))})
+    assert lg.simulate(stone, t1=0.1, num_steps=10, integrator=scheme).result == 0
 
 
 def test_a_reference_that_lies_flat_is_singular():

@@ -48,3 +48,4 @@ from lgsens.dynamics._system import (
     autodiff_constraint_jacobian as autodiff_constraint_jacobian,
     autodiff_tangents as autodiff_tangents,
 )
+from lgsens.dynamics._turning import unsteady_rate as unsteady_rate

@@ -15,6 +15,7 @@ class RESULTS(IntEnum):
     position_failed = 6
     steps_exhausted = 7
     singular_configuration = 8
+    turn_not_resolved = 9
 
     @property
     def message(self) -> str:
@@ -51,6 +52,10 @@ _MESSAGES = {
         "The mechanism passes a singular configuration, where its joints lose independence and the motion may branch "
         "(a linkage that lies flat): which way it goes on is not determined, and derivatives by lengths are infinite. "
         "End the simulation before, change the lengths, or let a joint give way (`Bushing`)."
+    ),
+    RESULTS.turn_not_resolved: (
+        "A body turns by more than π in a step while its angular velocity changes: what loads do in between, the steps "
+        "do not see, and the motion may be quite another one. Take steps of 0.3 rad or less (more `num_steps`)."
     ),
     RESULTS.position_failed: (
         "No position satisfies the joints for these values of the driven ones: they are out of reach, or the mechanism "

@@ -101,6 +101,10 @@ class AbstractSparseSystem(AbstractSystem):
         """K_t, C_t and B; the columns of K_t and B by bodies."""
 
     @abc.abstractmethod
+    def angular_velocities(self, v) -> Float[Array, "*n N 3"]:
+        """Ω of each body, body frame, from v along leading axes, or Ω̇ from v̇; zero about axes that it does not have."""
+
+    @abc.abstractmethod
     def tangent_operators(self, x) -> Float[Array, "N 3 3"]:
         """T(x) on the rotations of each body, zero in the rows and columns of those that it does not have; T = I on
         translations."""

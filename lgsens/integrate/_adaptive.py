@@ -104,7 +104,7 @@ class ControlledStats(NamedTuple):
         increment: the last increment of each step, relative as in `GeneralizedAlpha.tolerance`, shape (n,).
         residual: the largest entry of the residual r before that increment [N or N m], shape (n,).
         converged: whether each step converged, shape (n,), bool.
-        margin: as in `Stats`; not looked at, NaN, shape (n,).
+        margin: as in `Stats`, shape (n,).
         error: the estimated error of each step, relative as in `AdaptiveSteps.tolerance`, shape (n,).
         rejected: attempts with a longer step before each, shape (n,), int32.
         steps: the number of steps that t1 took, shape (), int32.

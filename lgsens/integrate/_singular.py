@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lgsens.dynamics import AbstractSystem, factorized, mass_scale
 from lgsens.linear import Factors, Matrix
 
 _SMALL = 0.1  # margins above this fraction of the largest of a run are no sign: B may turn by radians in a step
@@ -38,6 +39,12 @@ def margin_of(factors: Factors, jacobian: Matrix, scale: Float[Array, " k"]) -> 
     moved = jacobian @ y
     _, mu = factors.solve(jnp.zeros_like(scale), moved)
     return jnp.sqrt(jnp.sum(moved**2) / jnp.sum(mu**2))
+
+
+def margin_by_mass(system: AbstractSystem, mass: Matrix, jacobian: Matrix, scale: Float[Array, " k"]):
+    """m with M for A: it can be compared where steps are not equal, and costs a factorization."""
+    factors = factorized(system, mass, jacobian.T, jacobian, mass_scale(mass))
+    return margin_of(factors, jacobian, scale)
 
 
 class Watch(NamedTuple):
@@ -63,4 +70,4 @@ def singular_steps(margins: Float[Array, " n"]):
     """For each step whether a singular configuration is passed in it or in the next; margins not known are NaN."""
     before = jnp.concatenate([jnp.full(1, jnp.nan, margins.dtype), margins[:-1]])
     largest = jnp.nanmax(margins)
-    return (2.0 * margins <= before) & (margins <= _SMALL * largest)
+    return (2.0 * margins <= before) & (margins <= _SMALL * largest) & jnp.isfinite(margins)  # infinite without joints

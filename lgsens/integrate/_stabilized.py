@@ -40,6 +40,7 @@ from jaxtyping import Array, Float
 
 from lgsens.dynamics import AbstractSystem, State, constraint_velocity, mass_scale
 from lgsens.integrate._scheme import AbstractStep, GeneralizedAlpha, advance
+from lgsens.integrate._singular import margin_by_mass
 from lgsens.linear import LU, Factors
 
 
@@ -134,8 +135,9 @@ class StabilizedStep(AbstractStep):
 
     def factors(self, motion, lam, t, kind=LU):
         at_state = self.tangents(motion.q, motion.v, motion.vdot, lam, t)
-        not_known = jnp.full((), jnp.nan, self.h.dtype)
-        return self.factorized(at_state, motion.x, kind), not_known
+        jacobian = at_state.constraint_jacobian
+        margin = margin_by_mass(self.system, self.mass, jacobian, self.system.coordinate_scale())
+        return self.factorized(at_state, motion.x, kind), margin
 
     def factorized(self, at_state: StabilizedTangents, x, kind: Any = LU) -> "StabilizedFactors":
         """The factors of S₂."""

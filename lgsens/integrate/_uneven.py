@@ -21,9 +21,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from lgsens.dynamics import AbstractSystem, State
+from lgsens.dynamics import AbstractSystem, State, constraint_jacobian
+from lgsens.integrate._lanes import renewed_where
 from lgsens.integrate._newton import SLOW, Chord, Constants, Guess, Solver, Stats, no_solver, take_step
 from lgsens.integrate._scheme import GeneralizedAlpha
+from lgsens.integrate._singular import Watch, margin_by_mass
 
 _SAME = 2.0  # the change of h up to which modified Newton keeps its matrix
 
@@ -53,6 +55,8 @@ class Progress(NamedTuple):
     past: _Past
     contraction: Float[Array, ""]
     shared: _Shared | None
+    watch: Watch  # margins by time
+    watched: Float[Array, ""]  # when
     running: Bool[Array, ""]
 
     def chosen(self, which, other: "Progress") -> "Progress":
@@ -85,6 +89,11 @@ class UnevenSteps(eqx.Module):
     def of(cls, scheme: GeneralizedAlpha, system: AbstractSystem) -> "UnevenSteps":
         return cls(scheme, system, Constants.of(system))
 
+    def _margin(self, state: State) -> Float[Array, ""]:
+        """A margin (`_singular`) that can be compared with those of other step sizes."""
+        jacobian = constraint_jacobian(self.system, state.q)
+        return margin_by_mass(self.system, self.constants.mass, jacobian, self.constants.scale)
+
     def first(self, state0: State, t0, h) -> Progress:
         """Before the first step, to whose size h the a of `state0` belongs."""
         twice = lambda leaf: jnp.stack([leaf, leaf])
@@ -96,6 +105,8 @@ class UnevenSteps(eqx.Module):
             past=_Past(t0 - h * jnp.asarray([1.0, 2.0], h.dtype), twice(state0.vdot), twice(state0.lam)),
             contraction=jnp.ones_like(h),
             shared=self._not_yet(state0, t0, h) if self.scheme.factor_every else None,
+            watch=Watch.first(h.dtype),
+            watched=t0,
             running=jnp.all(jnp.isfinite(state0.a)),
         )
 
@@ -106,7 +117,9 @@ class UnevenSteps(eqx.Module):
     def _due(self, progress: Progress, shared: _Shared, h):
         """Whether a step of size h wants a new matrix."""
         old = (shared.age >= self.scheme.factor_every) | ((progress.contraction >= SLOW) & (shared.age > 1))
-        return old | (h > _SAME * shared.h) | (_SAME * h < shared.h)
+        passed = progress.t + h - progress.watched
+        singular = progress.watch.ends_within(passed + 2.0 * self.scheme.factor_every * h)
+        return old | singular | (h > _SAME * shared.h) | (_SAME * h < shared.h)
 
     def tried(self, progress: Progress, h, active) -> Attempt:
         """The state that a step of size h reaches; NaN unless `active` and converged."""
@@ -117,11 +130,13 @@ class UnevenSteps(eqx.Module):
         state, guess, stats, chord = take_step(
             self.scheme, self.system, self.constants, start, guess, chord, active, t, h
         )
-        if shared is not None and chord is not None:
+        if shared is None or chord is None:
+            margin = self._margin(state)
+        else:
             made = chord.due
+            margin = renewed_where(made, lambda: self._margin(state), jnp.full_like(h, jnp.nan))
             shared = _Shared(chord.solver, jnp.where(made, h, shared.h), jnp.where(made, 0, shared.age) + 1)
-        # margins of steps of different sizes cannot be compared as `singular_steps` does
-        return Attempt(state, guess.contraction, stats._replace(margin=jnp.full_like(h, jnp.nan)), shared)
+        return Attempt(state, guess.contraction, stats._replace(margin=margin), shared)
 
     def _predicted(self, progress: Progress, h):
         """u and λ from the parabolas through the last three v̇ and λ; u by eq. (29), whatever sizes they had."""
@@ -145,14 +160,18 @@ class UnevenSteps(eqx.Module):
     def after(self, progress: Progress, found: Attempt, h) -> Progress:
         """With a step of size h done; it ends the simulation if it did not converge."""
         earlier = lambda last, before: jnp.stack([last, before[0]])
-        state, past = progress.state, progress.past
+        state, past, t = progress.state, progress.past, progress.t + h
+        margin = found.stats.margin
+        known = ~jnp.isnan(margin)
         return progress._replace(
             state=found.state,
-            t=progress.t + h,
+            t=t,
             h=h,
             past=_Past(earlier(progress.t, past.t), earlier(state.vdot, past.vdot), earlier(state.lam, past.lam)),
             contraction=found.contraction,
             shared=found.shared,
+            watch=chosen(known, progress.watch.after(margin, t - progress.watched), progress.watch),
+            watched=jnp.where(known, t, progress.watched),
             running=found.stats.converged,
         )
 

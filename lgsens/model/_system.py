@@ -85,6 +85,9 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             return group.rows(v)
         return v.reshape(*v.shape[:-1], -1, BODY_DIM)
 
+    def angular_velocities(self, v):
+        return self.twists(v)[..., ROTATION]
+
     def _placed(self, q: Pose) -> Pose:
         """q with what no body can change taken from the reference configuration.
 

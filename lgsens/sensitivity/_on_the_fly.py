@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import State
+from lgsens.dynamics import State, unsteady_rate
 from lgsens.integrate import Chord, Constants, GeneralizedAlpha, Guess, Stats, margin_of, take_step
 from lgsens.linear import LU
 from lgsens.sensitivity._criterion_terms import Functional
@@ -35,11 +35,12 @@ from lgsens.sensitivity._linearization import (
 
 
 class OnTheFly(NamedTuple):
-    """Values (c,), gradients (c, p), Newton's statistics, and what `begin` has to say besides."""
+    """Values (c,), gradients (c, p), Newton's statistics, how fast bodies turn, what `begin` has to say besides."""
 
     value: Float[Array, " c"]
     gradient: Float[Array, "c p"]
     stats: Stats
+    rates: Float[Array, " n"]  # `unsteady_rate` after each step
     begun: Any
 
 
@@ -90,7 +91,10 @@ def direct_on_the_fly(
         # the last point has the weight h/2
         weight = jnp.where(n == num_steps - 1, h / 2, h)
         total = jax.tree.map(lambda total, f: total + weight * f, total, rate)
-        return (state, guess, prepared.factors, stats.converged, delta, total), stats
+        return (state, guess, prepared.factors, stats.converged, delta, total), (
+            stats,
+            unsteady_rate(system, state.v, state.vdot),
+        )
 
     delta0 = jax.vmap(lambda tangent: to_algebra(group, state0, tangent))(d_state0)
     first = with_derivative(functional.rate, state0, parameters.t0, delta0)
@@ -98,7 +102,7 @@ def direct_on_the_fly(
     shapes = jax.eval_shape(lambda: linearized_at(state0, state0, parameters.t0)[1].factors)
     factors = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)  # of no step yet
     start = (state0, Guess.first(state0), factors, jnp.ones((), bool), delta0, half)
-    (state, *_, delta, integral), stats = lax.scan(step, start, jnp.arange(num_steps, dtype=p.dtype))
+    (state, *_, delta, integral), (stats, rates) = lax.scan(step, start, jnp.arange(num_steps, dtype=p.dtype))
     final = with_derivative(functional.final, state, parameters.t0 + num_steps * h, delta)
     value, derivative = jax.tree.map(jnp.add, integral, final)
-    return OnTheFly(value, derivative.T, stats, begun)
+    return OnTheFly(value, derivative.T, stats, rates, begun)

@@ -1,0 +1,31 @@
+"""Turns that time steps do not resolve.
+
+A load that is fixed in space turns against a body of angular velocity Ω, in the frame of the body: by h|Ω| in a step.
+From π on its samples are those of a slower turn as well, or of none at 2π, and Newton converges to the
+motion that belongs to these. No equation of a step tells them apart.
+
+With Ω̇ = 0 in the body's frame the moment J Ω̇ + Ω × J Ω on it is the same at all samples, and the increment x = h Ω
+is exact at any angle: a ball in flight, a body about a principal axis, a balanced rotor at constant speed in its
+bearing. What changes Ω where it is not constant, samples more than half a turn apart do not tell; that Ω̇ is along Ω, as
+for a pendulum that turns over, does not help. So a body counts as unsteady if
+
+    |Ω̇| > ε^(2/3) |Ω|²,
+
+where round-off makes Ω̇ = ε Ω², and more by the multipliers of joints, and no unsteady body may turn by π in a step.
+"""
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem
+
+
+def unsteady_rate(system: AbstractSystem, v: Float[Array, "*n k"], vdot: Float[Array, "*n k"]) -> Float[Array, "*n"]:
+    """The largest |Ω| of an unsteady body [rad/s], along leading axes, without derivative; 0 if bodies are unknown."""
+    if not isinstance(system, AbstractSparseSystem):
+        return jnp.zeros(v.shape[:-1], v.dtype)
+    v, vdot = lax.stop_gradient((v, vdot))
+    square, change = (jnp.sum(system.angular_velocities(each) ** 2, axis=-1) for each in (v, vdot))
+    unsteady = change > (jnp.finfo(v.dtype).eps ** (2.0 / 3.0) * square) ** 2
+    return jnp.sqrt(jnp.max(jnp.where(unsteady, square, 0.0), axis=-1, initial=0.0))
