@@ -138,7 +138,7 @@ def test_one_factorization_for_all_parameters_and_criteria(method, monkeypatch):
     p = jax.tree.map(jnp.asarray, P)
     many, batched = factorizations(three, build, p)
     one, _ = factorizations(SIDE, one_p, p["alpha0"])
-    assert many == one > 1
+    assert many == one > 0
     assert batched == []
 
 
