@@ -260,7 +260,7 @@ def programs(scene: Scene, counts: Mapping[int, str] | None = None) -> list[Prog
 
     None: the step of the others, and the step that gives their accuracy.
     """
-    if scene.name not in COARSE:
+    if counts is None and scene.name not in COARSE:
         return []
     counts = {scene.num_steps: "equal step", COARSE[scene.name]: "equal accuracy"} if counts is None else counts
     ca = casadi()

@@ -156,3 +156,8 @@ def test_spring_without_leverage():
     car = eqx.tree_at(lambda car: car.spring.link_point, car, pivot)
     with pytest.raises(ValueError, match=r"cannot hold .* at its design position .*does the spring change its length"):
         car.model()
+
+
+def test_a_file_is_read_inside_of_jit():
+    """Its numbers are constants there too."""
+    assert jax.jit(lambda scale: scale * QuarterCar.load().spring.rate)(2.0) == 2.0 * QuarterCar.load().spring.rate

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -94,7 +95,8 @@ class QuarterCar(eqx.Module):
         `ValueError` naming the file and the key (or the line) for a file that cannot be read or is
         incomplete.
         """
-        return _parse(*read(path))
+        with jax.ensure_compile_time_eval():  # the file's numbers are constants, inside `jit` too
+            return _parse(*read(path))
 
     def model(
         self,
