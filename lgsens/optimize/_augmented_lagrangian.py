@@ -147,7 +147,7 @@ def advance(
     accuracy = jnp.maximum(tolerance, jnp.minimum(search.accuracy, INNER_ACCURACY * penalty * sigma))
     solved = (norm <= accuracy) | (search.inner >= INNER_STEPS)
     follow = accepted & solved & (sigma > 0) & (search.inner >= least)
-    stiffer = follow & (sigma > FALL * search.violation)
+    stiffer = follow & (norm <= accuracy) & (sigma > FALL * search.violation)
     contradiction = follow & (penalty >= LARGEST_PENALTY) & (sigma > HOPELESS * search.violation)
     contradiction &= (worst > constraint_tolerance) & (norm <= jnp.maximum(tolerance, 1e-4))
 

@@ -14,7 +14,8 @@ which is the step of a stabilized SQP method (Wright 1998, Comput. Optim. Appl. 
 A step that lowers L by a small part of what q promises is accepted; reach follows how well q promises, as in a
 trust-region method. With f, g, ∇f and J of a point L is known there for every μ, so that a change of μ takes no
 evaluation. B is of BFGS, damped by Powell to stay positive definite, from the differences of ∇f + Jᵀ ν with the ν = μ⁺
-of the better of the two points; a trial that is rejected teaches it as well.
+of the better of the two points; a trial that is rejected teaches it as well. (The symmetric rank-one formula does
+better on small problems and worse on the suspension, where ν changes much from step to step.)
 """
 
 from collections.abc import Callable
@@ -30,7 +31,8 @@ from lgsens.optimize._penalty_model import PenaltyModel, minimum
 
 FIRST_MOVE = 0.1  # of the box, where nothing is known but ∇f
 DAMPING = 0.2  # of sᵀ B s, the least curvature that B learns
-LEAST_CURVATURE = 1e-4  # of f/|f(x₀)| over the box
+STEEPER = 100.0  # times what B knows, the most that it learns at once
+FLATTEST = 1e-4  # of the largest eigenvalue of B, the least
 POOR, GOOD = 0.25, 0.75  # of the promised decrease: reach falls, reach grows
 
 
@@ -51,6 +53,7 @@ class Carry(NamedTuple):
     point: Point  # the last that was accepted
     curvature: Float[Array, "n n"]  # B
     learned: Bool[Array, ""]  # whether B is more than a guess
+    renewed: Bool[Array, ""]  # whether B was given up at this point
     reach: Float[Array, ""]
     rejected: Int[Array, ""]  # trials from the point
 
@@ -64,6 +67,7 @@ def start(z: Float[Array, " n"], num_constraints: int) -> Carry:
         point=Point(z, jnp.full((), jnp.inf, z.dtype), jnp.zeros_like(z), g, jacobian),
         curvature=jnp.eye(z.size, dtype=z.dtype),
         learned=jnp.asarray(False),
+        renewed=jnp.asarray(False),
         reach=jnp.full((), outer.LARGEST_MOVE, z.dtype),
         rejected=jnp.zeros((), jnp.int32),
     )
@@ -118,13 +122,14 @@ def make_step(fun: Callable, box: Box, tolerances: tuple[float, float]) -> Calla
         change = there.slope + gradients[1] - here.slope - gradients[0]
         curvature, learned = _learned(carry, move, change, finite & ~first)
         again = first | given_up
-        stalled = given_up & ~carry.learned
+        stalled = given_up & carry.renewed
         zero, one = jnp.zeros_like(carry.rejected), jnp.ones_like(carry.rejected)
         return Carry(
             search=search._replace(ended=jnp.where(stalled, outer.STALLED, search.ended)),
             point=after,
             curvature=jnp.where(again, _guess(after.slope), curvature),
             learned=learned & ~again,
+            renewed=given_up | (carry.renewed & ~accepted),
             reach=jnp.where(again, outer.LARGEST_MOVE, reach),
             rejected=jnp.where(accepted | given_up, zero, carry.rejected + one),
         ), row
@@ -142,14 +147,16 @@ def _learned(carry: Carry, move, change, known) -> tuple[Float[Array, "n n"], Bo
     """B after the gradient of the Lagrangian changed by `change` along `move`."""
     squared, product = jnp.vdot(move, move), jnp.vdot(move, change)
     safe = lambda number: jnp.where(number > 0, number, 1.0)
-    first = jnp.where(product > 0, jnp.vdot(change, change) / safe(product), jnp.trace(carry.curvature) / move.size)
-    b = jnp.where(carry.learned, carry.curvature, first * jnp.eye(move.size, dtype=move.dtype))
+    usual = jnp.vdot(change, change) / safe(product)  # the larger curvatures that a first pair shows
+    b = jnp.where(carry.learned | (product <= 0), carry.curvature, usual * jnp.eye(move.size, dtype=move.dtype))
     image = b @ move
     curved = jnp.vdot(move, image)
     share = jnp.where(product >= DAMPING * curved, 1.0, (1 - DAMPING) * curved / safe(curved - product))
     damped = share * change + (1 - share) * image
-    # Where curvature is negative again and again the damping alone would let B go to 0.
-    damped += jnp.maximum(0.0, LEAST_CURVATURE - jnp.vdot(damped, move) / safe(squared)) * move
     updated = b + jnp.outer(damped, damped) / safe(jnp.vdot(damped, move)) - jnp.outer(image, image) / safe(curved)
-    useful = known & (squared > 0) & (curved > 0) & jnp.all(jnp.isfinite(updated))
-    return jnp.where(useful, updated, carry.curvature), carry.learned | useful
+    sound = jnp.vdot(damped, damped) <= STEEPER * jnp.trace(b) * jnp.vdot(damped, move)
+    useful = known & sound & (squared > 0) & (curved > 0) & jnp.all(jnp.isfinite(updated))
+    # Damping by itself lets the least eigenvalues fall, one by one, to nothing, after which others grow without bound.
+    values, vectors = jnp.linalg.eigh(jnp.where(useful, updated, b))
+    values = jnp.maximum(values, FLATTEST * jnp.max(values))
+    return jnp.where(useful, (vectors * values[None]) @ vectors.T, carry.curvature), carry.learned | useful

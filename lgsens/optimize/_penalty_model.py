@@ -2,8 +2,8 @@
 
     q(d) = sᵀ d + ½ dᵀ B d + Σ_i [max(0, c_i + ρ J_i d)² − max(0, c_i)² − 2 ρ max(0, c_i) J_i d] / (2ρ),   l ≤ d ≤ u
 
-with s the gradient at d = 0, so that q(0) = 0. With p = max(0, c), δ = ρ J d and the rise r = max(0, c + δ) − p the sum is
-of [r² + 2 p (r − δ)] / (2ρ), which are not negative: nothing cancels, however small d is.
+with s the gradient at d = 0, so that q(0) = 0. With p = max(0, c), δ = ρ J d and the rise r = max(0, c + δ) − p the sum
+is of [r² + 2 p (r − δ)] / (2ρ), which are not negative: nothing cancels, however small d is.
 
 q is convex and piecewise quadratic. A primal active set method: Newton's direction with the entries `held` at their
 bounds; along it the minimum up to the first bound, or a lower point bent at bounds; an entry that would leave is held;
