@@ -14,7 +14,7 @@ import jax
 import pytest
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
-SLOW = {"04_direct_or_adjoint", "06_sweeps", "07_your_own_joint_and_force"}  # 04 times: it asks for a quiet machine
+SLOW = {"03_quarter_car_design", "04_direct_or_adjoint", "06_sweeps", "07_your_own_joint_and_force"}  # 04: it times
 NAMES = sorted(path.stem for path in NOTEBOOKS.glob("*.ipynb"))
 
 

@@ -65,8 +65,8 @@ class Checkpoint:
         )
         if not same:
             raise ValueError(
-                f"`checkpoint` {str(self.path)!r} belongs to another start, other bounds or tolerances, or "
-                f"another number of constraints; {remedy}"
+                f"`checkpoint` {str(self.path)!r} belongs to another start, other bounds or tolerances, another "
+                f"number of constraints or another mode; {remedy}"
             )
         rows = [Row(*row) for row in zip(*(arrays[f"row_{name}"] for name in Row._fields))]
         # Another machine or version rounds otherwise, which a motion may enlarge: half of the digits are compared.

@@ -31,8 +31,8 @@ from lgsens.optimize._penalty_model import PenaltyModel, minimum
 
 FIRST_MOVE = 0.1  # of the box, where nothing is known but ∇f
 DAMPING = 0.2  # of sᵀ B s, the least curvature that B learns
-STEEPER = 100.0  # times what B knows, the most that it learns at once
-FLATTEST = 1e-4  # of the largest eigenvalue of B, the least
+STEEPER = 10.0  # times what B knows, the most that it learns at once
+FLATTEST = 1e-3  # of f/|f(x₀)| over the box, the least eigenvalue of B
 POOR, GOOD = 0.25, 0.75  # of the promised decrease: reach falls, reach grows
 
 
@@ -158,5 +158,5 @@ def _learned(carry: Carry, move, change, known) -> tuple[Float[Array, "n n"], Bo
     useful = known & sound & (squared > 0) & (curved > 0) & jnp.all(jnp.isfinite(updated))
     # Damping by itself lets the least eigenvalues fall, one by one, to nothing, after which others grow without bound.
     values, vectors = jnp.linalg.eigh(jnp.where(useful, updated, b))
-    values = jnp.maximum(values, FLATTEST * jnp.max(values))
+    values = jnp.maximum(values, FLATTEST)
     return jnp.where(useful, (vectors * values[None]) @ vectors.T, carry.curvature), carry.learned | useful
