@@ -13,7 +13,8 @@ first term is learned, B, and the model of L that a step minimizes keeps the res
 which is the step of a stabilized SQP method (Wright 1998, Comput. Optim. Appl. 11:253; Nocedal & Wright 2006, §18).
 A step that lowers L by a small part of what q promises is accepted; reach follows how well q promises, as in a
 trust-region method. With f, g, ∇f and J of a point L is known there for every μ, so that a change of μ takes no
-evaluation. B is of BFGS, damped by Powell to stay positive definite, from the differences of ∇f + Jᵀ ν with the ν = μ⁺
+evaluation; and in the beginning, far from an optimum, the multipliers max(0, μ + ρ (g + J d)) of the model replace μ after
+every accepted step, without which a start on a constraint would first leave the feasible designs by μ/ρ. B is of BFGS, damped by Powell to stay positive definite, from the differences of ∇f + Jᵀ ν with the ν = μ⁺
 of the better of the two points; a trial that is rejected teaches it as well. (The symmetric rank-one formula does
 better on small problems and worse on the suspension, where ν changes much from step to step.)
 """
@@ -29,6 +30,7 @@ from lgsens.optimize import _augmented_lagrangian as outer
 from lgsens.optimize._box import Box
 from lgsens.optimize._penalty_model import PenaltyModel, minimum
 
+EAGER = 20  # first evaluations in which μ follows every step
 FIRST_MOVE = 0.1  # of the box, where nothing is known but ∇f
 DAMPING = 0.2  # of sᵀ B s, the least curvature that B learns
 STEEPER = 10.0  # times what B knows, the most that it learns at once
@@ -106,7 +108,11 @@ def make_step(fun: Callable, box: Box, tolerances: tuple[float, float]) -> Calla
         gain = before - outer.value(search, there.objective, pushed_there)
         accepted = finite & (gain >= outer.DECREASE * promised - outer.noise(before))
         trial = outer.Trial(z, x, f, g, there.slope + pushed_there @ jacobian, pushed_there, finite)
-        search, _, row = outer.advance(search, trial, accepted, tolerances, least=0)
+        search, follow, row = outer.advance(search, trial, accepted, tolerances, least=0)
+        first = carry.search.step == 0
+        eager = accepted & ~follow & ~first & (carry.search.step < EAGER)
+        multipliers = jnp.maximum(0.0, model.pushed + model.penalty * (here.jacobian @ move))
+        search = search._replace(multipliers=jnp.where(eager, multipliers, search.multipliers))
 
         # Of L, its slope and L at the trial the parabola; half where the trial is not finite.
         length, descent = jnp.max(jnp.abs(move)), jnp.vdot(model.slope, move)
@@ -115,7 +121,6 @@ def make_step(fun: Callable, box: Box, tolerances: tuple[float, float]) -> Calla
         longer = jnp.where(gain < POOR * promised, length / 2, longer)
         reach = jnp.minimum(jnp.where(accepted, longer, share * length), outer.LARGEST_MOVE)
 
-        first = carry.search.step == 0
         given_up = ~accepted & (carry.rejected >= outer.REJECTIONS)
         after = outer.select(accepted, there, here)
         gradients = jnp.where(accepted, pushed_there, pushed) @ jnp.stack([here.jacobian, jacobian])
