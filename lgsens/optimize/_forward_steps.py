@@ -13,10 +13,12 @@ first term is learned, B, and the model of L that a step minimizes keeps the res
 which is the step of a stabilized SQP method (Wright 1998, Comput. Optim. Appl. 11:253; Nocedal & Wright 2006, §18).
 A step that lowers L by a small part of what q promises is accepted; reach follows how well q promises, as in a
 trust-region method. With f, g, ∇f and J of a point L is known there for every μ, so that a change of μ takes no
-evaluation; and in the beginning, far from an optimum, the multipliers max(0, μ + ρ (g + J d)) of the model replace μ after
-every accepted step, without which a start on a constraint would first leave the feasible designs by μ/ρ. B is of BFGS, damped by Powell to stay positive definite, from the differences of ∇f + Jᵀ ν with the ν = μ⁺
-of the better of the two points; a trial that is rejected teaches it as well. (The symmetric rank-one formula does
-better on small problems and worse on the suspension, where ν changes much from step to step.)
+evaluation. In the beginning, far from an optimum, the multipliers max(0, μ + ρ (g + J d)) of the model replace μ after
+every accepted step, without which a start on a constraint would first leave the feasible designs by μ/ρ.
+
+B is of BFGS, damped by Powell to stay positive definite, from the differences of ∇f + Jᵀ ν with the ν = μ⁺ of the
+better of the two points; a trial that is rejected teaches it as well. (The symmetric rank-one formula does better on
+small problems and worse on the suspension, where ν changes much from step to step.)
 """
 
 from collections.abc import Callable

@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -198,6 +198,6 @@ def prepared(
         return f, g.ravel()
 
     few = shape[1].size > 0 and x.size <= FEW
-    method = _forward_steps if (few if forward is None else forward) else _reverse_steps
+    method: Any = _forward_steps if (few if forward is None else forward) else _reverse_steps
     step = method.make_step(in_a_row, box, tolerances)
     return lambda x: method.start(box.scaled(x), shape[1].size), step, shape[1].shape
