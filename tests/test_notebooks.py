@@ -14,8 +14,13 @@ import jax
 import pytest
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
-# 04 times: it asks for a quiet machine
-SLOW = {"04_direct_or_adjoint", "05_speed_or_accuracy", "06_sweeps", "07_your_own_joint_and_force"}
+SLOW = {
+    "03_quarter_car_design",
+    "04_direct_or_adjoint",
+    "05_speed_or_accuracy",
+    "06_sweeps",
+    "07_your_own_joint_and_force",
+}
 NAMES = sorted(path.stem for path in NOTEBOOKS.glob("*.ipynb"))
 
 

@@ -9,12 +9,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from lgsens.optimize._augmented_lagrangian import Carry, Row
+from lgsens.optimize._augmented_lagrangian import Row
 from lgsens.optimize._box import Box
 
-FORMAT = 1
+FORMAT = 2
 
 
 def columns(rows: list[Row]) -> dict[str, np.ndarray]:
@@ -30,7 +30,7 @@ class Checkpoint:
         numbers = b"".join(np.ascontiguousarray(leaf).tobytes() for leaf in (*box, x0, tolerances))
         self.problem = f"{FORMAT} {hashlib.sha256(numbers).hexdigest()}"
 
-    def save(self, carry: Carry, rows: list[Row]) -> None:
+    def save(self, carry: PyTree, rows: list[Row]) -> None:
         """The state after the evaluations `rows`."""
         arrays: dict[str, Any] = {f"carry_{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(carry))}
         arrays |= {f"row_{name}": column for name, column in columns(rows).items()}
@@ -40,7 +40,7 @@ class Checkpoint:
             np.savez(file, problem=np.asarray(self.problem), **arrays)
         os.replace(draft, self.path)
 
-    def load(self, carry: Carry, first: Row) -> tuple[Carry, list[Row]]:
+    def load(self, carry: PyTree, first: Row) -> tuple[PyTree, list[Row]]:
         """What the file holds; `carry` and no rows where there is none.
 
         Arguments:
@@ -65,8 +65,8 @@ class Checkpoint:
         )
         if not same:
             raise ValueError(
-                f"`checkpoint` {str(self.path)!r} belongs to another start, other bounds or tolerances, or "
-                f"another number of constraints; {remedy}"
+                f"`checkpoint` {str(self.path)!r} belongs to another start, other bounds or tolerances, another "
+                f"number of constraints or another mode; {remedy}"
             )
         rows = [Row(*row) for row in zip(*(arrays[f"row_{name}"] for name in Row._fields))]
         # Another machine or version rounds otherwise, which a motion may enlarge: half of the digits are compared.

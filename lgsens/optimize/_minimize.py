@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +12,15 @@ from jaxtyping import Array, Float, PyTree
 
 from lgsens._progress import progress_bar
 from lgsens._validate import as_count
-from lgsens.optimize import _augmented_lagrangian as method
+from lgsens.optimize import _forward_steps, _reverse_steps
+from lgsens.optimize._augmented_lagrangian import Row
 from lgsens.optimize._box import Box, checked_box
 from lgsens.optimize._checkpoint import Checkpoint, columns
 
 Problem = Callable[[PyTree], tuple[Float[Array, ""], Array]]
+Carry = _forward_steps.Carry | _reverse_steps.Carry
 REASONS = ("steps", "converged", "stalled", "infeasible")
+FEW = 40  # variables: their Jacobian costs little more than a gradient in reverse mode
 
 
 class History(NamedTuple):
@@ -79,26 +82,30 @@ def minimize(
     log_scale: PyTree = False,
     tolerance: float = 1e-5,
     constraint_tolerance: float = 1e-3,
+    forward: bool | None = None,
     progress: bool = True,
     callback: Callable[[int, float, float], None] | None = None,
     checkpoint: str | os.PathLike | None = None,
 ) -> OptimizationResult:
     """min f(x) subject to g(x) ≤ 0 and lower ≤ x ≤ upper.
 
-    By an augmented Lagrangian with a multiplier for each constraint, minimized by L-BFGS in the box: one gradient in
-    reverse mode for each evaluation, whatever the number of constraints.
+    By an augmented Lagrangian with a multiplier for each constraint. Of few variables it takes the Jacobian of all
+    constraints, by which it sees them bend the way (a stabilized SQP method, in forward mode); of many one gradient
+    for each evaluation, whatever the number of constraints (L-BFGS in the box, in reverse mode).
 
     Arguments:
         fun: x ↦ (f, g): the objective, shape (), and the constraints, an array of any shape, each scaled so
-            that 1 is a large violation; an empty array for none. Traced once, differentiated in reverse mode.
+            that 1 is a large violation; an empty array for none. Traced once.
         x0: where to start, a pytree of arrays within the bounds. It need not satisfy g ≤ 0.
         lower, upper: the bounds, pytrees as x0; a leaf of shape () bounds every entry.
-        num_steps: the most evaluations of f, g and one gradient; the first is at x0.
+        num_steps: the most evaluations of f, g and derivatives; the first is at x0.
         log_scale: whether to search by the logarithm, a bool or a pytree of bools as x0; for positive rates
             whose bounds are a decade apart.
         tolerance: the search ends where the projected gradient of the Lagrangian, in variables scaled to [0, 1] and
             for f/|f(x₀)|, and σ of `History` are not above it; 0: never.
         constraint_tolerance: the g up to which a design satisfies its constraints.
+        forward: whether to differentiate in forward mode, static; None: where there are constraints and at most 40
+            variables.
         progress: show a bar, if tqdm is installed (`pip install "lgsens[plot]"`).
         callback: called after each evaluation with (step, f, max g).
         checkpoint: a file (.npz) that keeps the search, written after every evaluation. If it is there already, of
@@ -109,13 +116,13 @@ def minimize(
     A step into a region where f, g or the gradient is not finite is halved until they are. Raises
     `ValueError` for bounds of another shape than x0, lower ≥ upper, x0 outside them, a logarithmic scale over
     0, `num_steps` < 1, a tolerance that is out of range, an f or g that is not finite at x0, and a checkpoint of
-    another problem. Derivation and sources: `lgsens/optimize/_augmented_lagrangian.py`.
+    another problem. Derivation and sources: `lgsens/optimize/_augmented_lagrangian.py` and the two files of steps.
     """
     num_steps = as_count(num_steps, "num_steps")
     check_tolerances(tolerance, constraint_tolerance)
     x, unravel, box = checked_box(x0, lower, upper, log_scale)
     started = time.perf_counter()
-    begin, step = prepared(fun, x, unravel, box, tolerance, constraint_tolerance)
+    begin, step, shape = prepared(fun, x, unravel, box, (tolerance, constraint_tolerance), forward)
     carry = begin(x)
     step = jax.jit(step).lower(carry).compile()
     compiled = time.perf_counter()
@@ -131,7 +138,7 @@ def minimize(
         store = Checkpoint(checkpoint, box, x, (tolerance, constraint_tolerance))
         carry, rows = store.load(carry, first)
     with progress_bar(num_steps, "step", progress, initial=len(rows)) as bar:
-        while len(rows) < num_steps and not int(carry.ended):
+        while len(rows) < num_steps and not int(carry.search.ended):
             carry, row = step(carry) if rows else (after, first)
             rows.append(jax.tree.map(np.asarray, row))
             if store is not None:
@@ -144,13 +151,14 @@ def minimize(
     finished = time.perf_counter()
 
     found = columns(rows)
-    best, step = carry.best, int(carry.best.step)
+    search = carry.search
+    best, step = search.best, int(search.best.step)
     return OptimizationResult(
         x=unravel(jnp.asarray(found["x"][step])),
         objective=float(found["objective"][step]),
-        constraints=np.asarray(best.constraints),
+        constraints=np.asarray(best.constraints).reshape(shape),
         feasible=bool(best.worst <= constraint_tolerance),
-        reason=REASONS[int(carry.ended)],
+        reason=REASONS[int(search.ended)],
         step=step,
         history=History(
             objective=found["objective"],
@@ -159,7 +167,7 @@ def minimize(
             complementarity=found["complementarity"],
             design=jax.tree.map(np.asarray, jax.vmap(unravel)(jnp.asarray(found["x"]))),
         ),
-        multipliers=np.asarray(carry.multipliers),
+        multipliers=np.asarray(search.multipliers).reshape(shape),
         compile_seconds=compiled - started,
         run_seconds=finished - compiled,
     )
@@ -174,12 +182,22 @@ def check_tolerances(tolerance: float, constraint_tolerance: float) -> None:
 
 
 def prepared(
-    fun: Problem, x: Array, unravel: Callable, box: Box, tolerance: float, constraint_tolerance: float
-) -> tuple[Callable[[Array], method.Carry], Callable[[method.Carry], tuple[method.Carry, method.Row]]]:
-    """x₀ ↦ the first carry, and the step of a problem. Raises `ValueError` for a `fun` that returns something else."""
-    flat_fun = jax.jit(lambda x: fun(unravel(x)))  # jit keeps its trace: shapes and gradient come from one
+    fun: Problem, x: Array, unravel: Callable, box: Box, tolerances: tuple[float, float], forward: bool | None
+) -> tuple[Callable[[Array], Carry], Callable[[Carry], tuple[Carry, Row]], tuple[int, ...]]:
+    """x₀ ↦ the first carry, the step of a problem, and the shape of its constraints.
+
+    Raises `ValueError` for a `fun` that returns something else.
+    """
+    flat_fun = jax.jit(lambda x: fun(unravel(x)))  # jit keeps its trace: shapes and derivatives come from one
     shape = jax.eval_shape(flat_fun, x)
     if not (isinstance(shape, tuple) and len(shape) == 2 and shape[0].shape == ()):
         raise ValueError(f"`fun` must return (objective of shape (), array of constraints), got {shape}.")
-    step = method.make_step(flat_fun, box, tolerance, constraint_tolerance)
-    return lambda x: method.start(box.scaled(x), shape[1]), step
+
+    def in_a_row(x):
+        f, g = flat_fun(x)
+        return f, g.ravel()
+
+    few = shape[1].size > 0 and x.size <= FEW
+    method: Any = _forward_steps if (few if forward is None else forward) else _reverse_steps
+    step = method.make_step(in_a_row, box, tolerances)
+    return lambda x: method.start(box.scaled(x), shape[1].size), step, shape[1].shape

@@ -11,7 +11,7 @@ from jaxtyping import PyTree
 
 from lgsens._sweep import as_designs, sweep
 from lgsens._validate import as_count
-from lgsens.optimize import _augmented_lagrangian as method
+from lgsens.optimize._augmented_lagrangian import NOT_YET
 from lgsens.optimize._box import checked_box
 from lgsens.optimize._minimize import REASONS, Problem, check_tolerances, prepared
 
@@ -49,6 +49,7 @@ def multi_start(
     log_scale: PyTree = False,
     tolerance: float = 1e-5,
     constraint_tolerance: float = 1e-3,
+    forward: bool | None = None,
     seed: int = 0,
     progress: bool = True,
     batch_size: int | None = None,
@@ -57,8 +58,8 @@ def multi_start(
     """`minimize` from many starts: where f has several minima, the best of those that are found.
 
     Arguments:
-        fun, lower, upper, num_steps, log_scale, tolerance, constraint_tolerance: as of `minimize`; the bounds have the
-            shapes of x, unless `starts` shows them.
+        fun, lower, upper, num_steps, log_scale, tolerance, constraint_tolerance, forward: as of `minimize`; the bounds
+            have the shapes of x, unless `starts` shows them.
         starts: a number of random ones, uniform between the bounds (in the logarithm, where `log_scale`), or designs as
             `sweep` takes them.
         seed: of the random ones.
@@ -81,18 +82,18 @@ def multi_start(
         starts, count = as_designs(starts)
         for i in range(count):
             x, unravel, box = checked_box(jax.tree.map(lambda leaf, i=i: leaf[i], starts), lower, upper, log_scale)
-    begin, step = prepared(fun, x, unravel, box, tolerance, constraint_tolerance)
+    begin, step, _ = prepared(fun, x, unravel, box, (tolerance, constraint_tolerance), forward)
 
     def search(x0: PyTree) -> dict[str, Any]:
-        running = lambda carry: (carry.ended == method.NOT_YET) & (carry.step < num_steps)
-        carry = jax.lax.while_loop(running, lambda carry: step(carry)[0], begin(ravel_pytree(x0)[0]))
-        best = carry.best
+        running = lambda carry: (carry.search.ended == NOT_YET) & (carry.search.step < num_steps)
+        ended = jax.lax.while_loop(running, lambda carry: step(carry)[0], begin(ravel_pytree(x0)[0])).search
+        best = ended.best
         return {
             "x": unravel(box.value(best.z)),
             "objective": jnp.where(jnp.isfinite(best.objective), best.objective, jnp.nan),
             "worst": best.worst,
-            "ended": carry.ended,
-            "steps": carry.step,
+            "ended": ended.ended,
+            "steps": ended.step,
         }
 
     swept = sweep(search, starts, batch_size=batch_size, folder=folder, progress=progress)

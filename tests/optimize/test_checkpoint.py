@@ -14,7 +14,7 @@ def problem(x):
     return f, jnp.stack([x["a"] ** 2 + x["b"] ** 2 - 1.0, -x["a"] - 1.0, x["b"] - 3.0])
 
 
-def search(num_steps, checkpoint=None, fun=problem, start=0.5, callback=None):
+def search(num_steps, checkpoint=None, fun=problem, start=0.5, callback=None, forward=None):
     bounds = {"lower": {"a": -2.0, "b": -2.0}, "upper": {"a": 2.0, "b": 2.0}}
     return minimize(
         fun,
@@ -25,6 +25,7 @@ def search(num_steps, checkpoint=None, fun=problem, start=0.5, callback=None):
         progress=False,
         callback=callback,
         checkpoint=checkpoint,
+        forward=forward,
     )
 
 
@@ -43,7 +44,7 @@ def whole():
 @pytest.mark.parametrize("killed_after", [0, 7])
 def test_a_killed_search_goes_on_bit_by_bit(tmp_path, whole, killed_after):
     path = tmp_path / "new" / "search.npz"
-    assert whole.reason == "converged" and len(whole.history.objective) > 10
+    assert whole.reason == "converged" and len(whole.history.objective) > 8
 
     def kill(step, *_):
         if step == killed_after:
@@ -65,6 +66,14 @@ def test_more_steps_go_on_from_where_they_ran_out(tmp_path, whole):
     same(search(60, path), whole)
 
 
+def test_in_reverse_mode_too(tmp_path):
+    path = tmp_path / "search.npz"
+    assert search(5, path, forward=False).reason == "steps"
+    same(search(60, path, forward=False), search(60, forward=False))
+    with pytest.raises(ValueError, match="or another mode; name another file"):
+        search(60, path, forward=True)
+
+
 def test_a_half_written_file_does_not_replace_the_last(tmp_path, whole, monkeypatch):
     path = tmp_path / "search.npz"
     search(3, path)
@@ -82,8 +91,8 @@ def test_a_half_written_file_does_not_replace_the_last(tmp_path, whole, monkeypa
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"start": 0.6}, "belongs to another start, other bounds or tolerances, or another"),
-        ({"fun": lambda x: (problem(x)[0], problem(x)[1][:2])}, "another number of constraints"),
+        ({"start": 0.6}, "belongs to another start, other bounds or tolerances, another"),
+        ({"fun": lambda x: (problem(x)[0], problem(x)[1][:2])}, "number of constraints or another mode"),
         ({"fun": lambda x: (2 * problem(x)[0], problem(x)[1])}, "belongs to another `fun`: objective at `x0`"),
     ],
 )

@@ -1,0 +1,141 @@
+"""Steps of an augmented Lagrangian method with one gradient in reverse mode each, for many variables.
+
+The method is L-BFGS of optax on the face of the box in which z may move (Bertsekas 1982, SIAM J. Control Optim.
+20:221), with a backtracking search along the projected path. Each step is one evaluation, accepted or not. Behind a
+constraint that z has not touched L rises steeply, of which the memory knows nothing; so a step that was shortened
+limits the next ones, which may double.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int
+
+from lgsens.optimize import _augmented_lagrangian as outer
+from lgsens.optimize._box import Box
+
+Memory = Any  # optax.ScaleByLBFGSState; its members are declared as any pytree, here they are arrays
+LBFGS: Any = optax.scale_by_lbfgs(memory_size=10)
+
+
+class Carry(NamedTuple):
+    """What one evaluation hands to the next."""
+
+    search: outer.Search
+    z: Float[Array, " n"]  # the last point that was accepted
+    value: Float[Array, ""]  # L there
+    gradient: Float[Array, " n"]  # ∇L there
+    memory: Memory  # of points before z
+    direction: Float[Array, " n"]  # to the trial
+    reach: Float[Array, ""]  # the most that an entry of it may be
+    rejected: Int[Array, ""]  # trials from z
+    fresh: Bool[Array, ""]  # z is to be evaluated anew: L is another one
+
+
+def start(z: Float[Array, " n"], num_constraints: int) -> Carry:
+    """The carry before the first evaluation, which is at z."""
+    return Carry(
+        search=outer.start(z, num_constraints),
+        z=z,
+        value=jnp.full((), jnp.inf, z.dtype),
+        gradient=jnp.zeros_like(z),
+        memory=LBFGS.init(z),
+        direction=jnp.zeros_like(z),
+        reach=jnp.full((), outer.LARGEST_MOVE, z.dtype),
+        rejected=jnp.zeros((), jnp.int32),
+        fresh=jnp.asarray(True),
+    )
+
+
+def make_step(fun: Callable, box: Box, tolerances: tuple[float, float]) -> Callable[[Carry], tuple[Carry, outer.Row]]:
+    """carry ↦ (carry, row): one evaluation of f, g and ∇L, and what follows from it."""
+
+    def step(carry: Carry) -> tuple[Carry, outer.Row]:
+        search = carry.search
+        z = jnp.where(carry.fresh, carry.z, jnp.clip(carry.z + carry.direction, 0.0, 1.0))
+
+        def lagrangian(z):
+            x = box.value(z)
+            f, g = fun(x)
+            pushed = outer.pushed(search, g)
+            return outer.value(search, f / outer.scale(search, f), pushed), (x, f, g, pushed)
+
+        (value, (x, f, g, pushed)), gradient = jax.value_and_grad(lagrangian, has_aux=True)(z)
+        finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(g)) & jnp.all(jnp.isfinite(gradient))
+
+        move = z - carry.z
+        promised = jnp.vdot(carry.gradient, move)
+        enough = value <= carry.value + outer.DECREASE * promised + outer.noise(carry.value)
+        accepted = finite & (carry.fresh | enough)
+        # Since a change of μ its first point is z itself, another one has to follow.
+        trial = outer.Trial(z, x, f, g, gradient, pushed, finite)
+        search, follow, row = outer.advance(search, trial, accepted, tolerances, least=1)
+
+        zero, one = jnp.zeros_like(carry.rejected), jnp.ones_like(carry.rejected)
+        moved = carry._replace(
+            z=z,
+            value=value,
+            gradient=gradient,
+            memory=_next_memory(carry, z, gradient),
+            reach=jnp.where(
+                carry.fresh,
+                carry.reach,
+                jnp.minimum(2 * jnp.where(carry.rejected > 0, jnp.max(jnp.abs(move)), carry.reach), outer.LARGEST_MOVE),
+            ),
+            rejected=zero,
+            fresh=follow,
+        )
+        # The parabola through L, its slope and L at the trial; half where the trial is not finite.
+        ratio = -promised / (2 * (value - carry.value - promised))
+        given_up = carry.rejected >= outer.REJECTIONS
+        stayed = carry._replace(
+            memory=outer.select(given_up, LBFGS.init(z), carry.memory),
+            direction=carry.direction * jnp.where(finite, jnp.clip(ratio, 0.1, 0.5), 0.5),
+            rejected=jnp.where(given_up, zero, carry.rejected + one),
+        )
+        stalled = ~accepted & given_up & (carry.memory.count == 0)
+        after = outer.select(accepted, moved, stayed)
+        after = outer.select(accepted | given_up, after._replace(direction=_direction(after)), after)
+        ended = jnp.where(stalled, outer.STALLED, search.ended)
+        return after._replace(search=search._replace(ended=ended)), row
+
+    return step
+
+
+def _next_memory(carry: Carry, trial, gradient) -> Memory:
+    """The memory of the points before the trial, which was accepted.
+
+    The last of them is z, unless the step shows no positive curvature or is across two Lagrangians. Then the point
+    before z is shifted so that the difference to it stays: the pair of the last step serves once more.
+    """
+    move, change = trial - carry.z, gradient - carry.gradient
+    shifted = carry.memory._replace(params=carry.memory.params + move, updates=carry.memory.updates + change)
+    small = jnp.finfo(move.dtype).eps ** 0.5 * jnp.linalg.norm(move) * jnp.linalg.norm(change)
+    with jax.numpy_dtype_promotion("standard"):  # optax mixes its int32 count with floats
+        _, usual = LBFGS.update(carry.gradient, carry.memory, carry.z)
+    return outer.select(~carry.fresh & (jnp.vdot(move, change) > small), usual, shifted)
+
+
+def _direction(carry: Carry) -> Float[Array, " n"]:
+    """−H ∇L on the face in which z may move, with the pairs of the memory projected on it, no farther than reach."""
+    z, gradient, memory = carry.z, carry.gradient, carry.memory
+    free = jnp.where(((z <= 0) & (gradient > 0)) | ((z >= 1) & (gradient < 0)), 0.0, 1.0)
+    moves, changes = (free[None] * pairs for pairs in (memory.diff_params_memory, memory.diff_updates_memory))
+    curvature = jnp.sum(moves * changes, axis=1)
+    on_face = memory._replace(
+        params=free * memory.params,
+        updates=free * memory.updates,
+        diff_params_memory=moves,
+        diff_updates_memory=changes,
+        weights_memory=jnp.where(curvature > 0, 1.0 / jnp.where(curvature > 0, curvature, 1.0), 0.0),
+    )
+    slope = free * gradient
+    with jax.numpy_dtype_promotion("standard"):
+        scaled, _ = LBFGS.update(slope, on_face, free * z)
+    descends = jnp.vdot(scaled, slope) > 1e-8 * jnp.linalg.norm(scaled) * jnp.linalg.norm(slope)
+    direction = -free * jnp.where(descends & jnp.all(jnp.isfinite(scaled)), scaled, slope)
+    largest = jnp.max(jnp.abs(direction))
+    return direction * jnp.minimum(1.0, carry.reach / jnp.where(largest > 0, largest, 1.0))
