@@ -199,6 +199,7 @@ def test_continued_from_a_state():
 # Error control.
 
 
+@pytest.mark.slow
 def test_error_control():
     """Few output times: each interval is divided as needed. Both modes give the same derivative."""
 

@@ -14,13 +14,6 @@ import jax
 import pytest
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
-SLOW = {
-    "03_quarter_car_design",
-    "04_direct_or_adjoint",
-    "05_speed_or_accuracy",
-    "06_sweeps",
-    "07_your_own_joint_and_force",
-}
 NAMES = sorted(path.stem for path in NOTEBOOKS.glob("*.ipynb"))
 
 
@@ -41,7 +34,7 @@ def run(source, filename, names):
     return None if last is None else eval(compile(ast.Expression(last.value), filename, "eval"), names)
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in SLOW else []) for n in NAMES])
+@pytest.mark.parametrize("name", NAMES)
 def test_a_notebook_runs(name, tmp_path, monkeypatch):
     """And shows figures where they are committed."""
     monkeypatch.chdir(tmp_path)  # where a notebook writes

@@ -42,7 +42,9 @@ def test_values_and_final_state():
     assert run.result == lg.RESULTS.successful and run.stats.converged.shape == (37,)
 
 
-@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev], ids=["forward", "reverse"])
+@pytest.mark.parametrize(
+    "derivative", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev], ids=["forward", "reverse"]
+)
 def test_derivatives(derivative):
     same(derivative(lambda alpha: saved(alpha).values)(0.7), derivative(of_trajectory)(0.7))
 

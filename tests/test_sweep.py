@@ -164,7 +164,12 @@ PUSHES = np.array([0.0, 100.0, 0.0, -200.0])
 
 
 @pytest.mark.parametrize(
-    "kind", ["value", "value and gradient", "gradient only", pytest.param("forward mode", marks=pytest.mark.slow)]
+    "kind",
+    [
+        "value",
+        "gradient only",
+        *(pytest.param(k, marks=pytest.mark.slow) for k in ("value and gradient", "forward mode")),
+    ],
 )
 def test_failed_designs_are_marked_and_the_others_kept(kind):
     fn = {

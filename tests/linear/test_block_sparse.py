@@ -72,6 +72,7 @@ def close(actual, expected, *, ulps):
     np.testing.assert_allclose(actual, expected, rtol=0, atol=ulps * np.finfo(float).eps * scale)
 
 
+@pytest.mark.slow
 def test_matrices_and_their_products(pair):
     """M, K_t, C_t, B: as arrays, times vectors and columns from both sides, times T(x)."""
     dense, sparse, point = pair

@@ -70,6 +70,7 @@ def top(count=3):
     return parts, lg.Model({"top": whole}, pivot("top"), held("top", "top"))
 
 
+@pytest.mark.slow
 def test_motion_is_that_of_the_one_body():
     merged, whole = top()
     assert merged.system().body_names == ("part0 + part1 + part2",)

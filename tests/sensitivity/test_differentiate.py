@@ -46,7 +46,9 @@ def by_jax():
 
 
 @pytest.mark.parametrize(
-    "method", [lg.DirectDifferentiation(), lg.AdjointVariable(), lg.ContinuousAdjoint()], ids=lambda m: type(m).__name__
+    "method",
+    [lg.DirectDifferentiation(), lg.AdjointVariable(), pytest.param(lg.ContinuousAdjoint(), marks=pytest.mark.slow)],
+    ids=lambda m: type(m).__name__,
 )
 def test_structures_and_explicit_parameters(method, by_jax):
     """Nested criteria, F and G of one criterion, both with explicit dependence on p, t, v̇ and λ."""
@@ -75,11 +77,8 @@ def test_with_respect_to_a_whole_model():
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-10 * float(jnp.abs(b).max()))
 
 
-@pytest.mark.parametrize(
-    "method",
-    [lg.DirectDifferentiation(), pytest.param(lg.ContinuousAdjoint(), marks=pytest.mark.slow)],
-    ids=["direct", "continuous"],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [lg.DirectDifferentiation(), lg.ContinuousAdjoint()], ids=["direct", "continuous"])
 def test_start_from_a_given_state(method):
     """`state0` as a function of p: its derivative counts; two runs in a row are one."""
     p = {"alpha0": 0.7, "mass": 15.0, "length": 1.0}

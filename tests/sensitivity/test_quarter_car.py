@@ -44,7 +44,7 @@ def test_static_preload_is_the_reference():
     np.testing.assert_allclose(forces["tyre"].preload, REFERENCE["states"][0]["tire_normal_force"], rtol=1e-10)
 
 
-@pytest.fixture(scope="module", params=["hinged", pytest.param("locked", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=[pytest.param(wheel, marks=pytest.mark.slow) for wheel in ("hinged", "locked")])
 def runs(request):
     """Trajectories and gradients of Ψ₀ at 500 and 1000 steps over 2 s, one wheel kind."""
     wheel = request.param
@@ -79,6 +79,7 @@ def test_joints_hold(runs):
         assert float(jnp.abs(violation).max()) <= 1e-10  # m; the constraint is solved at position level
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runs", ["hinged"], indirect=True)  # the reference has the states of this one
 def test_states_of_the_reference(runs):
     """Spring length, tyre force and wheel centre at the reference's times, second order."""

@@ -55,6 +55,7 @@ def slopes():
     return {name: [float(route(ALPHA, n)) for n in steps[name]] for name, route in routes.items()}
 
 
+@pytest.mark.slow
 def test_the_three_routes_agree(slopes):
     # The same linear systems solved in another order: round-off 2e-16 × 500 steps × condition 5e2 would be
     # 5e-11 at worst; it does not accumulate in one direction, 1e-11 is asked for.
@@ -62,6 +63,7 @@ def test_the_three_routes_agree(slopes):
     np.testing.assert_allclose(slopes["AdjointVariable"], slopes["DDM"][:1], rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_error_and_order(slopes):
     error = np.abs(np.array(slopes["DDM"]) / REFERENCE - 1.0)
     assert error[0] <= 1.1e-4  # h = 2e-3
@@ -97,6 +99,7 @@ def test_scalar_parameters():
         np.testing.assert_allclose(reverse[name], estimate, rtol=1e-8, atol=1e-8 * scale)
 
 
+@pytest.mark.slow
 def test_every_leaf():
     """m, each entry of J, l, initial position, orientation and velocity, pivot and g, each entry of each."""
     angle = 0.3  # a reference orientation that is not the identity
@@ -155,6 +158,7 @@ def test_times_are_differentiated():
         np.testing.assert_allclose(jax.jit(mode(value, argnums=(0, 1)))(*times), estimates, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_taylor_remainder_falls_at_second_order():
     """|Ψ(p + s d) − Ψ(p) − s dΨ·d| ∝ s² in a random direction of the model."""
     model = spinning_top(0.7)
