@@ -15,7 +15,6 @@ import pytest
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 NAMES = sorted(path.stem for path in NOTEBOOKS.glob("*.ipynb"))
-QUICK = ("01_first_gradient", "02_four_bar_in_fifteen_lines")  # the others take one to four minutes each
 
 
 def read(name):
@@ -35,7 +34,7 @@ def run(source, filename, names):
     return None if last is None else eval(compile(ast.Expression(last.value), filename, "eval"), names)
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in QUICK else [pytest.mark.slow]) for n in NAMES])
+@pytest.mark.parametrize("name", NAMES)
 def test_a_notebook_runs(name, tmp_path, monkeypatch):
     """And shows figures where they are committed."""
     monkeypatch.chdir(tmp_path)  # where a notebook writes
