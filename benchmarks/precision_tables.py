@@ -19,19 +19,18 @@ COLUMNS = (
 )
 
 
-def fastest(records: list[dict[str, Any]], level: float, family: str) -> dict[str, Any] | None:
-    """The fastest program of a family, or of all whose name begins so, with an error of at most `level`."""
-    reached = [r for r in records if r["rival"].startswith(family) and r["gradient_error"] <= level]
-    return min(reached, key=lambda r: r["seconds"], default=None)
+def fastest(records: list[dict[str, Any]], level: float) -> dict[str, Any] | None:
+    """The fastest program with an error of at most `level`."""
+    return min((r for r in records if r["gradient_error"] <= level), key=lambda r: r["seconds"], default=None)
 
 
 def _rows(found: dict[str, Any]) -> list[str]:
     records, lines = found["programs"], []
     families = list(dict.fromkeys(r["rival"] for r in records))
     for level in found["levels"]:
-        best = fastest(records, level, "lgsens")
+        best = fastest([r for r in records if r["rival"].startswith("lgsens")], level)
         for family in families:
-            record = fastest(records, level, family)
+            record = fastest([r for r in records if r["rival"] == family], level)
             if record is None:
                 cells = ("not reached", *("–",) * 6)
             else:
@@ -61,6 +60,7 @@ def markdown(document: dict[str, Any]) -> str:
                     "",
                     f"Gradient with respect to {found['parameters']} parameters. Medians of {found['repeats']} rounds; "
                     f"{circumstances(found['environment'])}",
+                    *(f"\nDid not finish: {name}." for name in found.get("failed", ())),
                     "",
                     f"![error against time](results/work_precision_{name}.png)",
                     "",

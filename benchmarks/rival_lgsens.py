@@ -31,8 +31,14 @@ def common_entries(scene: Scene, gradient: lg.Model):
 
 def reference(scene: Scene) -> tuple[float, list[float]]:
     """Ψ and dΨ/dp of the motion itself: the index-reduced equations, by diffrax's Dopri8 at a tolerance of 1e-12 or in
-    the scene's equal steps."""
+    the scene's equal steps; of chains, generalized-α extrapolated from those steps and half of them."""
     body, quantity, axis = scene.observed
+    if scene.reference_route == "extrapolation":
+        assert scene.reference_steps is not None
+        of_steps = lambda p, n: criterion(scene._replace(num_steps=n), scene.model(p))
+        of_p = lambda p: lg.richardson(lambda n: of_steps(p, n), scene.reference_steps).value
+        value, gradient = jax.jit(jax.value_and_grad(of_p))(jnp.asarray(scene.start))
+        return float(value), gradient.tolist()
     if scene.reference_steps is not None:
         psi = lg.Criterion(integrand=lambda s, _: getattr(s.body(body), quantity)[axis] ** 2)
         route = {"num_steps": scene.reference_steps, "integrator": lg.IndexReducedODE(diffrax.Dopri8())}

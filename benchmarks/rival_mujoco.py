@@ -5,6 +5,9 @@ first link; its ball joints on the other four links are `connect` constraints, a
 of two steps), so Ψ is not that of hard joints. Spring, damper and the tyre's stiffness are tendons, the tyre's one a
 kilometre long so that it stays vertical; the bump is a control sequence, constant over a step. `mujoco.rollout` steps
 in C.
+
+The chain is a tree of hinges, without loops, so in MuJoCo's coordinates there are no constraints: RK4 on N angles. Its Ψ
+is the trapezoidal rule with the correction h²/12 of its ends, of fourth order too.
 """
 
 import importlib
@@ -16,6 +19,7 @@ from rival_timing import Program
 
 DEPTH = 1000.0  # m, of the tyre's lower end
 INTEGRATORS = ("implicitfast", "RK4")
+CHAIN_STEPS = {2: 5, 8: 5, 32: 5, 128: 5, 512: 5}  # the fewest of RK4 with at least lgsens's accuracy in Ψ
 
 
 def _text(values) -> str:
@@ -90,8 +94,52 @@ def _xml(scene: Scene, numbers: Numbers, integrator: str) -> str:
     )
 
 
+def _chain_model(mujoco: Any, scene: Scene, numbers: Numbers, num_steps: int) -> Any:
+    spec = mujoco.MjSpec()  # XML may not be nested so deep
+    spec.option.timestep = scene.t1 / num_steps
+    spec.option.gravity = numbers.gravity
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    body, at = spec.worldbody, np.zeros(3)
+    for i, name in enumerate(scene.bodies):
+        body = body.add_body(name=name, pos=numbers.position[i] - at, explicitinertial=True)
+        body.mass, body.ipos, body.iquat = numbers.mass[i], np.zeros(3), np.eye(4)[0]
+        body.inertia, at = np.diag(numbers.inertia[i]), numbers.position[i]
+        hinge = {"pos": numbers.coincident[1][i], "axis": numbers.orthogonal[1][i]}
+        body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, **hinge)
+    for kind in ("FRAMEPOS", "FRAMELINVEL"):
+        kind = getattr(mujoco.mjtSensor, f"mjSENS_{kind}")
+        spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_BODY, objname=scene.observed[0])
+    return spec.compile()
+
+
+def _chain(scene: Scene) -> list[Program]:
+    mujoco: Any = importlib.import_module("mujoco")
+    rollout = importlib.import_module("mujoco.rollout")
+    numbers, axis = scene.arrays(), scene.observed[2]
+    found = []
+    for basis, num_steps in (("equal step", scene.num_steps), ("equal accuracy", CHAIN_STEPS[len(scene.bodies)])):
+        model = _chain_model(mujoco, scene, numbers, num_steps)
+        data = mujoco.MjData(model)
+        data.qvel[0] = numbers.spin[0] @ numbers.orthogonal[1][0]  # the others turn with the first
+        kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        state = np.zeros(mujoco.mj_stateSize(model, kind))
+        mujoco.mj_getState(model, data, state, kind)
+        h = scene.t1 / num_steps
+
+        def call(model=model, data=data, state=state, num_steps=num_steps, h=h):
+            _, sensed = rollout.rollout(model, data, state[None], nstep=num_steps + 1)  # sensors at the start of a step
+            z, rate = sensed[0, :, axis], sensed[0, :, 3 + axis]
+            slope = 2 * z * rate
+            return float(np.trapezoid(z**2, dx=h) - h**2 / 12 * (slope[-1] - slope[0])), None
+
+        found.append(Program("MuJoCo", "RK4, angles", "forward", num_steps, basis, call))
+    return found
+
+
 def programs(scene: Scene) -> list[Program]:
     """Forward simulations; a gradient takes one more for each parameter, by differences."""
+    if scene.name.startswith("chain"):
+        return _chain(scene)
     if scene.name != "quarter_car":
         return []
     mujoco: Any = importlib.import_module("mujoco")

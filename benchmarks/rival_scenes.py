@@ -68,6 +68,7 @@ class Scene(NamedTuple):
     batch: int = 0  # designs in a batch, if batches are measured
     all_numbers: bool = True  # whether the gradient with respect to all numbers is measured
     reference_steps: int | None = None  # equal steps of the reference, where error control would take too long
+    reference_route: str = "index-reduced"  # with those steps; or "extrapolation"
 
     def arrays(self) -> Numbers:
         """The numbers at the start, as NumPy arrays."""
@@ -306,6 +307,8 @@ def chain(num_links: int) -> Scene:
         bodies=tuple(f"link{i}" for i in range(num_links)),
         observed=(f"link{num_links // 2}", "position", 2),
         all_numbers=False,
+        reference_steps=4 * 100,
+        reference_route="extrapolation",
     )
 
 
