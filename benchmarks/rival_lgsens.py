@@ -95,6 +95,13 @@ def programs(scene: Scene) -> list[Program]:
                 **basis,
             )
         )
+    if scene.reduced is not None:
+        smaller = lambda p: psi(scene.model(p, **scene.reduced))
+        basis["basis"] = "equal step, " + ", ".join(f"{key}={value}" for key, value in scene.reduced.items())
+        found += [
+            compiled(smaller, (p,), kind="forward", program="simulate", **basis),
+            compiled(jax.value_and_grad(smaller), (p,), kind="gradient, p", program="jax.value_and_grad", **basis),
+        ]
     if scene.batch:
         designs = p * jnp.linspace(1.0, 1.001, scene.batch)[:, None]
         found.append(

@@ -6,7 +6,7 @@ of two steps), so Ψ is not that of hard joints. Spring, damper and the tyre's s
 kilometre long so that it stays vertical; the bump is a control sequence, constant over a step. `mujoco.rollout` steps
 in C.
 
-The chain is a tree of hinges, without loops, so in MuJoCo's coordinates there are no constraints: RK4 on N angles. Its Ψ
+The chain is a tree of hinges without loops, so in MuJoCo's coordinates there are no constraints: RK4 on N angles. Its Ψ
 is the trapezoidal rule with the correction h²/12 of its ends, of fourth order too.
 """
 

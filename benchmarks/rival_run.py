@@ -90,7 +90,10 @@ def _compare(scene: Scene, records: list[dict[str, Any]], reference: dict[str, A
     """
     if reference is not None and not np.array_equal(reference["p"], scene.start):
         reference = None  # one of other parameters
-    own = {record["kind"]: record for record in records if record["rival"] == "lgsens"}
+    own: dict[str, dict[str, Any]] = {}
+    for record in records:
+        if record["rival"] == "lgsens":
+            own.setdefault(record["kind"], record)  # the first of a kind has the rivals' unknowns
     parts = {"gradient, p": slice(None), f"gradient, p, batch of {scene.batch}": slice(None)}
     parts |= {f"gradient, {name}": list(where) for name, where in scene.subsets}
     for record in records:

@@ -67,6 +67,7 @@ class Scene(NamedTuple):
     subsets: tuple[tuple[str, tuple[int, ...]], ...] = ()  # entries of p for forward mode
     batch: int = 0  # designs in a batch, if batches are measured
     all_numbers: bool = True  # whether the gradient with respect to all numbers is measured
+    reduced: dict[str, str] | None = None  # settings of a model with fewer unknowns
     reference_steps: int | None = None  # equal steps of the reference, where error control would take too long
     reference_route: str = "index-reduced"  # with those steps; or "extrapolation"
 
@@ -232,6 +233,7 @@ def quarter_car(bushings: Sequence[str] = ()) -> Scene:
         observed=("chassis", "acceleration", 2),
         breaks=(0.25,),
         subsets=(("2 parameters", (0, 1)), ("30 hardpoint coordinates", tuple(range(2, 32)))),
+        reduced=None if bushings else {"chassis": "heave", "links": "rods"},
         reference_steps=10_000 if bushings else None,
     )
 
