@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import diffrax
 import jax
 import jax.numpy as jnp
+import numpy as np
 import rival_casadi
 import rival_diffrax
 import rival_sundials
@@ -196,12 +197,16 @@ def run(scenes: Iterable[str], chosen: Sequence[str] | None, repeats: int, path:
                     program.prepare(program)
                 assert program.call is not None
                 try:
-                    program.call()
+                    value, _ = program.show(program.call())
                 except RuntimeError as error:  # SUNDIALS gives up: the others are measured nevertheless
                     failed.append(f"{family}, {program.program}")
                     print(f"{failed[-1]}: {error}", flush=True)
-                else:
+                    continue
+                if np.isfinite(value):
                     programs.append(program)
+                else:
+                    failed.append(f"{family}, {program.program}, {program.num_steps} steps")
+                    print(f"{failed[-1]}: not finite", flush=True)
         records = measure(programs, repeats)
         for record in records:
             record["value_error"] = abs(record["value"] / reference["value"] - 1)
