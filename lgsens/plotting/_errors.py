@@ -145,7 +145,7 @@ def work_precision(
         _target_line(axes, target)
     plain(axes)
     axes.set(xlabel=cost, ylabel=error, title=title)
-    axes.legend(frameon=False, title=None if target is None else "cost at the target")
+    axes.legend(frameon=False, loc="upper right", title=None if target is None else "cost at the target")
     return fig
 
 

@@ -96,7 +96,7 @@ def convergence(history: Any, *, tolerance: float, best: int | None = None, obje
         values = (history.objective, history.worst_constraint, history.gradient_norm)
         for axes, value in zip((top, middle, bottom), values):
             axes.plot(best, value[best], "o", color=COLOURS[2], markersize=8, label="design kept", zorder=3)
-        top.legend(frameon=False)
+        top.legend(frameon=False, loc="upper right")
     labels = (objective, "worst constraint\nover its scale [–]", "projected gradient\nof the Lagrangian [–]")
     for axes, label in zip((top, middle, bottom), labels):
         plain(axes)

@@ -69,7 +69,7 @@ def sensitivities(
     by_body = {"w": np.asarray(system.twists(w)), "v": np.asarray(system.twists(change.v))}
     t = np.asarray(trajectory.t)
 
-    fig = figure(13.0, 0.8 + 2.1 * rows)
+    fig = figure(13.0, 0.8 + 2.3 * rows)
     grid: Any = fig.subplots(rows, COLUMNS, sharex=True, squeeze=False)
     per = parameter.partition(" [")
     unit = f" per {per[2].rstrip(']')}" if per[2] else ""
@@ -79,9 +79,11 @@ def sensitivities(
             axes.plot(t, column, color=CURVES[i % len(CURVES)]["color"], linewidth=1.5, label=component)
         plain(axes)
         axes.margins(x=0)
-        axes.set_title(name, fontsize=10)
+        axes.set_title(name, fontsize=10, pad=18)  # points; the legend is between
         axes.set_ylabel(label, fontsize=9)
-        axes.legend(frameon=False, fontsize=8, ncols=3, handlelength=1.0, loc="best")
+        # over the panel: the search of a place within it takes seconds where trajectories are long
+        place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "borderaxespad": 0.0}
+        axes.legend(frameon=False, fontsize=8, ncols=3, handlelength=1.0, **place)
 
     for row, body in zip(grid, bodies):
         number = system.body_names.index(body)

@@ -61,7 +61,7 @@ def suspension_curves(
     for axes in all_axes[-1]:
         axes.set_xlabel("wheel travel [mm], bump +")
     if len(curves) > 1:
-        all_axes[0, 0].legend(*_of_curves(all_axes[0, 0], curves), frameon=False)
+        all_axes[0, 0].legend(*_of_curves(all_axes[0, 0], curves), frameon=False, loc="lower left")
     if title:
         fig.suptitle(title)
     return fig
