@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from lgsens.dynamics import AbstractSystem, State
-from lgsens.integrate._newton import SLOW, Chord, Constants, Guess, Stats, no_solver, take_step
+from lgsens.integrate._newton import Chord, Constants, Guess, Stats, Wear, no_solver, take_step
 from lgsens.integrate._scheme import GeneralizedAlpha
 from lgsens.integrate._singular import Watch
 
@@ -71,27 +71,26 @@ def integrate_onward(
     iteration matrix is due there, and is not part of the mark.
     """
     constants = Constants.of(system, stabilized=scheme.stabilized)
+    unknowns = system.group.dim + len(system.constraint_names)
 
     def step(carry, n):
-        previous, guess, solver, age, running, watch = carry
-        chord, steps = None, jnp.maximum(age, 1).astype(h.dtype)
+        previous, guess, solver, wear, running, watch = carry
+        chord, steps = None, jnp.maximum(wear.steps, 1).astype(h.dtype)
         if solver is not None:
-            # A matrix that contracts slowly is renewed, unless it was new: then full Newton takes over. In a batch
-            # every lane pays for the slowest; for its full iterations it would pay more.
             due = (jnp.mod(n, scheme.factor_every) == 0) | watch.ends_within(steps + 2.0 * scheme.factor_every)
-            if scheme.iterations is None:  # else by the clock, which is the same in all lanes
-                due = due | ((guess.contraction >= SLOW) & (age > 1))
+            if scheme.iterations is None:
+                due = due | wear.out(unknowns)
             chord = Chord(solver, due)
         t = t0 + (n + 1) * h
         state, guess, stats, chord = take_step(scheme, system, constants, previous, guess, chord, running, t, h)
         if chord is not None:
             solver, made = chord
             watch = jax.tree.map(partial(jnp.where, made), watch.after(stats.margin, steps), watch)
-            age = jnp.where(made, 0, age) + 1
-        return (state, guess, solver, age, stats.converged, watch), (output(state, t), stats)
+            wear = wear.after(made, stats.iterations)
+        return (state, guess, solver, wear, stats.converged, watch), (output(state, t), stats)
 
     count = mark.n + jnp.arange(num_steps, dtype=constants.scale.dtype)
     solver = no_solver(scheme, system, constants, mark.state, t0, h) if scheme.factor_every else None
-    start = (mark.state, mark.guess, solver, jnp.zeros((), jnp.int32), mark.running, mark.watch)
+    start = (mark.state, mark.guess, solver, Wear.unused(), mark.running, mark.watch)
     (state, guess, _, _, running, watch), (outputs, stats) = lax.scan(step, start, count)
     return outputs, Mark(mark.n + num_steps, state, guess, running, watch), stats

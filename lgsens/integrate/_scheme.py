@@ -60,10 +60,11 @@ class GeneralizedAlpha(eqx.Module):
             motion is off by about the last increment times the contraction of one iteration, and so is its derivative,
             which is that of converged steps. Too few feed their error to the steps that follow: at h = 1 ms a top
             takes 2 full ones, or 4 with a matrix up to 20 steps old (with 3 it diverges). None: as many as it takes.
-        factor_every: steps that share one inverse of the iteration matrix (modified Newton). Its iterations cost a
-            tenth of a full one, and go on until the error left is what full Newton would leave; a step that they do
-            not bring there is finished by full Newton. 0: full Newton always. The sensitivities do not depend on it:
-            theirs is always the exact matrix of the converged step.
+        factor_every: the most steps that share one inverse of the iteration matrix (modified Newton); a new one is made
+            earlier where the iterations that it saves are worth it. Its iterations cost a tenth of a full one, and go
+            on until the error left is what full Newton would leave; a step that they do not bring there is finished by
+            full Newton. 0: full Newton always. The sensitivities do not depend on it: theirs is always the exact
+            matrix of the converged step.
         second_order_start: start with a₀ = v̇₀ + (α_m − α_f) h v̈₀, because a_n stands for the acceleration at
             t_n + (α_m − α_f) h, and with v₀ moved by O(h²) along the constraint directions, where the scheme keeps
             it anyway: positions, velocities and multipliers are then second order from the first step.

@@ -19,11 +19,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from lgsens.dynamics import AbstractSystem, State, constraint_jacobian
 from lgsens.integrate._lanes import renewed_where
-from lgsens.integrate._newton import SLOW, Chord, Constants, Guess, Solver, Stats, no_solver, take_step
+from lgsens.integrate._newton import Chord, Constants, Guess, Solver, Stats, Wear, no_solver, take_step
 from lgsens.integrate._scheme import GeneralizedAlpha
 from lgsens.integrate._singular import Watch, margin_by_mass
 
@@ -43,7 +43,7 @@ class _Shared(NamedTuple):
 
     solver: Solver
     h: Float[Array, ""]  # of the step that it was made for
-    age: Int[Array, ""]  # attempts with it
+    wear: Wear  # by attempts
 
 
 class Progress(NamedTuple):
@@ -112,11 +112,13 @@ class UnevenSteps(eqx.Module):
 
     def _not_yet(self, state0: State, t0, h) -> _Shared:
         zeros = no_solver(self.scheme, self.system, self.constants, state0, t0, h)
-        return _Shared(zeros, h, jnp.asarray(self.scheme.factor_every, jnp.int32))
+        return _Shared(zeros, h, Wear.unused())
 
     def _due(self, progress: Progress, shared: _Shared, h):
         """Whether a step of size h wants a new matrix."""
-        old = (shared.age >= self.scheme.factor_every) | ((progress.contraction >= SLOW) & (shared.age > 1))
+        wear = shared.wear
+        unknowns = self.system.group.dim + len(self.system.constraint_names)
+        old = (wear.steps == 0) | (wear.steps >= self.scheme.factor_every) | wear.out(unknowns)
         passed = progress.t + h - progress.watched
         singular = progress.watch.ends_within(passed + 2.0 * self.scheme.factor_every * h)
         return old | singular | (h > _SAME * shared.h) | (_SAME * h < shared.h)
@@ -135,7 +137,7 @@ class UnevenSteps(eqx.Module):
         else:
             made = chord.due
             margin = renewed_where(made, lambda: self._margin(state), jnp.full_like(h, jnp.nan))
-            shared = _Shared(chord.solver, jnp.where(made, h, shared.h), jnp.where(made, 0, shared.age) + 1)
+            shared = _Shared(chord.solver, jnp.where(made, h, shared.h), shared.wear.after(made, stats.iterations))
         return Attempt(state, guess.contraction, stats._replace(margin=margin), shared)
 
     def _predicted(self, progress: Progress, h):

@@ -13,6 +13,7 @@ import lgsens as lg
 from lgsens.dynamics import State
 from lgsens.examples import heavy_top, spatial_chain, spinning_top
 from lgsens.integrate import integrate
+from lgsens.integrate._newton import Wear
 
 HEAVY = json.loads((Path(__file__).parents[1] / "data" / "heavy_top_bruls2012.json").read_text())
 
@@ -130,8 +131,8 @@ def test_modified_newton_is_full_newton(scene, factor_every):
 
 @pytest.mark.parametrize("factor_every", [0, 20])
 def test_what_makes_a_matrix_is_compiled_once(factor_every):
-    """One factorization in the program, of modified and full Newton together. Of the loops that carry its inverse, only
-    that which makes it selects between the lanes of a batch."""
+    """One factorization in the program, of modified and full Newton together. No loop that carries its inverse selects
+    between the lanes of a batch."""
     system, zero = heavy_top().system(), jnp.zeros(6)
     state = State(q=system.reference()[0], v=zero, vdot=zero, lam=zero[:3], a=zero)
     scheme = lg.GeneralizedAlpha(0.9, factor_every=factor_every)
@@ -144,4 +145,19 @@ def test_what_makes_a_matrix_is_compiled_once(factor_every):
         for each in program
         if each.primitive.name == "while" and (1, 2, 9, 9) in [leaf.aval.shape for leaf in each.outvars]
     ]
-    assert carrying == ([(), (1, 2)] if factor_every else [])
+    assert carrying == ([(), ()] if factor_every else [])
+
+
+@pytest.mark.parametrize("unknowns", [5, 40, 1000])
+def test_a_matrix_serves_as_long_as_that_is_cheapest(unknowns):
+    """Iterations that grow by one every third step: the average cost per step is the least of all schedules."""
+    cost = min(20, 4 + unknowns // 5)
+    iterations = [3 + n // 3 for n in range(60)]
+    averages = [(cost + sum(iterations[:n])) / n for n in range(1, 60)]
+    wear, n = Wear.unused(), 0
+    while not wear.out(unknowns):
+        wear = wear.after(n == 0, jnp.asarray(iterations[n], jnp.int32))
+        n += 1
+    best = averages.index(min(averages)) + 1
+    assert 1 < best < 30
+    assert best <= n <= best + 1  # the next step is taken to be like the last one

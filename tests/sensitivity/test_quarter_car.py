@@ -59,6 +59,13 @@ def runs(request):
     return wheel, {n: compute(x, n) for n in (500, 1000)}
 
 
+def test_matrices_serve_many_steps(runs):
+    """Margins are known where a matrix is made: the clock asks for one in 20 steps, the bump for some more."""
+    _, found = runs
+    for num_steps, ((_, trajectory), _) in found.items():
+        assert num_steps / 20 <= np.sum(np.isfinite(trajectory.stats.margin)) <= 2 * num_steps / 20
+
+
 def test_converges_to_the_reference_at_second_order(runs):
     wheel, results = runs
     name = "Psi0" if wheel == "hinged" else "Psi0_locked_wheel"
