@@ -1,8 +1,8 @@
 """The tests run in 64 bits, under JAX's strictest promotion rules.
 
 Nearly all their time is compilation, so XLA's costly optimizations are off, as in JAX's own tests: a third less. So are
-its fusion emitters where they can be (jaxlib 0.10, the last one for Python 3.11; later ones do not know the flag and end
-at it): what is left takes half as long. `pytest --optimized` compiles as users do.
+its fusion emitters where they can be (jaxlib 0.10, the last one for Python 3.11; later ones do not know the flag and
+end at it): what is left takes half as long. `pytest --optimized` compiles as users do.
 """
 
 import os
