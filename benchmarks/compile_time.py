@@ -7,22 +7,27 @@
 Each program is traced and compiled in a process of its own, as a session meets it: first with an empty cache, which it
 fills, then again with what the first has left. The gradient is that of Ψ, the integral of the square of an
 acceleration, by all numbers of the model. Processor time stands beside wall time: other load on the machine changes it
-least. "trace" is what no cache saves: Python that makes the program. Writes compile_time.json.
+least. "trace" is what no cache saves: Python that makes the program. Where XLA knows the option (jaxlib 0.10), a third
+process compiles without XLA's fusion emitters, `XLA_FLAGS=--xla_cpu_use_fusion_emitters=false`, which compiles faster
+what then runs slower: "runs" is the median of 20 runs of 100 steps. Writes compile_time.json.
 """
 
+import importlib.metadata
 import json
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-from benchmark import circumstances, environment, options, write
+from benchmark import SINGLE_THREAD, circumstances, environment, interleaved, options, write
 
 SCENES = ("top", "four_bar", "quarter_car", "chain_2", "chain_8", "chain_32")
 PROGRAMS = ("simulate", "value_and_grad")
 STEPS = 100  # a scan: compile time does not depend on it
+LEAN = "--xla_cpu_use_fusion_emitters=false"
 
 
 def compile_once(scene: str, program: str) -> dict:
@@ -55,32 +60,39 @@ def compile_once(scene: str, program: str) -> dict:
     begin, cpu_begin = time.perf_counter(), time.process_time()
     lowered = jax.jit(function).lower(model)
     traced = time.perf_counter()
-    lowered.compile()
-    return {
+    compiled = lowered.compile()
+    found = {
         "trace_seconds": traced - begin,
         "seconds": time.perf_counter() - begin,
         "cpu_seconds": time.process_time() - cpu_begin,
     }
+    jax.block_until_ready(compiled(model))
+    times = interleaved({program: lambda: jax.block_until_ready(compiled(model))}, 20)[program]
+    return found | {"run_seconds": statistics.median(times.cpu)}
 
 
 def measure(scene: str) -> dict:
-    """The programs of a scene, each in two processes that share a cache."""
+    """The programs of a scene, each in two processes that share a cache, and in one without emitters."""
     found = {}
     for program in PROGRAMS:
+
+        def run(settings: dict[str, str], program=program) -> str:
+            command = [sys.executable, __file__, "--one", scene, program]
+            own = os.environ | SINGLE_THREAD | settings
+            return subprocess.run(command, env=own, check=True, capture_output=True, text=True).stdout
+
         with tempfile.TemporaryDirectory() as cache:
             settings = {
                 "JAX_COMPILATION_CACHE_DIR": cache,
                 "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
                 "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
             }
-            command = [sys.executable, __file__, "--one", scene, program]
-            runs = [
-                subprocess.run(command, env=os.environ | settings, check=True, capture_output=True, text=True).stdout
-                for _ in range(2)
-            ]
+            runs = [run(settings) for _ in range(2)]
             size = sum(path.stat().st_size for path in Path(cache).rglob("*") if path.is_file())
-        first, again = (json.loads(run.splitlines()[-1]) for run in runs)
-        found[program] = {"first": first, "again": again, "cache_bytes": size}
+        if importlib.metadata.version("jaxlib").startswith("0.10."):
+            runs.append(run({"XLA_FLAGS": f"{SINGLE_THREAD['XLA_FLAGS']} {LEAN}"}))
+        first, again, *lean = (json.loads(text.splitlines()[-1]) for text in runs)
+        found[program] = {"first": first, "again": again, "cache_bytes": size} | ({"lean": lean[0]} if lean else {})
         print(f"{scene}, {program}: {first['seconds']:.1f} s, again {again['seconds']:.1f} s", flush=True)
     return found
 
@@ -89,12 +101,13 @@ def markdown(document: dict) -> str:
     lines = [
         circumstances(document["environment"]),
         "",
-        "| scene | program | compile [s] (CPU) | of it trace [s] | cached [s] (CPU) | ratio | cache [MB] |",
-        "|---|---|---|---|---|---|---|",
+        "| scene | program | compile [s] (CPU) | of it trace [s] | cached [s] (CPU) | ratio | cache [MB] "
+        "| runs [ms] | without emitters: compile [s] (CPU) | runs [ms] |",
+        "|---" * 10 + "|",
     ]
     for scene, programs in document["scenes"].items():
         for program, found in programs.items():
-            first, again = found["first"], found["again"]
+            first, again, lean = found["first"], found["again"], found.get("lean")
             cells = (
                 scene,
                 program,
@@ -103,6 +116,9 @@ def markdown(document: dict) -> str:
                 f"{again['seconds']:.1f} ({again['cpu_seconds']:.1f})",
                 f"{first['seconds'] / again['seconds']:.1f}",
                 f"{found['cache_bytes'] / 1e6:.1f}",
+                f"{1e3 * first['run_seconds']:.2f}",
+                f"{lean['seconds']:.1f} ({lean['cpu_seconds']:.1f})" if lean else "–",
+                f"{1e3 * lean['run_seconds']:.2f}" if lean else "–",
             )
             lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
@@ -123,7 +139,7 @@ def main() -> None:
     if not (arguments.table or arguments.readme):
         for scene in arguments.scenes:
             document["scenes"][scene] = measure(scene)
-            document["environment"] = environment()
+            document["environment"] = environment(SINGLE_THREAD)
             write(path, document)
     text = markdown(document)
     if arguments.readme:

@@ -11,8 +11,10 @@ from rival_timing import Program, compiled
 
 import lgsens as lg
 
+FEW_STEPS = 6  # extrapolated, a hundred times as accurate on the chains as generalized-α's own 100
 
-def criterion(scene: Scene, model: lg.Model):
+
+def criterion(scene: Scene, model):
     """Ψ."""
     trajectory = lg.simulate(model, t1=scene.t1, num_steps=scene.num_steps, throw=False)
     body, quantity, axis = scene.observed
@@ -29,16 +31,23 @@ def common_entries(scene: Scene, gradient: lg.Model):
     return jnp.stack([*(gradient.bodies[name].mass for name in scene.bodies), *rates])
 
 
+def _system(scene: Scene):
+    """The equations of motion, made of p outside of any compiled program, and what makes of a gradient with respect to
+    all of their numbers that with respect to p."""
+    system, pull_back = eqx.filter_vjp(lambda p: scene.model(p).system(), jnp.asarray(scene.start))
+    return system, lambda gradient: pull_back(gradient)[0]
+
+
 def reference(scene: Scene) -> tuple[float, list[float]]:
     """Ψ and dΨ/dp of the motion itself: the index-reduced equations, by diffrax's Dopri8 at a tolerance of 1e-12 or in
     the scene's equal steps; of chains, generalized-α extrapolated from those steps and half of them."""
     body, quantity, axis = scene.observed
     if scene.reference_route == "extrapolation":
         assert scene.reference_steps is not None
-        of_steps = lambda p, n: criterion(scene._replace(num_steps=n), scene.model(p))
-        of_p = lambda p: lg.richardson(lambda n: of_steps(p, n), scene.reference_steps).value
-        value, gradient = jax.jit(jax.value_and_grad(of_p))(jnp.asarray(scene.start))
-        return float(value), gradient.tolist()
+        system, pull_back = _system(scene)
+        of_steps = lambda n: eqx.filter_value_and_grad(partial(criterion, scene._replace(num_steps=n)))
+        found = lg.richardson(lambda n: eqx.filter_jit(of_steps(n))(system), scene.reference_steps).value
+        return float(found[0]), pull_back(found[1]).tolist()
     if scene.reference_steps is not None:
         psi = lg.Criterion(integrand=lambda s, _: getattr(s.body(body), quantity)[axis] ** 2)
         route = {"num_steps": scene.reference_steps, "integrator": lg.IndexReducedODE(diffrax.Dopri8())}
@@ -56,13 +65,29 @@ def reference(scene: Scene) -> tuple[float, list[float]]:
     return float(found.value), [float(g) for g in found.gradient]
 
 
+def _programs_of_system(scene: Scene, basis: dict) -> list[Program]:
+    """Ψ and its gradient for p, by the scene's steps and extrapolated from a few."""
+    system, pull_back = _system(scene)
+    few = lambda system: lg.richardson(lambda n: criterion(scene._replace(num_steps=n), system), FEW_STEPS).value
+    shorter = {"rival": "lgsens", "num_steps": 3 * FEW_STEPS, "basis": f"{FEW_STEPS} and {2 * FEW_STEPS} steps"}
+    found = []
+    for function, title, settings in ((partial(criterion, scene), "simulate", basis), (few, "richardson", shorter)):
+        gradient, of_gradient = eqx.filter_value_and_grad(function), f"filter_value_and_grad of {title}"
+        found += [
+            compiled(function, (system,), kind="forward", program=title, **settings),
+            compiled(gradient, (system,), kind="gradient, p", program=of_gradient, select=pull_back, **settings),
+        ]
+    return found
+
+
 def programs(scene: Scene) -> list[Program]:
     """Ψ; its gradient by reverse mode for all numbers and for p; by forward mode for parts of p."""
     p = jnp.asarray(scene.start)
-    model = eqx.filter_jit(scene.model)(p)
     psi = partial(criterion, scene)
     psi_of_p = lambda p: psi(scene.model(p))
     basis = {"rival": "lgsens", "num_steps": scene.num_steps, "basis": "equal step"}
+    if scene.of_system:
+        return _programs_of_system(scene, basis)
 
     def part(indices):
         index = jnp.asarray(indices)
@@ -77,7 +102,7 @@ def programs(scene: Scene) -> list[Program]:
         found.append(
             compiled(
                 eqx.filter_value_and_grad(psi),
-                (model,),
+                (eqx.filter_jit(scene.model)(p),),
                 kind="gradient, all numbers",
                 program="eqx.filter_value_and_grad",
                 select=partial(common_entries, scene),

@@ -70,6 +70,7 @@ class Scene(NamedTuple):
     reduced: dict[str, str] | None = None  # settings of a model with fewer unknowns
     reference_steps: int | None = None  # equal steps of the reference, where error control would take too long
     reference_route: str = "index-reduced"  # with those steps; or "extrapolation"
+    of_system: bool = False  # programs of the equations; what makes them of p is too long to be compiled with them
 
     def arrays(self) -> Numbers:
         """The numbers at the start, as NumPy arrays."""
@@ -311,6 +312,7 @@ def chain(num_links: int) -> Scene:
         all_numbers=False,
         reference_steps=4 * 100,
         reference_route="extrapolation",
+        of_system=True,
     )
 
 

@@ -1,15 +1,13 @@
 """Designs per second of a sweep against the size of its batches: the top and the quarter-car, value and gradient.
 
-`python benchmarks/sweep.py` writes benchmarks/results/sweep.json, scene by scene, and prints the table of
-benchmarks/README.md. Each size is a compiled batch, run `REPEATS` times after a warm-up; medians, compilation apart.
-`--devices 2` splits the processor into that many devices of JAX.
+    python benchmarks/sweep.py [--scenes …] [--sizes …] [--devices 2] [--out benchmarks/results]
+    python benchmarks/sweep.py --readme   # the table of sweep.json, into benchmarks/README.md; measures nothing
+
+Each size is a compiled batch; medians of `--repeats` runs after a warm-up, compilation apart. `--devices 2` splits the
+processor into that many devices of JAX. Writes sweep.json, scene by scene, and prints a table.
 """
 
-import argparse
-import importlib.metadata
 import json
-import os
-import platform
 import statistics
 import time
 from collections.abc import Callable
@@ -19,14 +17,13 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
+from benchmark import circumstances, environment, options, write
+from rival_tables import put_into
 from tqdm import tqdm
 
 import lgsens as lg
 from lgsens._batches import compile_batch, trace
 from lgsens.examples import QuarterCar, spinning_top
-
-RESULTS = Path(__file__).parent / "results" / "sweep.json"
-REPEATS = 5
 
 
 class Scene(NamedTuple):
@@ -52,7 +49,7 @@ def quarter_car(damping):
 
 SCENES = {
     "top": Scene(top, 0.5, 1.0, 200, (1, 16, 64, 128, 256, 1024)),
-    "quarter_car": Scene(quarter_car, 2000.0, 8000.0, 100, (1, 16, 64, 128)),
+    "quarter_car": Scene(quarter_car, 2000.0, 8000.0, 100, (1, 4, 16, 128, 1024)),
 }
 
 
@@ -60,7 +57,7 @@ KINDS = {"value": lambda criterion: criterion, "value and gradient": jax.value_a
 UNITS = {"designs/s": "designs_per_second", "µs per step": "us_per_step", "kB per design": "kilobytes_per_design"}
 
 
-def measure(scene: Scene, kind: str, devices) -> list[dict]:
+def measure(scene: Scene, kind: str, devices, repeats: int) -> list[dict]:
     """One row for each size of a batch."""
     traced = trace(KINDS[kind](scene.criterion), np.ones(1))
     rows = []
@@ -70,7 +67,7 @@ def measure(scene: Scene, kind: str, devices) -> list[dict]:
         program = compile_batch(traced, np.ones(size), size, size, devices)
         designs = [np.linspace(scene.low, scene.high, program.size)]
         seconds = []
-        for _ in range(1 + REPEATS):
+        for _ in range(1 + repeats):
             started = time.perf_counter()
             _, ok = program.run(designs)
             seconds.append(time.perf_counter() - started)
@@ -96,41 +93,37 @@ def table(scenes: dict) -> str:
         for value, gradient in zip(*scene["rows"].values()):
             cells = [f"{row[key]:.3g}" for row in (value, gradient) for key in UNITS.values()]
             lines.append(f"| {scene['name']} | {scene['devices']} | {value['size']} | {' | '.join(cells)} |")
-    notes = [
-        f"{scene['name']}, devices: {scene['devices']}: {scene['date']}, {scene['machine']}, {scene['cores']} cores, "
-        f"load average {scene['load']:.1f}; jax {scene['jax']}, lgsens {scene['lgsens']}."
-        for scene in scenes.values()
-    ]
+    notes = [f"{name} device(s): {circumstances(scene['environment'])}" for name, scene in scenes.items()]
     return "\n".join([*lines, "", *notes])
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__)
     parser.add_argument("--devices", type=int, default=1, help="devices of JAX on this processor")
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
     parser.add_argument("--sizes", nargs="+", type=int, help="sizes of batches, in place of each scene's own")
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_num_cpu_devices", options.devices)
-    scenes = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
-    for name in options.scenes:
-        scene = SCENES[name]
-        if options.sizes:
-            scene = scene._replace(sizes=tuple(options.sizes))
-        scenes[f"{name}, {options.devices}"] = {
-            "name": name,
-            "date": time.strftime("%Y-%m-%d"),
-            "machine": platform.machine(),
-            "cores": os.cpu_count(),
-            "devices": options.devices,
-            "load": os.getloadavg()[0],
-            "python": platform.python_version(),
-            **{package: importlib.metadata.version(package) for package in ("lgsens", "jax", "jaxlib", "numpy")},
-            "repeats": REPEATS,
-            "rows": {kind: measure(scene, kind, jax.devices()) for kind in KINDS},
-        }
-        RESULTS.write_text(json.dumps(scenes, indent=1), encoding="utf-8")
-    print(table(scenes))
+    parser.add_argument("--readme", action="store_true", help="put the table of sweep.json into benchmarks/README.md")
+    arguments = parser.parse_args()
+    path = arguments.out / "sweep.json"
+    scenes = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    if not arguments.readme:
+        jax.config.update("jax_enable_x64", True)
+        jax.config.update("jax_num_cpu_devices", arguments.devices)
+        for name in arguments.scenes:
+            scene = SCENES[name]
+            if arguments.sizes:
+                scene = scene._replace(sizes=tuple(arguments.sizes))
+            scenes[f"{name}, {arguments.devices}"] = {
+                "name": name,
+                "devices": arguments.devices,
+                "environment": environment(),
+                "rows": {kind: measure(scene, kind, jax.devices(), arguments.repeats) for kind in KINDS},
+            }
+            write(path, scenes)
+    text = table(scenes)
+    if arguments.readme:
+        put_into(Path(__file__).parent / "README.md", text, "sweeps")
+    print(text)
 
 
 if __name__ == "__main__":
