@@ -111,14 +111,21 @@ SCENES = {
 }
 
 
+def rounded_anew(system, seed: int):
+    """Every number, or the one before or after it."""
+    rng = np.random.default_rng(seed)
+    return jax.tree.map(lambda leaf: leaf * (1.0 + EPS * rng.integers(-1, 2, leaf.shape)), system)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_gradients_by_every_number_are_those_of_double_precision(name):
     """Of motion and of accelerations: reverse mode by all numbers, and forward mode along one direction.
 
     Accelerations carry the round-off of constraints over βh², and their derivatives by places that joints must meet
-    carry it again: there two programs in double precision, of modified and of full Newton, differ by more than 1e-9,
-    and mixed precision may by ten times as much.
+    carry it again. What double precision leaves open there is seen where the numbers of the scene are rounded anew, and
+    in full Newton: 1e-8 to 1.3e-6 of the largest derivative of the chain, in 14 such programs; in as many of mixed
+    precision, too. One draw may be a hundredth of another, the largest of three a tenth.
     """
     scene, body, num_steps, h, solver = SCENES[name]
 
@@ -141,10 +148,11 @@ def test_gradients_by_every_number_are_those_of_double_precision(name):
         )
 
     double, mixed = (dataclasses.replace(scene().system(), linear_solver=solver(mixed=own)) for own in (False, True))
-    expected, other, found = (jax.device_get(run(*own)) for own in ((double, 20), (double, 0), (mixed, 20)))
-    for wanted, again, actual in zip(expected, other, found):
+    programs = (double, 20), (double, 0), (rounded_anew(double, 1), 20), (rounded_anew(double, 2), 20), (mixed, 20)
+    expected, *others, found = (jax.device_get(run(*own)) for own in programs)
+    for wanted, actual, *again in zip(expected, found, *others):
         for i, share in enumerate((0.0, 10.0)):  # motion; accelerations
-            own = np.abs(wanted[i] - again[i]).max()
+            own = max(np.abs(wanted[i] - other[i]).max() for other in again)
             assert np.abs(wanted[i] - actual[i]).max() <= max(1e-9 * np.abs(wanted[i]).max(), share * own)
     # and mixed precision was at work: other round-off
     assert np.any(found[1] != expected[1])
