@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.extend
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
+from jax.extend.core import jaxpr_as_fun, jaxprs_in_params
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
@@ -23,8 +23,10 @@ from lgsens._trajectory import Saved, Trajectory
 from lgsens.dynamics import RESULTS
 
 AXIS = "designs"
-# The most lanes per device. A CPU gains nothing beyond its caches (`benchmarks/sweep.py`); elsewhere memory decides.
-LANES = {"cpu": 256}
+# The most lanes per device. What the lanes of a batch carry around their loops should stay in the caches of a core
+# (`benchmarks/sweep.py`: 256 tops of 2 kB and 16 quarter-cars of 119 kB are the fastest); elsewhere memory decides.
+CACHE = 2 * 2**20  # bytes
+LANES = 256
 LANES_ELSEWHERE = 8192
 FREE_SHARE = 0.5  # of the memory that is free, what a batch may take
 
@@ -62,12 +64,25 @@ class Traced(NamedTuple):
     Attributes:
         run: the leaves of a design ↦ the leaves of its values, and whether it succeeded as the last.
         shapes: the values of one design, a pytree of shapes and dtypes.
+        carried: what a turn of its largest loop reads [bytes].
         seconds: wall time [s].
     """
 
     run: Callable[..., list[jax.Array]]
     shapes: PyTree
+    carried: int
     seconds: float
+
+
+def _carried(jaxpr: Any) -> int:
+    """The bytes that a turn of the largest loop in a program reads: what it carries, and its share of what it scans."""
+    largest = 0
+    for equation in jaxpr.eqns:
+        inner = list(jaxprs_in_params(equation.params))
+        if equation.primitive.name in ("scan", "while"):
+            largest = max(largest, *(sum(v.aval.size * v.aval.dtype.itemsize for v in body.invars) for body in inner))
+        largest = max([largest, *map(_carried, inner)])
+    return largest
 
 
 def trace(fn: Callable[[PyTree], PyTree], designs: PyTree) -> Traced:
@@ -84,7 +99,8 @@ def trace(fn: Callable[[PyTree], PyTree], designs: PyTree) -> Traced:
     started = time.perf_counter()
     with failures_as_nan():
         jaxpr, (shapes, _) = jax.make_jaxpr(single, return_shape=True)(*one)
-    return Traced(jax.extend.core.jaxpr_as_fun(jaxpr), shapes, time.perf_counter() - started)
+    run = jaxpr_as_fun(jaxpr)
+    return Traced(run, shapes, _carried(jaxpr.jaxpr), time.perf_counter() - started)
 
 
 def compile_batch(
@@ -108,7 +124,9 @@ def compile_batch(
         return spread.lower(*shapes).compile()
 
     started = time.perf_counter()
-    lanes = LANES.get(devices[0].platform, LANES_ELSEWHERE)
+    lanes = LANES_ELSEWHERE
+    if devices[0].platform == "cpu":
+        lanes = min(LANES, max(1, CACHE // max(traced.carried, 1)))
     size = even(count, batch_size or lanes * len(devices), len(devices))
     program = compiled(size)
     if batch_size is None:

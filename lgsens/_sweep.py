@@ -92,8 +92,8 @@ def sweep(
         designs: a pytree whose arrays have a leading axis N (a `Model` made under `jax.vmap` is one), or a list of N
             pytrees of one structure.
         batch_size: the most designs computed at once, on all devices together; rounded up to a multiple of their
-            number. None: at most 256 per CPU device, where larger batches gain nothing, 8192 per other device, and no
-            more than fit into half of the memory that is free.
+            number. None: per CPU device as many as carry 2 MiB around their loops, at most 256, since larger batches
+            leave its caches; 8192 per other device; and no more than fit into half of the memory that is free.
         folder: where to keep the results as they come, a folder of `.npy` files. If it is there already, with the same
             designs, the sweep continues where it stopped; the arrays of the result are then mapped from its
             files. To recognize the results of another `fn`, one of its designs is computed again. None: in memory.

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import EPS, close, everything, random_point, says
+from helpers import EPS, close, equations, everything, random_point, says
 from jaxtyping import Array, Float
 
 import lgsens as lg
@@ -52,17 +52,9 @@ def test_hand_derived_rule_on_every_joint_and_force():
 
 def factorizations(function, *arguments) -> list[tuple[int, ...]]:
     """The shapes of the matrices that a program factorizes."""
-
-    def walk(jaxpr):
-        for equation in jaxpr.eqns:
-            if equation.primitive.name in ("cholesky", "lu", "qr"):
-                yield equation.invars[0].aval.shape
-            for value in jax.tree.leaves(equation.params, is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")):
-                inner = getattr(value, "jaxpr", value)
-                if hasattr(inner, "eqns"):
-                    yield from walk(inner)
-
-    return list(walk(jax.make_jaxpr(function)(*arguments).jaxpr))
+    program = jax.make_jaxpr(function)(*arguments).jaxpr
+    kinds = ("cholesky", "lu", "qr")
+    return [each.invars[0].aval.shape for each in equations(program) if each.primitive.name in kinds]
 
 
 # A mass on a circle, as a system of a user's own: small enough for everything that compiles often.

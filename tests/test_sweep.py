@@ -219,6 +219,20 @@ def test_batches_are_even(count, largest, devices, size):
     assert _batches.even(count, largest, devices) == size
 
 
+def test_batches_fit_into_caches():
+    """A loop that carries 100 kB, reads 8 B of what it scans, and has a smaller one in it."""
+
+    def fn(x):
+        inner = lambda total: jax.lax.fori_loop(0, 3, lambda _, y: jnp.sqrt(1.0 + y), total)
+        turn = lambda carry, add: (carry + inner(add), None)
+        return jnp.sum(jax.lax.scan(turn, x * jnp.ones(12_500), jnp.ones(1000))[0])
+
+    carried = _batches.trace(fn, np.ones(1)).carried
+    assert 100_000 < carried < 100_100
+    found = lg.sweep(fn, np.ones(30), progress=False)
+    assert found.batch_size == 15  # two batches of at most 2 MiB/100 kB = 20
+
+
 def test_batches_fit_into_memory(monkeypatch):
     """A program for 256 lanes of 8 kB and more, and a machine with 200 kB, half of which a batch may take."""
     free = 200e3

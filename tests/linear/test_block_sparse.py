@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import equations
 
 import lgsens as lg
 from lgsens.dynamics import initial_state, is_redundant, tangents, times_tangent_operator
@@ -188,15 +189,6 @@ def test_nothing_dense_in_a_long_chain():
         if hasattr(variable.aval, "shape")
     ]
     assert max(sizes) < k * k
-
-
-def equations(jaxpr):
-    for equation in jaxpr.eqns:
-        yield equation
-        for value in jax.tree.leaves(equation.params, is_leaf=lambda x: hasattr(x, "jaxpr") or hasattr(x, "eqns")):
-            inner = getattr(value, "jaxpr", value)
-            if hasattr(inner, "eqns"):
-                yield from equations(inner)
 
 
 def two_hinges(*, apart: bool) -> lg.Model:

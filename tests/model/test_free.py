@@ -16,8 +16,7 @@ from free_scenes import (
     random_free_point,
     with_all_freedoms,
 )
-from helpers import close, everything
-from jax.extend.core import jaxprs_in_params
+from helpers import close, equations, everything
 
 import lgsens as lg
 from lgsens.dynamics import autodiff_tangents
@@ -115,11 +114,7 @@ def test_mass_matrix_is_the_hessian_of_kinetic_energy(system):
 
 def shapes(jaxpr):
     """The shapes of all arrays in a jaxpr, also in those inside it."""
-    for equation in jaxpr.eqns:
-        for variable in equation.outvars:
-            yield getattr(variable.aval, "shape", ())
-        for inner in jaxprs_in_params(equation.params):
-            yield from shapes(inner)
+    return [getattr(variable.aval, "shape", ()) for each in equations(jaxpr) for variable in each.outvars]
 
 
 def test_nothing_of_the_six_coordinates_is_traced():
