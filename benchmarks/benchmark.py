@@ -36,6 +36,9 @@ SINGLE_THREAD = {
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
 }
+# the same, and loops whose turns read less than 10 MB become functions (README, "Small scenes on a CPU")
+ONE_FUNCTION = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000"
+WHOLE_LOOPS = SINGLE_THREAD | {"XLA_FLAGS": f"{SINGLE_THREAD['XLA_FLAGS']} {ONE_FUNCTION}"}
 
 
 class Times(NamedTuple):

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 import rival_lgsens
-from benchmark import SINGLE_THREAD, environment, write
+from benchmark import WHOLE_LOOPS, environment, write
 from rival_scenes import SCENES, Scene
 from rival_timing import measure
 
@@ -48,7 +48,7 @@ def run(
     for name in scenes:
         scene = SCENES[name]()
         found = _scene(scene, present, kinds, repeats)
-        found["environment"] = environment(SINGLE_THREAD)
+        found["environment"] = environment(WHOLE_LOOPS)
         document = _read(path)
         document["scenes"][name] = found
         write(path, document)

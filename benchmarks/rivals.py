@@ -5,10 +5,10 @@
     python benchmarks/rivals.py --table            # the last run's tables as Markdown; measures nothing
 
 The rivals are in benchmarks/requirements.txt; one that is not installed is left out. Every program is compiled or built
-and called once; then the programs take turns, `--repeats` rounds, and medians count. All of them run on one thread. Ψ
-and its gradients are compared with the index-reduced equations at a tolerance of 1e-12 where `--references` has been
-run, else with lgsens, so that nobody measures other work. Writes rivals.json (scenes that are not run keep their
-numbers there) and prints the tables.
+and called once; then the programs take turns, `--repeats` rounds, and medians count. All of them run on one thread,
+those of JAX with loops as functions (`benchmark.WHOLE_LOOPS`). Ψ and its gradients are compared with the index-reduced
+equations at a tolerance of 1e-12 where `--references` has been run, else with lgsens, so that nobody measures other
+work. Writes rivals.json (scenes that are not run keep their numbers there) and prints the tables.
 
 "equal step": the step of lgsens. "equal accuracy": steps that reach at least lgsens's accuracy in Ψ.
 """
@@ -18,7 +18,7 @@ import json
 import os
 from pathlib import Path
 
-from benchmark import SINGLE_THREAD, options
+from benchmark import WHOLE_LOOPS, options
 
 SCENES = ("top", "quarter_car", "stiff_quarter_car", *(f"chain_{n}" for n in (2, 8, 32, 128, 512)))
 RIVALS = ("plain_jax", "exudyn", "casadi", "diffrax", "mujoco")
@@ -34,7 +34,7 @@ def main() -> None:
     parser.add_argument("--readme", action="store_true", help="as --table, and put them into benchmarks/README.md")
     arguments = parser.parse_args()
     path = arguments.out / "rivals.json"
-    os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
+    os.environ.update(WHOLE_LOOPS)  # before jax and numpy are imported
     tables = importlib.import_module("rival_tables")
     if not (arguments.table or arguments.readme):
         run = importlib.import_module("rival_run")

@@ -167,9 +167,7 @@ def test_gradient_of_every_leaf():
         scale = np.abs(estimate).max()
         if scale <= 10 * noise:
             silent.add(name)
-        np.testing.assert_allclose(
-            exact, estimate, rtol=0, atol=1e-6 * scale if scale > 10 * noise else noise, err_msg=name
-        )
+        np.testing.assert_allclose(exact, estimate, rtol=0, atol=max(1e-6 * scale, noise), err_msg=name)
     assert silent == WITHOUT_EFFECT
 
 
