@@ -45,6 +45,8 @@ def compile_once(scene: str, program: str) -> dict:
         model = four_bar()
     elif scene == "quarter_car":
         model = QuarterCar.load().model()
+    elif scene == "reduced_car":
+        model = QuarterCar.load().model(wheel="locked", chassis="heave", links="rods")
     else:
         model = spatial_chain(int(scene.removeprefix("chain_")))
     observed = sorted(model.bodies)[0]

@@ -82,6 +82,8 @@ class _State(NamedTuple):
 def minimum(model: PenaltyModel) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """The d of least q, and q there."""
     lower, upper = model.lower, model.upper
+    # A step up to a bound may end short of it; the next one would then have no length, and end the search.
+    round_off = 4 * jnp.finfo(lower.dtype).eps * jnp.maximum(jnp.abs(lower), jnp.abs(upper))
 
     def improve(state: _State) -> _State:
         d, held = state.d, state.held
@@ -92,8 +94,9 @@ def minimum(model: PenaltyModel) -> tuple[Float[Array, " n"], Float[Array, ""]]:
         promised = -jnp.vdot(direction, gradient)
         first = jnp.maximum(state.first, promised)
 
-        leaving = ((d <= lower) & (direction < 0)) | ((d >= upper) & (direction > 0))
-        inward = held & (((d <= lower) & (gradient < 0)) | ((d >= upper) & (gradient > 0)))
+        low, high = d <= lower + round_off, d >= upper - round_off
+        leaving = (low & (direction < 0)) | (high & (direction > 0))
+        inward = held & ((low & (gradient < 0)) | (high & (gradient > 0)))
         blocked = jnp.any(leaving)
         done = (promised <= ACCURACY * first) & ~blocked
 
