@@ -85,10 +85,11 @@ def environment(threads: Mapping[str, str] | None = None) -> dict[str, Any]:
 def circumstances(found: Mapping[str, Any]) -> str:
     """A line of what `environment` found."""
     versions = ", ".join(f"{package} {version}" for package, version in found["versions"].items())
-    machine = found["machine"]
+    machine, threads = found["machine"], found["threads"]
+    how = (", one thread" if threads else "") + (", loops as functions" if ONE_FUNCTION in str(threads) else "")
     return (
         f"{found['date']}, {machine['architecture']}, {machine['cores']} cores, load average "
-        f"{found['load_average']}{', one thread' if found['threads'] else ''}; {versions}."
+        f"{found['load_average']}{how}; {versions}."
     )
 
 
