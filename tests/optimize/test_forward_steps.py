@@ -140,7 +140,7 @@ def test_many_starts_at_once():
     assert found.objective[0] == pytest.approx(alone.objective, rel=1e-5)
 
 
-@pytest.mark.parametrize("seed", [*range(4), 61, 103])  # 61, 103: a step ends one round-off short of a bound
+@pytest.mark.parametrize("seed", [*range(4), 103, 150])  # 103, 150: a step ends one round-off short of a bound
 def test_the_minimum_of_the_model(seed):
     """Against L-BFGS-B of SciPy, and by its conditions: q is convex."""
     random = np.random.default_rng(seed)
