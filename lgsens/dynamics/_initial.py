@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from lgsens.dynamics._matrices import ConstrainedMass, constraint_jacobian, factorized
+from lgsens.dynamics._matrices import ConstrainedMass, constraint_jacobian, factorized, for_once
 from lgsens.dynamics._redundant import softness
 from lgsens.dynamics._results import RESULTS
 from lgsens.dynamics._state import State
@@ -145,7 +145,7 @@ def is_redundant(system: AbstractSystem, jacobian: Matrix) -> Bool[Array, ""]:
     above it. Sparse: the complements of [[I, B̂ᵀ], [B̂, 0]], B̂ with unit rows, are −R_ii² or combinations of them;
     round-off leaves nothing of those below eps^0.8.
     """
-    jacobian = lax.stop_gradient(jacobian)
+    (jacobian,) = for_once(lax.stop_gradient(jacobian))
     if not isinstance(jacobian, SparseMatrix):
         return independence(jacobian) < jnp.finfo(jacobian.dtype).eps ** 0.6
     dtype, ones = jacobian.dtype, jnp.ones(jacobian.shape[1], jacobian.dtype)

@@ -14,6 +14,8 @@ from lgsens.dynamics._state import Tangents
 from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem
 from lgsens.linear import LU, Factors, Matrix, SparseMatrix
 
+_FEW = 200  # unknowns: an LU of 0.3 ms
+
 
 def _sparse(system: AbstractSystem) -> AbstractSparseSystem | None:
     """The system, if its linear solver is sparse."""
@@ -82,6 +84,12 @@ def factorized(
     return Factors.of(dynamic, upper, lower, scale, plan=plan, kind=kind, softness=softness, mixed=mixed)
 
 
+def for_once(*matrices: Matrix) -> tuple[Matrix, ...]:
+    """Matrices that are factorized once in a run, as arrays where that takes less than the blocks take to compile."""
+    few = sum(matrix.shape[0] for matrix in matrices) <= _FEW
+    return tuple(m.dense() if few and isinstance(m, SparseMatrix) else m for m in matrices)
+
+
 def kkt_solve(mass, jacobian, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
     """Solve [[M, Bᵀ], [B, 0]] [x; λ] = [force; rate], constraint rows and multipliers scaled to M."""
     k, m = mass.shape[0], jacobian.shape[0]
@@ -113,7 +121,7 @@ class ConstrainedMass(eqx.Module):
         soft = softness(system)
         if factors is not None or (_sparse(system) is None and soft is None):
             return cls(mass, jacobian, factors, soft is not None)
-        fixed, border = lax.stop_gradient((mass, jacobian))
+        fixed, border = for_once(*lax.stop_gradient((mass, jacobian)))
         factors = factorized(system, fixed, border.T, border, mass_scale(mass), softness=soft)
         return cls(mass, jacobian, factors, soft is not None)
 

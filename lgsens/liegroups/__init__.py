@@ -12,5 +12,7 @@ from ._rotation import (
     cross as cross,
     nearest_rotation as nearest_rotation,
     skew as skew,
+    turn as turn,
+    turn_back as turn_back,
     unskew as unskew,
 )

@@ -59,18 +59,32 @@ def unskew(X: Float[Array, "3 3"]) -> Float[Array, "3"]:
     return 0.5 * jnp.stack([X32 - X23, X13 - X31, X21 - X12])
 
 
+# Products this small are sums written out, which become part of the loops around them. As a `dot` each is an operation
+# of its own, and a step is as slow as it has operations; in float32 it may be rounded to TF32 on a GPU, and a rotation
+# would not stay one. As a reduction XLA hands those of many bodies to YNNPACK, at 20 ns per number: half of the time of
+# a residual of 512 links (jax 0.10).
+
+
 def _matmul(A, B):
-    # Matrices this small are faster as a fused sum of products than as a `dot`. Moreover a `dot` in float32
-    # may be rounded to TF32 on a GPU: three digits, and a rotation would not stay one.
-    return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)
-
-
-def _matvec(A, x):
-    return jnp.sum(A * x[None, :], axis=1)
+    return _sum(*(lax.slice_in_dim(A, i, i + 1, axis=1) * lax.slice_in_dim(B, i, i + 1, axis=0) for i in range(3)))
 
 
 def _dot(x, y):
-    return jnp.sum(x * y)
+    return _sum(*(a * b for a, b in zip(_components(x), _components(y))))
+
+
+def turn(rotation: Float[Array, "3 3"], x: Float[Array, "3"]) -> Float[Array, "3"]:
+    """`R x`, shape (3,), for any matrix R."""
+    return _sum(*(lax.index_in_dim(rotation, i, 1, keepdims=False) * x_i for i, x_i in enumerate(_components(x))))
+
+
+def turn_back(rotation: Float[Array, "3 3"], x: Float[Array, "3"]) -> Float[Array, "3"]:
+    """`R^T x`, shape (3,), for any matrix R."""
+    return _sum(*(lax.index_in_dim(rotation, i, 0, keepdims=False) * x_i for i, x_i in enumerate(_components(x))))
+
+
+def _sum(a, b, c):
+    return a + b + c
 
 
 def _exp(x):
@@ -87,7 +101,7 @@ def _quaternion(R):
     rows = jnp.eye(4, dtype=R.dtype) + linear
     row = lax.dynamic_index_in_dim(rows, jnp.argmax(jnp.diagonal(rows)), keepdims=False)
     # Of the two quaternions ±p, the one with θ ≤ π. At θ = π both have cos θ/2 = 0 and this picks one.
-    return row * lax.rsqrt(_dot(row, row)) * jnp.where(row[0] < 0.0, -1.0, 1.0).astype(R.dtype)
+    return row * lax.rsqrt(jnp.sum(row * row)) * jnp.where(row[0] < 0.0, -1.0, 1.0).astype(R.dtype)
 
 
 def _log(R):
@@ -151,10 +165,10 @@ class SO3(AbstractLieGroup):
 
     def Ad_inv_mv(self, q, w):
         """`D(R) w = R^T w`: inertial-frame components to body-frame components."""
-        return _matvec(q.T, w)
+        return turn_back(q, w)
 
     def Ad_inv_rmv(self, q, w):
-        return _matvec(q, w)
+        return turn(q, w)
 
     def tangent_mv(self, x, y):
         """`T(x) = I - (1 - cos θ)/θ² x~ + (θ - sin θ)/θ³ x~²`, applied to `y`."""

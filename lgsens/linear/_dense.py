@@ -17,8 +17,8 @@ class LU(eqx.Module):
 
     @classmethod
     def of(cls, matrix) -> "LU":
-        lu, _, permutation = lax.linalg.lu(matrix)
-        return cls(lu, permutation)
+        lu, pivots, _ = lax.linalg.lu(matrix)
+        return cls(lu, _permutation(pivots))
 
     def solve(self, rhs, *, transposed: bool = False):
         """S⁻¹ rhs or S⁻ᵀ rhs, one column or several."""
@@ -37,6 +37,23 @@ class LU(eqx.Module):
         return columns.reshape(rhs.shape)
 
 
+def _permutation(pivots: Int[Array, " n"], *, inverse: bool = False) -> Int[Array, " n"]:
+    """The rows of P S in S (or those of S in P S), from LAPACK's exchanges of rows.
+
+    JAX's own are eight operations for each row, which took a third of a gradient with few steps at a time. Without
+    scatters the exchanges can be one function of XLA's.
+    """
+    size = pivots.shape[0]
+    places = jnp.arange(size, dtype=pivots.dtype)
+
+    def exchange(i, rows):
+        first = size - 1 - i if inverse else i
+        second = pivots[first]
+        return jnp.where(places == first, rows[second], jnp.where(places == second, rows[first], rows))
+
+    return lax.fori_loop(0, size, exchange, places)
+
+
 class Inverse(eqx.Module):
     """S⁻¹ itself, for the iterations of many steps: a product with it costs a tenth of two triangular solves.
 
@@ -48,12 +65,12 @@ class Inverse(eqx.Module):
 
     @classmethod
     def of(cls, matrix) -> "Inverse":
-        lu, _, permutation = lax.linalg.lu(matrix)
+        lu, pivots, _ = lax.linalg.lu(matrix)
         # P S = L U, so S⁻ᵀ = Pᵀ L⁻ᵀ U⁻ᵀ
         eye = jnp.eye(lu.shape[0], dtype=lu.dtype)
         rows = lax.linalg.triangular_solve(lu, eye, left_side=True, lower=False, transpose_a=True)
         rows = lax.linalg.triangular_solve(lu, rows, left_side=True, lower=True, transpose_a=True, unit_diagonal=True)
-        return cls(rows[jnp.argsort(permutation)])
+        return cls(rows[_permutation(pivots, inverse=True)])
 
     def solve(self, rhs, *, transposed: bool = False):
         """S⁻¹ rhs or S⁻ᵀ rhs, one column or several."""

@@ -22,7 +22,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.linear._ordering import Level
-from lgsens.linear._sparse import added
+from lgsens.linear._sparse import added, chosen
 
 
 class Elimination:
@@ -103,11 +103,50 @@ class Elimination:
 
     def blocks(self, entries, i: int):
         """S₁₁, S₁₂ and S₂₁ of level i."""
+        return self.first(entries[self._starts[2 * i] :], i)[0]
+
+    def first(self, entries, i: int):
+        """S₁₁, S₁₂ and S₂₁ of level i, and the entries after them, from the entries of this level and later ones."""
         own, boundary = self.levels[i]
         count, p, q = len(own), own.shape[1], boundary.shape[1]
-        start, middle, end = self._starts[2 * i : 2 * i + 3]
-        rows = entries[start:middle].reshape(count, p, p + q)
-        return rows[:, :, :p], rows[:, :, p:], entries[middle:end].reshape(count, q, p)
+        middle, end = np.cumsum(_sizes(own, boundary))
+        rows = entries[:middle].reshape(count, p, p + q)
+        return (rows[:, :, :p], rows[:, :, p:], entries[middle:end].reshape(count, q, p)), entries[end:]
+
+    @cached_property
+    def coupled(self) -> list[np.ndarray]:
+        """Of each level, where S₂₁ S₁₁⁻¹ S₁₂ goes among the entries after the level, shape (clusters q q)."""
+        found = []
+        for i, (_, boundary) in enumerate(self.levels):
+            q = boundary.shape[1]
+            across = np.broadcast_to(boundary[:, None, :], (len(boundary), q, q))
+            places = self.places(np.swapaxes(across, 1, 2).ravel(), across.ravel())
+            found.append(np.where(places < 0, -1, places - self._starts[2 * i + 2]))
+        return found
+
+    @cached_property
+    def order(self) -> np.ndarray:
+        """The unknowns as they are eliminated, level after level, and then the rest; −1 where one only fills up."""
+        order = np.concatenate([*(own.ravel() for own, _ in self.levels), self.rest])
+        return np.where(order == self.size, -1, order)
+
+    @cached_property
+    def position(self) -> np.ndarray:
+        """Where each unknown is in that order."""
+        found = np.zeros(self.size, np.int32)
+        real = np.flatnonzero(self.order >= 0)
+        found[self.order[real]] = real
+        return found
+
+    @cached_property
+    def boundaries(self) -> list[np.ndarray]:
+        """Of each level, where its boundary is among the unknowns after the level, in their order; −1: fills up."""
+        found, end = [], 0
+        for own, boundary in self.levels:
+            end += own.size
+            places = np.append(self.position, -1)[boundary]
+            found.append(np.where(places < 0, -1, places - end))
+        return found
 
 
 def _sizes(own, boundary) -> tuple[int, int]:
@@ -131,9 +170,8 @@ class BlockMatrix(eqx.Module):
 
     @classmethod
     def of(cls, plan: Elimination, values, rows: np.ndarray, columns: np.ndarray) -> "BlockMatrix":
-        filling = plan.filling()
-        given = (values, plan.places(rows, columns))
-        return cls(added([given, (jnp.ones(len(filling), values.dtype), filling)], plan.numbers, values.dtype), plan)
+        entries = jnp.zeros(plan.numbers, values.dtype).at[plan.places(rows, columns)].add(values)
+        return cls(entries.at[plan.filling()].set(1.0), plan)
 
     @property
     def dtype(self):
@@ -173,33 +211,36 @@ class BlockFactors(eqx.Module):
         """`kind`: LU or Inverse, for the rest."""
         entries, plan = matrix.entries, matrix.plan
         eliminated = []
-        for i, (_, boundary) in enumerate(plan.levels):
-            pivot, right, left = plan.blocks(entries, i)
+        for i, places in enumerate(plan.coupled):
+            (pivot, right, left), entries = plan.first(entries, i)
             inverse = inverses(pivot)
             level = Eliminated(inverse, inverse @ right, left @ inverse)
             eliminated.append(level)
-            q = boundary.shape[1]
-            across = np.broadcast_to(boundary[:, None, :], (len(boundary), q, q))
-            places = plan.places(np.swapaxes(across, 1, 2).ravel(), across.ravel())
-            entries = entries.at[places[places >= 0]].add(-(level.left @ right).ravel()[np.flatnonzero(places >= 0)])
-        return cls(tuple(eliminated), kind.of(matrix.rest(entries)), plan)
+            there = np.flatnonzero(places >= 0)
+            entries = entries.at[places[there]].add(-(level.left @ right).ravel()[there])
+        return cls(tuple(eliminated), kind.of(entries.reshape(2 * (len(plan.rest),))), plan)
 
     def solve(self, rhs, *, transposed: bool = False):
-        """S⁻¹ rhs or S⁻ᵀ rhs, one column or several."""
+        """S⁻¹ rhs or S⁻ᵀ rhs, one column or several.
+
+        What a level leaves is the end of a vector in the order of elimination: no level touches those before it.
+        """
         if rhs.ndim == 2:
             return jax.vmap(lambda column: self.solve(column, transposed=transposed), in_axes=1, out_axes=1)(rhs)
-        b = jnp.concatenate([rhs, jnp.zeros(1, rhs.dtype)])
-        for level, (own, boundary) in zip(self.eliminated, self.plan.levels):
+        b, known = chosen(rhs, self.plan.order), []
+        for level, (own, _), boundary in zip(self.eliminated, self.plan.levels, self.plan.boundaries):
             left = _turned(level.right) if transposed else level.left
-            b = b.at[boundary.ravel()].add(-_product(left, b[own]).ravel())
-        if len(self.plan.rest):
-            b = b.at[self.plan.rest].set(self.rest.solve(b[self.plan.rest], transposed=transposed))
-        for level, (own, boundary) in reversed(list(zip(self.eliminated, self.plan.levels))):
+            known.append(b[: own.size].reshape(own.shape))
+            b = b[own.size :]
+            b = b - added([(_product(left, known[-1]), boundary)], len(b), b.dtype)
+        x = self.rest.solve(b, transposed=transposed) if len(b) else b
+        for level, own, boundary in reversed(list(zip(self.eliminated, known, self.plan.boundaries))):
             inverse, right = (
                 (_turned(level.inverse), _turned(level.left)) if transposed else (level.inverse, level.right)
             )
-            b = b.at[own.ravel()].set((_product(inverse, b[own]) - _product(right, b[boundary])).ravel())
-        return b[:-1]
+            own = _product(inverse, own) - _product(right, chosen(x, boundary))
+            x = jnp.concatenate([own.ravel(), x])
+        return x[self.plan.position]
 
 
 def inverses(blocks: Float[Array, "c p p"]) -> Float[Array, "c p p"]:

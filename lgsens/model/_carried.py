@@ -12,9 +12,9 @@ from typing import TypeVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from lgsens.liegroups import cross
+from lgsens.liegroups import cross, turn, turn_back
 from lgsens.model._constraints import AbstractConstraint, Coincidence, Distance, InPlane, Orthogonality
-from lgsens.model._frames import BODY_A, BODY_B, ROTATION, Frame, turn, turn_back
+from lgsens.model._frames import BODY_A, BODY_B, ROTATION, Frame
 from lgsens.model._loads import AbstractLoad, PointForce, SpringDamperLoad, TyreLoad
 
 Element = TypeVar("Element", AbstractConstraint, AbstractLoad)
@@ -77,6 +77,10 @@ class _CarriedConstraint(AbstractConstraint):
     @property
     def num_rows(self):
         return self.element.num_rows
+
+    @property
+    def relative(self):
+        return self.element.relative
 
     def value(self, a, b):
         return self.element.value(_frame(a, self.a), _frame(b, self.b))

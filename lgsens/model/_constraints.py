@@ -33,6 +33,12 @@ class AbstractConstraint(eqx.Module):
     def num_rows(self) -> int:
         """Number of scalar equations."""
 
+    @property
+    def relative(self) -> bool:
+        """Whether Φ depends on nothing but the pose of one body as seen from the other, as in a joint: it then takes as
+        many directions from either body while the other one is held, which the linear solver makes use of."""
+        return False
+
     @abc.abstractmethod
     def value(self, a: Frame, b: Frame) -> Float[Array, " rows"]:
         """Φ at the given poses, zero when satisfied."""
@@ -64,6 +70,10 @@ class Coincidence(AbstractClosedFormConstraint):
     def num_rows(self):
         return 3
 
+    @property
+    def relative(self):
+        return True
+
     def value(self, a, b):
         return b.point(self.point_b) - a.point(self.point_a)
 
@@ -91,6 +101,10 @@ class Orthogonality(AbstractClosedFormConstraint):
     @property
     def num_rows(self):
         return 1
+
+    @property
+    def relative(self):
+        return True
 
     def value(self, a, b):
         return jnp.sum(a.axis(self.axis_a) * b.axis(self.axis_b))[None]
@@ -134,6 +148,10 @@ class InPlane(AbstractClosedFormConstraint):
     def num_rows(self):
         return 1
 
+    @property
+    def relative(self):
+        return True
+
     def value(self, a, b):
         return jnp.sum(a.axis(self.axis_a) * (b.point(self.point_b) - a.point(self.point_a)))[None]
 
@@ -173,6 +191,10 @@ class Distance(AbstractClosedFormConstraint):
     @property
     def num_rows(self):
         return 1
+
+    @property
+    def relative(self):
+        return True
 
     def value(self, a, b):
         d = b.point(self.point_b) - a.point(self.point_a)

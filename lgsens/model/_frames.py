@@ -10,25 +10,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens.liegroups import cross, skew
+from lgsens.liegroups import cross, skew, turn, turn_back
 
 BODY_A, BODY_B = slice(0, 6), slice(6, 12)
 ROTATION = slice(3, 6)  # within one body
 ROTATION_A, TRANSLATION_B, ROTATION_B = slice(3, 6), slice(6, 9), slice(9, 12)  # within an element's 12
-
-
-# Written out, products of 3 × 3 matrices become part of the loops around them; as dots each is an operation of its own,
-# and a step is as slow as it has operations.
-
-
-def turn(rotation: Float[Array, "3 3"], x: Float[Array, "3"]) -> Float[Array, "3"]:
-    """R x."""
-    return jnp.sum(rotation * x[None, :], axis=1)
-
-
-def turn_back(rotation: Float[Array, "3 3"], x: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Rᵀ x."""
-    return jnp.sum(rotation * x[:, None], axis=0)
 
 
 class Frame(NamedTuple):

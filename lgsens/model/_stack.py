@@ -52,7 +52,8 @@ class Stack(eqx.Module, Generic[Element]):
 
     @property
     def ends(self) -> Ends:
-        return Ends(self.a, self.b, self.owners, self.kept)
+        relative = isinstance(self.elements, AbstractConstraint) and self.elements.relative
+        return Ends(self.a, self.b, self.owners, self.kept, relative)
 
     def map(self, function, q, *per_side, extra: Sequence[Any] = ()):
         """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra)` for every element.

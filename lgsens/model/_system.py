@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import suggestion
 from lgsens.dynamics import AbstractRedundantSystem, AbstractSparseSystem, Tangents, least_norm
-from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew
+from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew, turn
 from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, chosen
 from lgsens.model._constraints import AbstractConstraint
-from lgsens.model._frames import ROTATION, turn
+from lgsens.model._frames import ROTATION
 from lgsens.model._loads import AbstractLoad
 from lgsens.model._parts import Parts
 from lgsens.model._stack import (

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lgsens.liegroups import Poses
-from lgsens.linear import AbstractLinearSolver, Elimination, Pattern, elimination
+from lgsens.linear import AbstractLinearSolver, Elimination, Graph, Joint, Pattern, elimination
 from lgsens.model._frames import ROTATION
 
 
@@ -17,6 +17,7 @@ class Ends(NamedTuple):
     b: tuple[int, ...] | None
     owners: tuple[str, ...]
     kept: tuple[tuple[bool, ...], ...]
+    relative: bool = False  # of constraints, as in `AbstractConstraint`
 
     @property
     def slots(self) -> np.ndarray:
@@ -53,29 +54,37 @@ class Topology:
         return Pattern(coordinates, coordinates, ends.slots)
 
     @cached_property
-    def _graph(self):
-        """Nodes, neighbours and prerequisites for the elimination: bodies first, joints after the bodies they join."""
+    def _graph(self) -> Graph:
+        """Bodies, and after them joints, for the elimination."""
         k = int((self.index >= 0).sum())
         count = len(self.index)
-        joints = sorted({owner for ends in self._constraints for owner in ends.owners})
-        number = {name: count + i for i, name in enumerate(joints)}
-        nodes = [list(own[own >= 0]) for own in self.index] + [[] for _ in joints]
+        names = sorted({owner for ends in self._constraints for owner in ends.owners})
+        number = {name: count + i for i, name in enumerate(names)}
+        nodes = [list(own[own >= 0]) for own in self.index] + [[] for _ in names]
         near: list[set[int]] = [set() for _ in nodes]
-        after: dict[int, set[int]] = {node: set() for node in number.values()}
+        joints = {node: Joint(frozenset(), grounded=False, relative=True) for node in number.values()}
         for ends, rows in zip(self._constraints, self.rows):
             for owner, bodies, own in zip(ends.owners, ends.slots.tolist(), rows):
-                nodes[number[owner]].extend(k + own[own >= 0])
-                after[number[owner]].update(bodies)
-                _join(near, {number[owner], *bodies})
+                node = number[owner]
+                nodes[node].extend(k + own[own >= 0])
+                known = joints[node]
+                joints[node] = Joint(
+                    known.bodies | set(bodies), known.grounded or len(bodies) == 1, known.relative and ends.relative
+                )
+                _join(near, {node, *bodies})
         for ends in self._loads:
             for bodies in ends.slots.tolist():
                 _join(near, set(bodies))
-        return nodes, near, after
+        for node, joint in joints.items():  # of two bodies or of one and the ground, no more
+            if len(joint.bodies) + joint.grounded > 2:
+                joints[node] = joint._replace(relative=False)
+        whole = frozenset(body for body, own in enumerate(self.index) if (own >= 0).all())
+        return Graph(nodes, near, joints, whole)
 
     def elimination(self, solver: AbstractLinearSolver | None) -> Elimination | None:
         """The plan of the linear solver, made once; None: a dense one. `solver` None: the cheaper one."""
         if solver not in self._plans:
-            self._plans[solver] = elimination(solver, *self._graph)
+            self._plans[solver] = elimination(solver, self._graph)
         return self._plans[solver]
 
 

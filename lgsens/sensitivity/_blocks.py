@@ -12,7 +12,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-_NUMBERS = 2**17  # of the factors of a block: 1 MB in double precision, what stays in a core's cache
+# Of the factors of a block: 128 kB in double precision, so that those of a batch of trajectories stay in a core's cache
+# too. With 2**17, alone as fast, 16 quarter-cars at once took 149 instead of 110 µs per step and gradient.
+_NUMBERS = 2**14
 _LONGEST = 64
 
 

@@ -13,9 +13,10 @@ from helpers import equations
 import lgsens as lg
 from lgsens.dynamics import initial_state, is_redundant, tangents, times_tangent_operator
 from lgsens.dynamics._matrices import ConstrainedMass
-from lgsens.examples import four_bar, spatial_chain
+from lgsens.examples import QuarterCar, four_bar, spatial_chain
 from lgsens.integrate import factorize_iteration_matrix
 from lgsens.linear import LU, Inverse
+from lgsens.linear._ordering import levels
 
 H = 1e-3
 
@@ -130,6 +131,33 @@ def test_everything_is_eliminated_once():
     plan = systems("branched")[1].elimination
     gone = np.concatenate([level.own.ravel() for level in plan.levels] + [plan.rest])
     np.testing.assert_array_equal(np.sort(gone[gone < plan.size]), np.arange(plan.size))
+
+
+@pytest.mark.parametrize("name", ["branched", "chain", "four_bar", "suspension"])
+@pytest.mark.parametrize("early", [False, True])
+def test_joints_go_with_bodies_that_hold_them(name, early):
+    """Rows of B of joints that are gone are independent in the columns of bodies that are gone, level after level."""
+    system = (SCENES | {"suspension": lambda: QuarterCar.load().model()})[name]().system()
+    rows_of_all = np.asarray(system.constraint_jacobian(system.reference()[0]))
+    k = rows_of_all.shape[1]
+    gone, incomplete = np.zeros(0, int), False
+    for own, _ in levels(system.topology._graph, early=early):
+        gone = np.append(gone, own[own < sum(rows_of_all.shape)])
+        rows, columns = rows_of_all[gone[gone >= k] - k], gone[gone < k]
+        assert np.linalg.matrix_rank(rows[:, columns]) == len(rows)
+        incomplete |= bool(np.delete(rows, columns, axis=1).any())
+    assert len(gone) == sum(rows_of_all.shape)
+    # the bodies of the four-bar have three coordinates: a joint may take less from one of them than from both
+    assert incomplete == (early and name != "four_bar")
+
+
+def test_a_link_goes_with_one_of_its_joints():
+    plan = QuarterCar.load().model().system().elimination
+    ((own, boundary),) = plan.levels
+    assert own.shape == (6, 10)  # five links with a universal joint of 4 rows, and the wheel
+    # the chassis, the knuckle and the 3 rows of the joint there
+    assert boundary.shape == (6, 15)
+    assert len(plan.rest) == 93 - 5 * 10 - 6
 
 
 def objective(body: str):
