@@ -32,6 +32,7 @@ from lgsens._trajectory import (
     Trajectory as Trajectory,
 )
 from lgsens._uneven_runs import GivenSteps as GivenSteps
+from lgsens._xla import without_ynn_fusions
 from lgsens.criteria import Criterion as Criterion, soft_maximum as soft_maximum, time_integral as time_integral
 from lgsens.dynamics import RESULTS as RESULTS, AbstractSystem as AbstractSystem, State as State
 from lgsens.integrate import AdaptiveSteps as AdaptiveSteps, GeneralizedAlpha as GeneralizedAlpha
@@ -73,6 +74,8 @@ _NAMESPACES = (
     "plotting",
     "testing",
 )  # imported when first used: optax and matplotlib take their time
+
+without_ynn_fusions()
 
 
 def __getattr__(name: str):

@@ -71,6 +71,12 @@ NUMBERS = {
 WRONG_CONSTRAINTS = {
     "sign of one entry of B": (Coincidence, {"jacobian": wrong_sign}, {"B"}, "[1, ry_a]"),
     "an entry of the force": (Orthogonality, {"force": wrong_force}, {"Bᵀλ"}, "[ry_b]: 0, not"),
+    "a coupling left out": (
+        Orthogonality,
+        {"coupled": property(lambda self: ((3, 4, 5), (9, 10, 11)))},
+        {"K = ∂(Bᵀλ)/∂x"},
+        "rx_b]: 0, not",
+    ),
     "stiffness transposed": (Coincidence, {"geometric_stiffness": unsymmetric}, {"K = ∂(Bᵀλ)/∂x"}, "K = ∂(Bᵀλ)/∂x"),
 }
 

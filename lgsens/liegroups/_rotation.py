@@ -1,10 +1,8 @@
 """The rotation group SO(3)."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from ._base import AbstractLieGroup
@@ -61,57 +59,26 @@ def unskew(X: Float[Array, "3 3"]) -> Float[Array, "3"]:
     return 0.5 * jnp.stack([X32 - X23, X13 - X31, X21 - X12])
 
 
-# Products this small are sums written out, which become part of the loops around them. As a `dot` each is an operation
-# of its own, and a step is as slow as it has operations; in float32 it may be rounded to TF32 on a GPU, and a rotation
-# would not stay one. As a reduction XLA hands those of many bodies to YNNPACK, at 20 ns per number: half of the time of
-# a residual of 512 links (jax 0.10).
+# Products this small are fused sums of products. As a `dot` each is an operation of its own, and a step is as slow as
+# it has operations; in float32 it may be rounded to TF32 on a GPU, and a rotation would not stay one.
 
 
 def _matmul(A, B):
-    return _sum(*(lax.slice_in_dim(A, i, i + 1, axis=1) * lax.slice_in_dim(B, i, i + 1, axis=0) for i in range(3)))
+    return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)
 
 
 def _dot(x, y):
-    return _sum(*(a * b for a, b in zip(_components(x), _components(y))))
+    return jnp.sum(x * y)
 
 
-@jax.custom_jvp
 def turn(rotation: Float[Array, "3 3"], x: Float[Array, "3"]) -> Float[Array, "3"]:
     """`R x`, shape (3,), for any matrix R."""
-    return _sum(*(lax.index_in_dim(rotation, i, 1, keepdims=False) * x_i for i, x_i in enumerate(_components(x))))
+    return jnp.sum(rotation * x[None, :], axis=1)
 
 
-@jax.custom_jvp
 def turn_back(rotation: Float[Array, "3 3"], x: Float[Array, "3"]) -> Float[Array, "3"]:
     """`R^T x`, shape (3,), for any matrix R."""
-    return _sum(*(lax.index_in_dim(rotation, i, 0, keepdims=False) * x_i for i, x_i in enumerate(_components(x))))
-
-
-def _with_reductions(product, axis: int):
-    """The derivative of `turn` by reductions, whose transposes are three operations each; those of slices are padded
-    sums, and made the compilation of a gradient by hardpoints 15 s longer (of 56)."""
-
-    def reduced(rotation, x):
-        return jnp.sum(rotation * jnp.expand_dims(x, 1 - axis), axis=axis)
-
-    def rule(primals, tangents):
-        (rotation, x), (d_rotation, dx) = primals, tangents
-        changes = []
-        if not isinstance(d_rotation, SymbolicZero):
-            changes.append(reduced(d_rotation, x))
-        if not isinstance(dx, SymbolicZero):
-            changes.append(reduced(rotation, dx))
-        return product(rotation, x), changes[0] if len(changes) == 1 else changes[0] + changes[1]
-
-    product.defjvp(rule, symbolic_zeros=True)
-
-
-_with_reductions(turn, axis=1)
-_with_reductions(turn_back, axis=0)
-
-
-def _sum(a, b, c):
-    return a + b + c
+    return jnp.sum(rotation * x[:, None], axis=0)
 
 
 def _exp(x):
@@ -128,7 +95,7 @@ def _quaternion(R):
     rows = jnp.eye(4, dtype=R.dtype) + linear
     row = lax.dynamic_index_in_dim(rows, jnp.argmax(jnp.diagonal(rows)), keepdims=False)
     # Of the two quaternions ±p, the one with θ ≤ π. At θ = π both have cos θ/2 = 0 and this picks one.
-    return row * lax.rsqrt(jnp.sum(row * row)) * jnp.where(row[0] < 0.0, -1.0, 1.0).astype(R.dtype)
+    return row * lax.rsqrt(_dot(row, row)) * jnp.where(row[0] < 0.0, -1.0, 1.0).astype(R.dtype)
 
 
 def _log(R):

@@ -22,7 +22,7 @@ class Pattern:
     """Where the blocks of one stack are; static, and equal only to itself: make it once for each topology.
 
     rows: (E, r) integers, columns: (E, c) integers, −1 for a row or column that the matrix does not have.
-    slots: (E, c/6) the bodies of the columns, six for each, where they belong to bodies.
+    slots: (E, b) the bodies of the columns, where they belong to bodies: six for each, or its three rotations.
     """
 
     def __init__(self, rows: np.ndarray, columns: np.ndarray, slots: np.ndarray | None = None):
@@ -122,16 +122,16 @@ class SparseMatrix(eqx.Module):
         return self._with(scaled)
 
     def times_rotations(self, operators: Float[Array, "N 3 3"]) -> "SparseMatrix":
-        """A diag(I, operator_1, I, operator_2, …): an operator for the three last of the six columns of each body."""
+        """A diag(I, operator_1, I, operator_2, …): an operator for the three last of the columns of each body."""
         parts = []
         for part in self.parts:
             slots = part.pattern.slots
             assert slots is not None, "the columns of this matrix do not belong to bodies"
-            split = part.values.reshape(*part.values.shape[:2], slots.shape[1], 6)
-            own = operators[slots][:, None]
+            width = part.values.shape[2] // slots.shape[1]
+            split, own = part.values.reshape(*part.values.shape[:2], slots.shape[1], width), operators[slots][:, None]
             # written out, one loop over the result; as small products it took four times as long
-            turned = sum(split[..., 3 + i, None] * own[..., i, :] for i in range(3))
-            whole = jnp.concatenate([split[..., :3], turned], axis=-1)
+            turned = sum(split[..., width - 3 + i, None] * own[..., i, :] for i in range(3))
+            whole = jnp.concatenate([split[..., : width - 3], turned], axis=-1)
             parts.append(Blocks(whole.reshape(part.values.shape), part.pattern))
         return self._with(parts)
 

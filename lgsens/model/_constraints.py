@@ -16,8 +16,11 @@ from jaxtyping import Array, Float
 
 from lgsens.liegroups import cross, skew
 from lgsens.model._frames import (
+    ALL,
     ROTATION_A,
     ROTATION_B,
+    TURNING_A,
+    TURNING_B,
     Frame,
     separation,
     separation_force,
@@ -38,6 +41,12 @@ class AbstractConstraint(eqx.Module):
         """Whether Φ depends on nothing but the pose of one body as seen from the other, as in a joint: it then takes as
         many directions from either body while the other one is held, which the linear solver makes use of."""
         return False
+
+    @property
+    def coupled(self) -> tuple[tuple[int, ...], ...]:
+        """Disjoint sets of the coordinates [x_a, θ_a, x_b, θ_b], 0 … 11: the stiffness D_q(Bᵀλ) is zero but for the
+        square block of each, and these alone are added to K_t."""
+        return (ALL,)
 
     @abc.abstractmethod
     def value(self, a: Frame, b: Frame) -> Float[Array, " rows"]:
@@ -74,6 +83,10 @@ class Coincidence(AbstractClosedFormConstraint):
     def relative(self):
         return True
 
+    @property
+    def coupled(self):
+        return (TURNING_A, TURNING_B)
+
     def value(self, a, b):
         return b.point(self.point_b) - a.point(self.point_a)
 
@@ -105,6 +118,10 @@ class Orthogonality(AbstractClosedFormConstraint):
     @property
     def relative(self):
         return True
+
+    @property
+    def coupled(self):
+        return (TURNING_A + TURNING_B,)
 
     def value(self, a, b):
         return jnp.sum(a.axis(self.axis_a) * b.axis(self.axis_b))[None]

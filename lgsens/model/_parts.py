@@ -8,8 +8,7 @@ import numpy as np
 
 from lgsens.dynamics import AbstractSystem
 from lgsens.liegroups import Pose
-from lgsens.model._frames import ROTATION, Frame
-from lgsens.model._stack import BODY_DIM
+from lgsens.model._frames import BODY_DIM, ROTATION, Frame
 
 System = TypeVar("System", bound=AbstractSystem)
 

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from lgsens._validate import is_concrete
 from lgsens.liegroups import Pose, R3xSO3
@@ -19,7 +20,6 @@ from lgsens.model._frames import BODY_A, BODY_B, Frame, ground_frame
 from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, LoadTangents
 from lgsens.model._topology import Ends
 
-BODY_DIM = 6
 Element = TypeVar("Element", AbstractConstraint, AbstractLoad)
 
 
@@ -52,8 +52,10 @@ class Stack(eqx.Module, Generic[Element]):
 
     @property
     def ends(self) -> Ends:
-        relative = isinstance(self.elements, AbstractConstraint) and self.elements.relative
-        return Ends(self.a, self.b, self.owners, self.kept, relative)
+        found = Ends(self.a, self.b, self.owners, self.kept)
+        if not isinstance(self.elements, AbstractConstraint):
+            return found
+        return found._replace(relative=self.elements.relative, coupled=self.elements.coupled)
 
     def map(self, function, q, *per_side, extra: Sequence[Any] = ()):
         """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra)` for every element.
@@ -137,6 +139,14 @@ def constraint_stiffness(element: AbstractConstraint, a: Frame, b: Frame, lam):
         return element.geometric_stiffness(a, b, lam)
     zero = jnp.zeros(12, a.position.dtype)
     return jax.jacfwd(lambda x: lam @ constraint_jacobian(element, moved(a, x[BODY_A]), moved(b, x[BODY_B])))(zero)
+
+
+def square_blocks(matrices: Float[Array, "e n n"], places: np.ndarray) -> Float[Array, "e p p"]:
+    """The rows and columns at increasing `places`, by slices, of which XLA computes no others."""
+    runs = [slice(run[0], run[-1] + 1) for run in np.split(places, np.flatnonzero(np.diff(places) > 1) + 1)]
+    return jnp.concatenate(
+        [jnp.concatenate([matrices[:, rows, columns] for columns in runs], axis=2) for rows in runs], axis=1
+    )
 
 
 def load_tangents(element: AbstractLoad, a: Frame, b: Frame, va, vb, t) -> LoadTangents:

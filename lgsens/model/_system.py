@@ -14,16 +14,16 @@ from lgsens.dynamics import AbstractRedundantSystem, AbstractSparseSystem, Tange
 from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew, turn
 from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, chosen
 from lgsens.model._constraints import AbstractConstraint
-from lgsens.model._frames import ROTATION
+from lgsens.model._frames import BODY_DIM, ROTATION
 from lgsens.model._loads import AbstractLoad
 from lgsens.model._parts import Parts
 from lgsens.model._stack import (
-    BODY_DIM,
     Stack,
     constraint_force,
     constraint_jacobian,
     constraint_stiffness,
     load_tangents,
+    square_blocks,
 )
 from lgsens.model._topology import Topology, topology
 
@@ -297,10 +297,10 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
                 stiffness.append(Blocks(-position[:, part, part], pattern))
             if velocity is not None:
                 damping.append(Blocks(-velocity[:, part, part], pattern))
-        for stack, rows, pattern in zip(self.constraints, topology.rows, topology.stiffness):
+        for stack, rows, coupled in zip(self.constraints, topology.rows, topology.stiffness):
             part = stack.part
-            block = stack.map(constraint_stiffness, q, extra=(chosen(lam, rows),))
-            stiffness.append(Blocks(block[:, part, part], pattern))
+            block = stack.map(constraint_stiffness, q, extra=(chosen(lam, rows),))[:, part, part]
+            stiffness.extend(Blocks(square_blocks(block, places), pattern) for places, pattern in coupled)
         return Tangents(self._square(stiffness), self._square(damping), self.sparse_constraint_jacobian(q))
 
     def measure(self, force: str, q, v, t):

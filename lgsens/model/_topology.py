@@ -7,7 +7,7 @@ import numpy as np
 
 from lgsens.liegroups import Poses
 from lgsens.linear import AbstractLinearSolver, Elimination, Graph, Joint, Pattern, elimination
-from lgsens.model._frames import ROTATION
+from lgsens.model._frames import BODY_DIM, ROTATION
 
 
 class Ends(NamedTuple):
@@ -18,6 +18,7 @@ class Ends(NamedTuple):
     owners: tuple[str, ...]
     kept: tuple[tuple[bool, ...], ...]
     relative: bool = False  # of constraints, as in `AbstractConstraint`
+    coupled: tuple[tuple[int, ...], ...] = ()  # likewise
 
     @property
     def slots(self) -> np.ndarray:
@@ -40,7 +41,8 @@ class Topology:
         self.num_constraints = start
         self.mass = Pattern(index, index)
         self.gyroscopic = Pattern(index[:, ROTATION], index[:, ROTATION])
-        self.loads, self.stiffness = ([self._square(ends) for ends in some] for some in (loads, constraints))
+        self.loads = [self._square(ends) for ends in loads]
+        self.stiffness = [self._stiffness(ends) for ends in constraints]
         self.jacobian = [
             Pattern(rows, self.coordinates(ends), ends.slots) for rows, ends in zip(self.rows, constraints)
         ]
@@ -52,6 +54,18 @@ class Topology:
     def _square(self, ends: Ends) -> Pattern:
         coordinates = self.coordinates(ends)
         return Pattern(coordinates, coordinates, ends.slots)
+
+    def _stiffness(self, ends: Ends) -> list[tuple[np.ndarray, Pattern]]:
+        """Of each set of coupled coordinates those of bodies, by their places among these, and where they are."""
+        coordinates, found = self.coordinates(ends), []
+        first = 0 if ends.a is not None else BODY_DIM  # the ground has none
+        for group in ends.coupled:
+            places = np.asarray(group) - first
+            places = places[(places >= 0) & (places < coordinates.shape[1])]
+            if len(places):
+                own = coordinates[:, places]
+                found.append((places, Pattern(own, own, ends.slots[:, np.unique(places // BODY_DIM)])))
+        return found
 
     @cached_property
     def _graph(self) -> Graph:

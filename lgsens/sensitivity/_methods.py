@@ -201,19 +201,19 @@ def _direct_rule(scheme, num_steps, primals, tangents):
     d_state0, d_parameters, _ = tangents
     states, stats = _direct_trajectory(scheme, num_steps, *primals)
     group = parameters.system.group
-    first = to_algebra(group, state0, d_state0)
-    b = jax.tree.map(lambda zeros, leaf: zeros.at[0].set(leaf), zeros_like_trajectory(states), first)
-    # One flat vector, because `custom_linear_solve` is transposed only where no part of b is a constant, and the
-    # tangent of a parameter that is not differentiated is one: a zero.
-    flat, unravel = ravel_pytree((b, d_parameters))
+    # `custom_linear_solve` is transposed only where no part of b is a constant, and the tangent of a parameter that is
+    # not differentiated is one: a zero. Cut from one vector, all depend on all.
+    flat, unravel = ravel_pytree((to_algebra(group, state0, d_state0), d_parameters))
+    first, d_parameters = unravel(flat)
+    rows = jax.tree.map(lambda zeros: zeros[1:], zeros_like_trajectory(states))
+    b = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), first, rows)
     product, forwards, backwards = _sweeps(scheme)
-    solution = lax.custom_linear_solve(
-        lambda unknown: ravel_pytree(product(scheme, states, parameters, *unravel(unknown)))[0],
-        flat,
-        solve=lambda _, rhs: ravel_pytree(forwards(scheme, states, parameters, *unravel(rhs)))[0],
-        transpose_solve=lambda _, rhs: ravel_pytree(backwards(scheme, states, parameters, *unravel(rhs)))[0],
+    delta, _ = lax.custom_linear_solve(
+        lambda unknown: product(scheme, states, parameters, *unknown),
+        (b, d_parameters),
+        solve=lambda _, rhs: forwards(scheme, states, parameters, *rhs),
+        transpose_solve=lambda _, rhs: backwards(scheme, states, parameters, *rhs),
     )
-    delta, _ = unravel(solution)
     d_states = jax.vmap(partial(to_ambient, group))(states, delta)
     return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
 
