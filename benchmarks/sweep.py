@@ -108,7 +108,8 @@ def main() -> None:
     path = arguments.out / "sweep.json"
     scenes = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     if not arguments.readme:
-        os.environ.update(WHOLE_LOOPS)  # before the first computation
+        settings = WHOLE_LOOPS | {"PJRT_NPROC": str(arguments.devices)}  # a thread for each
+        os.environ.update(settings)  # before the first computation
         jax.config.update("jax_enable_x64", True)
         jax.config.update("jax_num_cpu_devices", arguments.devices)
         for name in arguments.scenes:
@@ -118,7 +119,7 @@ def main() -> None:
             scenes[f"{name}, {arguments.devices}"] = {
                 "name": name,
                 "devices": arguments.devices,
-                "environment": environment(WHOLE_LOOPS),
+                "environment": environment(settings),
                 "rows": {kind: measure(scene, kind, jax.devices(), arguments.repeats) for kind in KINDS},
             }
             write(path, scenes)

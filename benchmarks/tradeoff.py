@@ -17,7 +17,7 @@ import json
 import os
 from pathlib import Path
 
-from rivals import SINGLE_THREAD
+from benchmark import SINGLE_THREAD
 
 CHECK = {"quarter-car": 4000, "stiff-quarter-car": 20_000}  # steps of RK4: 160 leave 2e-5, so 4000 leave 5e-11
 
