@@ -88,13 +88,16 @@ def measure(scene: Scene, kind: str, devices, repeats: int) -> list[dict]:
 
 
 def table(scenes: dict) -> str:
-    head = ("scene", "devices", "batch", *(f"{kind}: {unit}" for kind in KINDS for unit in UNITS))
+    head = ("scene", "JAX", "devices", "batch", *(f"{kind}: {unit}" for kind in KINDS for unit in UNITS))
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for scene in scenes.values():
         for value, gradient in zip(*scene["rows"].values()):
             cells = [f"{row[key]:.3g}" for row in (value, gradient) for key in UNITS.values()]
-            lines.append(f"| {scene['name']} | {scene['devices']} | {value['size']} | {' | '.join(cells)} |")
-    notes = [f"{name} device(s): {circumstances(scene['environment'])}" for name, scene in scenes.items()]
+            version = scene["environment"]["versions"]["jax"]
+            lines.append(
+                f"| {scene['name']} | {version} | {scene['devices']} | {value['size']} | {' | '.join(cells)} |"
+            )
+    notes = [f"{name}: {circumstances(scene['environment'])}" for name, scene in scenes.items()]
     return "\n".join([*lines, "", *notes])
 
 
@@ -116,7 +119,7 @@ def main() -> None:
             scene = SCENES[name]
             if arguments.sizes:
                 scene = scene._replace(sizes=tuple(arguments.sizes))
-            scenes[f"{name}, {arguments.devices}"] = {
+            scenes[f"{name}, {arguments.devices} device(s), JAX {jax.__version__}"] = {
                 "name": name,
                 "devices": arguments.devices,
                 "environment": environment(settings),
