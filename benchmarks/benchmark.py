@@ -87,7 +87,9 @@ def circumstances(found: Mapping[str, Any]) -> str:
     """A line of what `environment` found."""
     versions = ", ".join(f"{package} {version}" for package, version in found["versions"].items())
     machine, threads = found["machine"], found["threads"]
-    how = (", one thread" if threads else "") + (", loops as functions" if ONE_FUNCTION in str(threads) else "")
+    count = threads.get("PJRT_NPROC", "1") if threads else None
+    how = {None: "", "1": ", one thread"}.get(count, f", {count} threads")
+    how += ", loops as functions" if ONE_FUNCTION in str(threads) else ""
     return (
         f"{found['date']}, {machine['architecture']}, {machine['cores']} cores, load average "
         f"{found['load_average']}{how}; {versions}."
