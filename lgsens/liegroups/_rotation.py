@@ -46,8 +46,8 @@ def cross(x: Float[Array, "3"], y: Float[Array, "3"]) -> Float[Array, "3"]:
 
 def skew(x: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """The skew-symmetric matrix `x~` with `x~ y = x × y` (§3.2). `x`: shape (3,)."""
-    # Stacked, not summed over a constant tensor: XLA's CPU compiler (jax 0.10.2, not 0.12) miscompiles
-    # `sum(constant * x)` fused with other terms in float32, wrong signs past 32768 results.
+    # Stacked, not summed over a constant tensor: with YNN fusions (`lgsens._xla`) XLA miscompiles `sum(constant * x)`
+    # fused with other terms in float32, wrong signs past 32768 results.
     x1, x2, x3 = _components(x)
     o = jnp.zeros_like(x1)
     return jnp.stack([o, -x3, x2, x3, o, -x1, -x2, x1, o]).reshape(3, 3)
