@@ -29,9 +29,11 @@ def nearest_rotation(R: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
     Source: Higham, Functions of Matrices (2008), eq. (8.20).
     """
     eye = jnp.broadcast_to(jnp.eye(3, dtype=R.dtype), R.shape)
-    for _ in range(4):
-        R = 0.5 * R @ (3.0 * eye - jnp.swapaxes(R, -1, -2) @ R)
-    return R
+
+    def step(R, _):
+        return 0.5 * R @ (3.0 * eye - jnp.swapaxes(R, -1, -2) @ R), None
+
+    return lax.scan(step, R, length=4)[0]
 
 
 def _components(x):

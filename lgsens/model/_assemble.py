@@ -1,7 +1,10 @@
 """The equations of motion of a scene, elements stacked by type."""
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Hashable, Mapping
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from lgsens.liegroups import Pose
@@ -14,27 +17,32 @@ from lgsens.model._loads import SpringDamperLoad
 from lgsens.model._merge import Group, Place, Places, merged
 from lgsens.model._needed import needed
 from lgsens.model._parts import Parts
-from lgsens.model._stack import Placed, stack, stacked
+from lgsens.model._rows import Row, evaluated, joined, stacked
+from lgsens.model._stack import Placed, stack
 from lgsens.model._system import MultibodySystem
 
 
 def assemble(
-    bodies: Mapping[str, RigidBody], joints: Mapping[str, AbstractJoint], forces: Mapping[str, AbstractForce]
+    bodies: Mapping[str, RigidBody],
+    frames: Frame,
+    joints: Mapping[str, AbstractJoint],
+    forces: Mapping[str, AbstractForce],
 ) -> MultibodySystem:
-    """The equations of bodies whose orientations are rotations."""
+    """The equations of bodies whose orientations are rotations; `frames`: theirs, by their names."""
     places: Places = {None: Place(None, None)} | {name: Place(name, None) for name in bodies}
-    return _assemble(bodies, bodies, places, joints, forces)
+    return _assemble(bodies, bodies, frames, places, joints, forces)
 
 
 def assemble_merged(
     bodies: Mapping[str, RigidBody],
+    frames: Frame,
     joints: Mapping[str, AbstractJoint],
     forces: Mapping[str, AbstractForce],
     found: tuple[Group, ...],
 ) -> MultibodySystem:
     """The equations of what fixed joints make of the bodies."""
     moving, places = merged(bodies, found)
-    parts, names = assemble(bodies, joints, forces), sorted(moving)
+    parts, names = assemble(bodies, frames, joints, forces), sorted(moving)
     own = [places[name] for name in parts.body_names]
     here = ground_frame(parts.mass.dtype)
     offsets = [here if place.offset is None else place.offset for place in own]
@@ -49,12 +57,13 @@ def assemble_merged(
         free=parts.free,
         fixed=tuple(map(tuple, fixed.values())),
     )
-    return _assemble(moving, bodies, places, joints, forces, seen)
+    return _assemble(moving, bodies, frames, places, joints, forces, seen)
 
 
 def _assemble(
     moving: Mapping[str, RigidBody],
     bodies: Mapping[str, RigidBody],
+    frames: Frame,
     places: Places,
     joints: Mapping[str, AbstractJoint],
     forces: Mapping[str, AbstractForce],
@@ -62,25 +71,28 @@ def _assemble(
 ) -> MultibodySystem:
     """The equations of the `moving` bodies, to which joints and forces on the named `bodies` are attached.
 
-    Names are sorted here and nowhere else: a dict comes out of `jit` sorted, so its own order cannot be relied on.
+    `frames`: those of `bodies`, by their names. Names are sorted here and nowhere else: a dict comes out of `jit`
+    sorted, so its own order cannot be relied on.
     """
     names = tuple(sorted(moving))
     ordered = [moving[name] for name in names]
     number = {None: None} | {name: i for i, name in enumerate(names)}
-    ground = ground_frame(ordered[0].mass.dtype)
-    frame = lambda name: ground if name is None else bodies[name].frame
+    frame = {None: None} | {name: Row(frames, i) for i, name in enumerate(sorted(bodies))}
 
+    between = [(name, joint) for name, joint in sorted(joints.items()) if places[joint.a].body != places[joint.b].body]
+    members = [
+        (joint, frame[joint.a], frame[joint.b], places[joint.a].offset, places[joint.b].offset) for _, joint in between
+    ]
+    kinds = [(_kind(joint), *(end is None for end in ends)) for joint, *ends in members]
     constraints = []
-    for name, joint in sorted(joints.items()):
-        a, b = places[joint.a], places[joint.b]
-        if a.body == b.body:
-            continue
-        elements = joint.constraints(frame(joint.a), frame(joint.b))
-        free = [() if end.body is None else moving[end.body].free for end in (a, b)]
-        for i, (element, kept) in enumerate(zip(elements, needed(name, joint, elements, *free))):
+    for (name, joint), row in zip(between, evaluated(_constraints, members, kinds)):
+        ends = places[joint.a], places[joint.b]
+        a, b = (number[end.body] for end in ends)
+        free = [() if end.body is None else moving[end.body].free for end in ends]
+        single = [jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), of) for of in row.of]
+        for i, (of, kept) in enumerate(zip(row.of, needed(name, joint, single, *free))):
             if any(kept):
-                element = carried_constraint(element, a.offset, b.offset)
-                constraints.append(Placed(element, number[a.body], number[b.body], name, kept, i))
+                constraints.append(Placed(Row(of, row.index), a, b, name, kept, i))
     loads = []
     for name, force in sorted(forces.items()):
         # the weights of the parts of a body are a weight at its centre of mass
@@ -88,16 +100,16 @@ def _assemble(
             a, b = (places[end] for end in ends)
             if a.body != b.body or (a.body is not None and not isinstance(load, SpringDamperLoad)):
                 loads.append(Placed(carried_load(load, a.offset, b.offset), number[a.body], number[b.body], name))
-    pivoted = any(body.pivot is not None for body in ordered)
+    kinds = [(body.inertia.ndim, body.pivot is None, body.mass.dtype) for body in ordered]
+    inertia, centre = joined(evaluated(_inertia, [(body,) for body in ordered], kinds))
+    if moving is not bodies:
+        frames = joined([body.frame for body in ordered])
     return MultibodySystem(
         mass=stacked([body.mass for body in ordered]),
-        inertia=stacked([body.frame_inertia for body in ordered]),
-        pose=Pose(
-            stacked([body.frame.position for body in ordered]),
-            stacked([body.orientation for body in ordered]),
-        ),
+        inertia=inertia,
+        pose=Pose(*frames),
         velocity=jnp.concatenate([part for body in ordered for part in body.free_velocity]),
-        centre=stacked([body.centre for body in ordered]) if pivoted else None,
+        centre=centre if any(body.pivot is not None for body in ordered) else None,
         constraints=stack(constraints),
         loads=stack(loads),
         parts=parts,
@@ -107,3 +119,21 @@ def _assemble(
         linear_solver=None,
         minimum_norm=False,
     )
+
+
+def _kind(joint: AbstractJoint) -> Hashable:
+    """What joints have in common whose constraints are made by the same operations."""
+    fields = [getattr(joint, field.name) for field in dataclasses.fields(joint) if field.name not in ("a", "b")]
+    leaves, structure = jax.tree.flatten(fields, is_leaf=lambda x: x is None)
+    return type(joint), structure, tuple((leaf.shape, leaf.dtype) if eqx.is_array(leaf) else leaf for leaf in leaves)
+
+
+def _constraints(joint: AbstractJoint, a: Frame | None, b: Frame | None, part_a: Frame | None, part_b: Frame | None):
+    """The constraints of a joint between its bodies; `part_a`, `part_b`: the poses of merged parts there."""
+    ground = ground_frame(next(end.position.dtype for end in (a, b) if end is not None))
+    elements = joint.constraints(ground if a is None else a, ground if b is None else b)
+    return tuple(carried_constraint(element, part_a, part_b) for element in elements)
+
+
+def _inertia(body: RigidBody):
+    return body.frame_inertia, body.centre

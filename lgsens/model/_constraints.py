@@ -22,6 +22,7 @@ from lgsens.model._frames import (
     TURNING_A,
     TURNING_B,
     Frame,
+    embedded,
     separation,
     separation_force,
     separation_stiffness,
@@ -141,12 +142,14 @@ class Orthogonality(AbstractClosedFormConstraint):
     def geometric_stiffness(self, a, b, lam):
         e_a, e_b = skew(self.axis_a), skew(self.axis_b)
         coupling = e_a @ (a.orientation.T @ b.orientation) @ e_b
-        stiffness = jnp.zeros((12, 12), lam.dtype)
-        stiffness = stiffness.at[ROTATION_A, ROTATION_A].set(e_a @ skew(a.local_axis(b.axis(self.axis_b))))
-        stiffness = stiffness.at[ROTATION_A, ROTATION_B].set(-coupling)
+        own_a, own_b = e_a @ skew(a.local_axis(b.axis(self.axis_b))), e_b @ skew(b.local_axis(a.axis(self.axis_a)))
         # −ẽ_b R_bᵀR_a ẽ_a is the transpose of −ẽ_a R_aᵀR_b ẽ_b
-        stiffness = stiffness.at[ROTATION_B, ROTATION_A].set(-coupling.T)
-        stiffness = stiffness.at[ROTATION_B, ROTATION_B].set(e_b @ skew(b.local_axis(a.axis(self.axis_a))))
+        stiffness = (
+            embedded(own_a, ROTATION_A, ROTATION_A)
+            - embedded(coupling, ROTATION_A, ROTATION_B)
+            - embedded(coupling.T, ROTATION_B, ROTATION_A)
+            + embedded(own_b, ROTATION_B, ROTATION_B)
+        )
         return stiffness * lam[0]
 
 
@@ -173,7 +176,7 @@ class InPlane(AbstractClosedFormConstraint):
         return jnp.sum(a.axis(self.axis_a) * (b.point(self.point_b) - a.point(self.point_a)))[None]
 
     def _axis_gradient(self, a):
-        return jnp.zeros((3, 12), self.axis_a.dtype).at[:, ROTATION_A].set(-a.orientation @ skew(self.axis_a))
+        return embedded(-a.orientation @ skew(self.axis_a), None, ROTATION_A)
 
     def jacobian(self, a, b):
         d, gradient = separation(a, b, self.point_a, self.point_b)
@@ -190,7 +193,7 @@ class InPlane(AbstractClosedFormConstraint):
         d, gradient = separation(a, b, self.point_a, self.point_b)
         cross = self._axis_gradient(a).T @ gradient
         stiffness = cross + cross.T
-        stiffness = stiffness.at[ROTATION_A, ROTATION_A].add(skew(self.axis_a) @ skew(a.local_axis(d)))
+        stiffness += embedded(skew(self.axis_a) @ skew(a.local_axis(d)), ROTATION_A, ROTATION_A)
         stiffness += separation_stiffness(a, b, self.point_a, self.point_b, a.axis(self.axis_a))
         return stiffness * lam[0]
 

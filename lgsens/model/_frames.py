@@ -8,6 +8,7 @@ rotation in the body frame, δx and δθ = (Rᵀ δR)^∨, for each body.
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.liegroups import cross, skew, turn, turn_back
@@ -17,6 +18,15 @@ BODY_A, BODY_B = slice(0, 6), slice(6, 12)
 ROTATION = slice(3, 6)  # within one body
 ROTATION_A, TRANSLATION_B, ROTATION_B = slice(3, 6), slice(6, 9), slice(9, 12)  # within an element's 12
 ALL, TURNING_A, TURNING_B = tuple(range(12)), (3, 4, 5), (9, 10, 11)
+
+
+def embedded(part: Array, *places: slice | None) -> Array:
+    """Zeros with `part` at these of an element's coordinates along each axis; None: along an axis of another kind.
+
+    `.at[…].set` is a scatter for JAX, and its derivative a gather.
+    """
+    around = [(0, 0, 0) if place is None else (place.start, 2 * BODY_DIM - place.stop, 0) for place in places]
+    return lax.pad(part, jnp.zeros((), part.dtype), around)
 
 
 class Frame(NamedTuple):
@@ -78,6 +88,5 @@ def separation_stiffness(a: Frame, b: Frame, point_a, point_b, force) -> Float[A
     from (−R X̃)ᵀ f = X̃ Rᵀ f and δ(Rᵀ f) = −θ̃ Rᵀ f = (Rᵀ f)~ δθ. With f = λ it is the paper's K_t (§3.2;
     ERRATA: −X̃ (Rᵀλ)~, with X from the pivot to the centre of mass, our −X_b).
     """
-    stiffness = jnp.zeros((12, 12), force.dtype)
-    stiffness = stiffness.at[ROTATION_A, ROTATION_A].set(-skew(point_a) @ skew(a.local_axis(force)))
-    return stiffness.at[ROTATION_B, ROTATION_B].set(skew(point_b) @ skew(b.local_axis(force)))
+    of_a = embedded(-skew(point_a) @ skew(a.local_axis(force)), ROTATION_A, ROTATION_A)
+    return of_a + embedded(skew(point_b) @ skew(b.local_axis(force)), ROTATION_B, ROTATION_B)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import axis_field, number_field, point_field, require
+from lgsens.liegroups import cross
 from lgsens.model._constraints import (
     AbstractConstraint,
     Coincidence,
@@ -32,9 +33,9 @@ def _normals(axis: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "
     """
     unit = axis / jnp.linalg.norm(axis)
     least = jax.nn.one_hot(jnp.argmin(jnp.abs(unit)), 3, dtype=axis.dtype)
-    first = jnp.cross(unit, least)
+    first = cross(unit, least)
     first = first / jnp.linalg.norm(first)
-    return unit, first, jnp.cross(unit, first)
+    return unit, first, cross(unit, first)
 
 
 def _coincidence(a: Frame, b: Frame, at) -> Coincidence:

@@ -20,6 +20,7 @@ from lgsens.model._frames import (
     ROTATION_B,
     TRANSLATION_B,
     Frame,
+    embedded,
     separation,
     separation_force,
     separation_stiffness,
@@ -57,7 +58,7 @@ class Weight(AbstractClosedFormLoad):
     acceleration: Float[Array, "3"]
 
     def force(self, a, b, va, vb, t):
-        return jnp.zeros(12, self.mass.dtype).at[TRANSLATION_B].set(self.mass * self.acceleration)
+        return embedded(self.mass * self.acceleration, TRANSLATION_B)
 
     def tangents(self, a, b, va, vb, t):
         return LoadTangents(None, None)
@@ -127,9 +128,9 @@ class SpringDamperLoad(AbstractClosedFormLoad):
         per_length = self._per_length(self.measure(a, b, va, vb, t))
         along = n @ gradient
         speed = gradient @ jnp.concatenate([va, vb])
-        turning = jnp.zeros((3, 12), n.dtype)
-        turning = turning.at[:, ROTATION_A].set(-a.orientation @ skew(cross(self.point_a, va[ROTATION])))
-        turning = turning.at[:, ROTATION_B].set(b.orientation @ skew(cross(self.point_b, vb[ROTATION])))
+        turning_a = a.orientation @ skew(cross(self.point_a, va[ROTATION]))
+        turning_b = b.orientation @ skew(cross(self.point_b, vb[ROTATION]))
+        turning = embedded(turning_b, None, ROTATION_B) - embedded(turning_a, None, ROTATION_A)
         across = gradient - jnp.outer(n, along)  # |d| P D
         rate_gradient = speed @ across / divisor + n @ turning
         position = (
@@ -183,16 +184,18 @@ class BushingLoad(AbstractClosedFormLoad):
         relative = b.orientation.T @ a.orientation
         swing = cross(vb[ROTATION], self.point_b)
         speed = vb[: ROTATION.start] + b.axis(swing) - va[: ROTATION.start]
-        rate = -skew(va[ROTATION]) @ gradient
-        rate = rate.at[:, ROTATION_A].add(skew(a.local_axis(speed)))
-        rate = rate.at[:, ROTATION_B].add(-relative.T @ skew(swing))
-        turned = a.orientation @ skew(g)
-        geometric = jnp.zeros((12, 12), g.dtype)
-        geometric = geometric.at[: ROTATION.start, ROTATION_A].set(turned)
-        geometric = geometric.at[ROTATION_A].set(skew(g) @ gradient)
-        geometric = geometric.at[TRANSLATION_B, ROTATION_A].set(-turned)
-        geometric = geometric.at[ROTATION_B, ROTATION_A].set(-skew(self.point_b) @ relative @ skew(g))
-        geometric = geometric.at[ROTATION_B, ROTATION_B].set(skew(self.point_b) @ skew(relative @ g))
+        rate = (
+            embedded(skew(a.local_axis(speed)), None, ROTATION_A)
+            - embedded(relative.T @ skew(swing), None, ROTATION_B)
+            - skew(va[ROTATION]) @ gradient
+        )
+        turned, arm = a.orientation @ skew(g), skew(self.point_b)
+        by_turns_of_a = jnp.concatenate([turned, jnp.zeros_like(turned), -turned, -arm @ relative @ skew(g)])
+        geometric = (
+            embedded(by_turns_of_a, None, ROTATION_A)
+            + embedded(skew(g) @ gradient, ROTATION_A, None)
+            + embedded(arm @ skew(relative @ g), ROTATION_B, ROTATION_B)
+        )
         position = gradient.T @ (self.stiffness @ gradient + self.damping @ rate) + geometric
         return LoadTangents(-position, -gradient.T @ self.damping @ gradient)
 

@@ -15,9 +15,10 @@ from lgsens.linear import AbstractLinearSolver
 from lgsens.model._assemble import assemble, assemble_merged
 from lgsens.model._body import RigidBody
 from lgsens.model._forces import AbstractForce
+from lgsens.model._frames import Frame
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._merge import Group, groups
-from lgsens.model._stack import stacked
+from lgsens.model._rows import stacked
 from lgsens.model._summary import Summary, summarize
 from lgsens.model._system import MultibodySystem
 
@@ -135,10 +136,11 @@ class Model(eqx.Module):
             name: eqx.tree_at(lambda body: body.orientation, self.bodies[name], rotations[i])
             for i, name in enumerate(names)
         }
+        frames = Frame(stacked([bodies[name].frame.position for name in names]), rotations)
         if self._groups is None:
-            system = assemble(bodies, self.joints, self.forces)
+            system = assemble(bodies, frames, self.joints, self.forces)
         else:
-            system = assemble_merged(bodies, self.joints, self.forces, self._groups)
+            system = assemble_merged(bodies, frames, self.joints, self.forces, self._groups)
         return dataclasses.replace(
             system, linear_solver=self.linear_solver, minimum_norm=self.redundant == "minimum_norm"
         )

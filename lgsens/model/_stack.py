@@ -11,28 +11,36 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens._validate import is_concrete
 from lgsens.liegroups import Pose, R3xSO3
 from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint
 from lgsens.model._frames import BODY_A, BODY_B, Frame, ground_frame
 from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, LoadTangents
+from lgsens.model._rows import Row, joined
 from lgsens.model._topology import Ends
 
 Element = TypeVar("Element", AbstractConstraint, AbstractLoad)
 
 
 class Placed(NamedTuple, Generic[Element]):
-    """An element, the numbers of its two bodies (None: the ground), the name of its owner; of a constraint, which of
-    its equations are kept, and which one of its joint's it is."""
+    """An element, or a `Row` of such, the numbers of its two bodies (None: the ground), the name of its owner; of a
+    constraint, which of its equations are kept, and which one of its joint's it is."""
 
-    element: Element
+    element: Element | Row
     a: int | None
     b: int | None
     owner: str
     kept: tuple[bool, ...] = ()
     place: int = 0
+
+
+class AtEnds(NamedTuple):
+    """What bodies have at the ends of a stack: positions, orientations, …, with a leading axis; None: the ground."""
+
+    a: tuple[Array, ...] | None
+    b: tuple[Array, ...] | None
 
 
 class Stack(eqx.Module, Generic[Element]):
@@ -57,49 +65,53 @@ class Stack(eqx.Module, Generic[Element]):
             return found
         return found._replace(relative=self.elements.relative, coupled=self.elements.coupled)
 
-    def map(self, function, q, *per_side, extra: Sequence[Any] = ()):
-        """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra)` for every element.
+    def map(self, function, ends: AtEnds, extra: Sequence[Any] = ()):
+        """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra)` for every element; `ends`: of `at_ends`.
 
-        `q` holds the poses of all bodies, each of `per_side` a (bodies, …) array; a ground side gets the
-        inertial frame and zeros. Each of `extra` has a leading axis over the elements, or is a scalar.
+        A ground side gets the inertial frame and zeros. Each of `extra` has a leading axis over the elements, or is a
+        scalar.
         """
-        dtype = q.position.dtype
-
-        def side(indices):
-            if indices is None:
-                zeros = [jnp.zeros(array.shape[1:], dtype) for array in per_side]
-                return ground_frame(dtype), zeros, None
-            index = np.asarray(indices)
-            return Frame(q.position[index], q.orientation[index]), [array[index] for array in per_side], 0
-
-        frame_a, arrays_a, axis_a = side(self.a)
-        frame_b, arrays_b, axis_b = side(self.b)
-        arrays = [array for pair in zip(arrays_a, arrays_b) for array in pair]
-        axes = [axis_a, axis_b] * len(per_side)
+        known = ends.a or ends.b
+        assert known is not None  # not both are the ground
+        dtype = known[0].dtype
+        ground = (*ground_frame(dtype), *(jnp.zeros(array.shape[1:], dtype) for array in known[2:]))
+        arrays = [item for pair in zip(ends.a or ground, ends.b or ground) for item in pair]
+        axes = [None if end is None else 0 for end in ends] * len(ground)
         extra_axes = [0 if jnp.ndim(value) else None for value in extra]
-        return jax.vmap(function, in_axes=(0, axis_a, axis_b, *axes, *extra_axes))(
-            self.elements, frame_a, frame_b, *arrays, *extra
-        )
+
+        def each(element, position_a, position_b, orientation_a, orientation_b, *others):
+            return function(element, Frame(position_a, orientation_a), Frame(position_b, orientation_b), *others)
+
+        return jax.vmap(each, in_axes=(0, *axes, *extra_axes))(self.elements, *arrays, *extra)
 
 
-def stacked(leaves: Sequence[Any]):
-    """`jnp.stack`, which would compile a program for each number of leaves: numbers that are known go through NumPy."""
-    return jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves])) if is_concrete(*leaves) else jnp.stack(leaves)
+def at_ends(stacks: Sequence[Stack], q: Pose, *arrays) -> list[AtEnds]:
+    """The poses q of the bodies, and what (bodies, …) `arrays` have of them, at the ends of the elements of each stack.
+
+    One gather for all stacks: its transpose is one scatter, of which each takes XLA as long as ten other operations.
+    """
+    sides = [np.asarray(side) for stack in stacks for side in (stack.a, stack.b) if side is not None]
+    if not sides:
+        return []
+    index, sizes = np.concatenate(sides), [len(side) for side in sides]
+    pieces = zip(*(lax.split(array[index], sizes) for array in (*q, *arrays)))
+    return [AtEnds(*(None if side is None else next(pieces) for side in (stack.a, stack.b))) for stack in stacks]
 
 
 def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
     """Group elements by type and ground side, keeping their order within a group."""
     groups: dict[Any, list[Placed[Element]]] = {}
     for item in placed:
-        leaves, structure = jax.tree.flatten(item.element)
-        key = (structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves), item.a is None, item.b is None)
+        of, axes = (item.element.of, 1) if isinstance(item.element, Row) else (item.element, 0)
+        leaves, structure = jax.tree.flatten(of)
+        key = (structure, tuple((leaf.shape[axes:], leaf.dtype) for leaf in leaves), item.a is None, item.b is None)
         groups.setdefault(key, []).append(item)
     stacks = []
     for members in groups.values():
         first = members[0]
         stacks.append(
             Stack(
-                elements=jax.tree.map(lambda *leaves: stacked(leaves), *[m.element for m in members]),
+                elements=joined([m.element for m in members]),
                 a=None if first.a is None else tuple(m.a for m in members if m.a is not None),
                 b=None if first.b is None else tuple(m.b for m in members if m.b is not None),
                 owners=tuple(m.owner for m in members),

@@ -19,6 +19,7 @@ from lgsens.model._loads import AbstractLoad
 from lgsens.model._parts import Parts
 from lgsens.model._stack import (
     Stack,
+    at_ends,
     constraint_force,
     constraint_jacobian,
     constraint_stiffness,
@@ -139,8 +140,8 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         square = jnp.mean(jnp.trace(self.inertia, axis1=1, axis2=2)) / (3.0 * mass)
         square = jnp.where(square > 0, square, 1.0)
         angular = []
-        for stack, rows in zip(self.constraints, self.topology.rows):
-            translation = stack.map(constraint_jacobian, self.pose).reshape(*rows.shape, -1, BODY_DIM)
+        for stack, ends, rows in zip(self.constraints, at_ends(self.constraints, self.pose), self.topology.rows):
+            translation = stack.map(constraint_jacobian, ends).reshape(*rows.shape, -1, BODY_DIM)
             without = jnp.all(translation[..., : ROTATION.start] == 0.0, axis=(2, 3))
             angular.append((without.astype(mass.dtype), rows))
         angular = lax.stop_gradient(added(angular, self.topology.num_constraints, mass.dtype))
@@ -214,10 +215,9 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         return self.sparse_mass_matrix().dense()
 
     def sparse_mass_matrix(self):
-        blocks = jnp.zeros((len(self.body_names), BODY_DIM, BODY_DIM), self.mass.dtype)
         translation = self.mass[:, None, None] * jnp.eye(ROTATION.start, dtype=self.mass.dtype)[None]
-        blocks = blocks.at[:, : ROTATION.start, : ROTATION.start].set(translation)
-        blocks = blocks.at[:, ROTATION, ROTATION].set(self.inertia)
+        none = jnp.zeros_like(translation)
+        blocks = jnp.block([[translation, none], [none, self.inertia]])
         return self._square([Blocks(blocks, self.topology.mass)])
 
     def _square(self, parts) -> SparseMatrix:
@@ -249,11 +249,11 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             moment = moment + jax.vmap(cross)(spin, turned(self.inertia, spin))
         topology = self.topology
         forces = [(jnp.concatenate([force, moment], axis=1), topology.mass.rows)]
-        for stack, pattern in zip(self.loads, topology.loads):
-            force = stack.map(lambda e, a, b, va, vb, t: e.force(a, b, va, vb, t), q, twist, extra=(t,))
+        for stack, ends, pattern in zip(self.loads, at_ends(self.loads, q, twist), topology.loads):
+            force = stack.map(lambda e, a, b, va, vb, t: e.force(a, b, va, vb, t), ends, (t,))
             forces.append((-force[:, stack.part], pattern.rows))
-        for stack, pattern in zip(self.constraints, topology.jacobian):
-            force = stack.map(constraint_force, q, extra=(chosen(lam, pattern.rows),))
+        for stack, ends, pattern in zip(self.constraints, at_ends(self.constraints, q), topology.jacobian):
+            force = stack.map(constraint_force, ends, (chosen(lam, pattern.rows),))
             forces.append((force[:, stack.part], pattern.columns))
         return added(forces, self.group.dim, v.dtype)
 
@@ -261,8 +261,8 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     def constraint(self, q):
         q = self._placed(q)
         values = [
-            (stack.map(lambda e, a, b: e.value(a, b), q), rows)
-            for stack, rows in zip(self.constraints, self.topology.rows)
+            (stack.map(lambda e, a, b: e.value(a, b), ends), rows)
+            for stack, ends, rows in zip(self.constraints, at_ends(self.constraints, q), self.topology.rows)
         ]
         return added(values, self.topology.num_constraints, self.mass.dtype)
 
@@ -273,8 +273,8 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     def sparse_constraint_jacobian(self, q):
         q = self._placed(q)
         parts = [
-            Blocks(stack.map(constraint_jacobian, q)[:, :, stack.part], pattern)
-            for stack, pattern in zip(self.constraints, self.topology.jacobian)
+            Blocks(stack.map(constraint_jacobian, ends)[:, :, stack.part], pattern)
+            for stack, ends, pattern in zip(self.constraints, at_ends(self.constraints, q), self.topology.jacobian)
         ]
         return SparseMatrix(tuple(parts), (self.topology.num_constraints, self.group.dim), self.mass.dtype)
 
@@ -290,16 +290,17 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             momentum = jnp.einsum("nij,nj->ni", self.inertia, spin)
             gyroscopic = jax.vmap(skew)(spin) @ self.inertia - jax.vmap(skew)(momentum)
             damping.append(Blocks(gyroscopic, topology.gyroscopic))
-        for stack, pattern in zip(self.loads, topology.loads):
+        for stack, ends, pattern in zip(self.loads, at_ends(self.loads, q, twist), topology.loads):
             part = stack.part
-            position, velocity = stack.map(load_tangents, q, twist, extra=(t,))
+            position, velocity = stack.map(load_tangents, ends, (t,))
             if position is not None:
                 stiffness.append(Blocks(-position[:, part, part], pattern))
             if velocity is not None:
                 damping.append(Blocks(-velocity[:, part, part], pattern))
-        for stack, rows, coupled in zip(self.constraints, topology.rows, topology.stiffness):
+        placed = zip(self.constraints, at_ends(self.constraints, q), topology.rows, topology.stiffness)
+        for stack, ends, rows, coupled in placed:
             part = stack.part
-            block = stack.map(constraint_stiffness, q, extra=(chosen(lam, rows),))[:, part, part]
+            block = stack.map(constraint_stiffness, ends, (chosen(lam, rows),))[:, part, part]
             stiffness.extend(Blocks(square_blocks(block, places), pattern) for places, pattern in coupled)
         return Tangents(self._square(stiffness), self._square(damping), self.sparse_constraint_jacobian(q))
 
@@ -327,6 +328,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
 
         def at_time(q, v, t):
             evaluate = lambda e, *args: getattr(e, "measure", e.force)(*args)
-            return single.map(evaluate, self._placed(q), self.twists(v), extra=(t,))
+            (ends,) = at_ends([single], self._placed(q), self.twists(v))
+            return single.map(evaluate, ends, (t,))
 
         return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(at_time)(q, v, t))

@@ -1,0 +1,72 @@
+"""A function of many members, evaluated once for all that have the same structure.
+
+What is traced and compiled for a scene grows with the number of kinds of its members, not of members: the constraints
+of 512 joints one by one take hundreds of operations, and their derivatives again.
+"""
+
+from collections.abc import Callable, Hashable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lgsens._validate import is_concrete
+
+
+class Row(NamedTuple):
+    """One entry along the leading axis of a pytree of arrays."""
+
+    of: Any
+    index: int
+
+
+def stacked(leaves: Sequence[Any]):
+    """`jnp.stack`, which would compile a program for each number of leaves: numbers that are known go through NumPy."""
+    if is_concrete(*leaves):
+        return jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves]))
+    if all(leaf is leaves[0] for leaf in leaves):  # gravity, say: its derivative is one sum
+        return jnp.broadcast_to(leaves[0], (len(leaves), *leaves[0].shape))
+    return jnp.stack(leaves)
+
+
+def joined(members: Sequence[Any]) -> Any:
+    """Pytrees, or rows of such, along a new leading axis: of one structure but for names, of which the first counts."""
+    if not isinstance(members[0], Row):
+        leaves = zip(*map(jax.tree.leaves, members))
+        return jax.tree.unflatten(jax.tree.structure(members[0]), map(stacked, leaves))
+    sources = list({id(row.of): row.of for row in members}.values())
+    lengths = [next(iter(leaf.shape[0] for leaf in jax.tree.leaves(source)), 0) for source in sources]
+    starts = dict(zip(map(id, sources), np.cumsum([0, *lengths])))
+    index = np.asarray([starts[id(row.of)] + row.index for row in members])
+
+    def chosen(*leaves):
+        if is_concrete(*leaves):
+            return jnp.asarray(np.concatenate([np.asarray(leaf) for leaf in leaves])[index])
+        whole = leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
+        return whole if np.array_equal(index, np.arange(whole.shape[0])) else whole[index]
+
+    return jax.tree.map(chosen, *sources)
+
+
+def evaluated(function: Callable, members: Sequence[tuple[Any, ...]], kinds: Sequence[Hashable]) -> list[Row]:
+    """`function(*member)` of each member, in their order; those of one kind at once.
+
+    A member is a tuple of pytrees, rows of such and None; those of one kind have one structure but for names.
+    """
+    places: dict[Hashable, list[int]] = {}
+    for i, kind in enumerate(kinds):
+        places.setdefault(kind, []).append(i)
+    found: dict[int, Row] = {}
+    for own in places.values():
+        columns = zip(*(members[i] for i in own))
+        arguments = [None if column[0] is None else joined(column) for column in columns]
+        results = _each(function, arguments)
+        found |= {i: Row(results, place) for place, i in enumerate(own)}
+    return [found[i] for i in range(len(members))]
+
+
+@partial(jax.jit, static_argnums=0)
+def _each(function, arguments):
+    return jax.vmap(lambda arguments: function(*arguments))(arguments)
