@@ -125,7 +125,7 @@ def projection(inertia: Inertia, system: AbstractSystem, x, q, v) -> Projection:
     if not system.constraint_names:
         none = jnp.zeros(0, v.dtype)
         return Projection(x, q, v, jnp.zeros_like(v), none, jnp.zeros_like(v), none, q)
-    kkt = ConstrainedInertia.of(inertia, system.constraint_jacobian(q))
+    kkt = ConstrainedInertia.of(inertia, system, q)
     still = jnp.zeros_like(v)
     y, mu = kkt.solve(still, -system.constraint(q))
     projected = system.group.retract(q, y)
@@ -224,7 +224,7 @@ def _varied_step(scheme: Coefficients, numbers: Numbers, dnumbers: Numbers, begi
         _, equations = jax.linearize(lambda q, v: _motion(system, q, v, vdot, lam, t), q, v)
         of_numbers = lambda system, t: _motion(system, q, v, vdot, lam, t)
         _, load = jax.jvp(of_numbers, (system, t), (dnumbers.system, dt))
-        return _Linear(equations, ConstrainedInertia.of(inertia, system.constraint_jacobian(q)), load)
+        return _Linear(equations, ConstrainedInertia.of(inertia, system, q), load)
 
     def kinematics(x, v):
         return jax.linearize(partial(_kinematics, group), begin.q, x, v)[1]
@@ -255,7 +255,7 @@ def _varied_step(scheme: Coefficients, numbers: Numbers, dnumbers: Numbers, begi
     dx, dv = advanced(p.x, p.v, jnp.asarray(scheme.b, h.dtype), slopes)
     _, dq = jax.jvp(group.retract, (begin.q, p.x), (dbegin.q, dx))
     if system.constraint_names:
-        kkt = ConstrainedInertia.of(inertia, system.constraint_jacobian(p.q))
+        kkt = ConstrainedInertia.of(inertia, system, p.q)
         of_first = lambda mass, system, q: _corrections(mass, system, q, p.projected, p)
         variations = dnumbers.inertia.mass, dnumbers.system, dq
         _, (change_p, change_r) = jax.jvp(of_first, (inertia.mass, system, p.q), variations)

@@ -32,7 +32,7 @@ from jaxtyping import Array, Float
 
 from lgsens.dynamics._matrices import kkt_product
 from lgsens.dynamics._redundant import SOFTNESS, refined, softness
-from lgsens.dynamics._system import AbstractSystem
+from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem
 
 
 class Inertia(eqx.Module):
@@ -40,6 +40,7 @@ class Inertia(eqx.Module):
 
     mass: Float[Array, "k k"]
     inverse: Float[Array, "k k"]
+    blocks: Float[Array, "N 6 6"] | None  # of the inverse, by bodies; None: of a system that is not made of bodies
     redundant: bool = eqx.field(static=True)  # whether constraints may be redundant
 
     @classmethod
@@ -48,7 +49,8 @@ class Inertia(eqx.Module):
         # N serves to solve only, and needs no derivative: that of the solution comes from M.
         fixed = lax.stop_gradient(mass)
         inverse = jnp.linalg.solve(fixed, jnp.eye(fixed.shape[0], dtype=fixed.dtype))
-        return cls(mass, inverse, softness(system) is not None)
+        blocks = system.body_blocks(inverse) if isinstance(system, AbstractSparseSystem) else None
+        return cls(mass, inverse, blocks, softness(system) is not None)
 
 
 class ConstrainedInertia(eqx.Module):
@@ -60,9 +62,18 @@ class ConstrainedInertia(eqx.Module):
     scale: Float[Array, " m"]  # D
 
     @classmethod
-    def of(cls, inertia: Inertia, jacobian) -> "ConstrainedInertia":
-        fixed = lax.stop_gradient(jacobian)
-        complement = fixed @ inertia.inverse @ fixed.T
+    def of(cls, inertia: Inertia, system: AbstractSystem, q) -> "ConstrainedInertia":
+        if inertia.blocks is None:
+            jacobian = system.constraint_jacobian(q)
+            weighted = jacobian @ inertia.inverse
+        else:
+            # B N of the rows of each joint and the two bodies that they have: with the arrays it takes three times
+            # as long as the factors of S
+            assert isinstance(system, AbstractSparseSystem)
+            sparse = system.sparse_constraint_jacobian(q)
+            jacobian, weighted = sparse.dense(), sparse.times_bodies(inertia.blocks).dense()
+        fixed, weighted = lax.stop_gradient((jacobian, weighted))
+        complement = weighted @ fixed.T
         scale = lax.rsqrt(jnp.diagonal(complement))
         unit = complement * scale[:, None] * scale[None, :]
         if inertia.redundant:
@@ -109,7 +120,7 @@ def equations_of_motion(system: AbstractSystem, q, v, vdot, lam, t):
 
 
 def _solved(inertia: Inertia, system: AbstractSystem, q, v, t):
-    kkt = ConstrainedInertia.of(inertia, system.constraint_jacobian(q))
+    kkt = ConstrainedInertia.of(inertia, system, q)
     free = jnp.zeros_like(v), jnp.zeros(kkt.jacobian.shape[0], v.dtype)
     left = equations_of_motion(system, q, v, *free, t)
     return kkt.solve(*jax.tree.map(jnp.negative, left)), kkt

@@ -101,6 +101,10 @@ class AbstractSparseSystem(AbstractSystem):
         """K_t, C_t and B; the columns of K_t and B by bodies."""
 
     @abc.abstractmethod
+    def body_blocks(self, matrix: Float[Array, "k k"]) -> Float[Array, "N 6 6"]:
+        """The rows and columns of each body in a matrix; zero where the body does not have the coordinate."""
+
+    @abc.abstractmethod
     def angular_velocities(self, v) -> Float[Array, "*n N 3"]:
         """Ω of each body, body frame, from v along leading axes, or Ω̇ from v̇; zero about axes that it does not have."""
 

@@ -121,6 +121,17 @@ class SparseMatrix(eqx.Module):
         scaled = [Blocks(chosen(scale, p.pattern.rows)[:, :, None] * p.values, p.pattern) for p in self.parts]
         return self._with(scaled)
 
+    def times_bodies(self, blocks: Float[Array, "N 6 6"]) -> "SparseMatrix":
+        """A diag(block_1, block_2, …): a block for the six columns of each body."""
+        parts = []
+        for part in self.parts:
+            slots = part.pattern.slots
+            assert slots is not None, "the columns of this matrix do not belong to bodies"
+            split = part.values.reshape(*part.values.shape[:2], slots.shape[1], 6)
+            turned = jnp.sum(split[..., :, None] * blocks[slots][:, None], axis=-2)
+            parts.append(Blocks(turned.reshape(part.values.shape), part.pattern))
+        return self._with(parts)
+
     def times_rotations(self, operators: Float[Array, "N 3 3"]) -> "SparseMatrix":
         """A diag(I, operator_1, I, operator_2, …): an operator for the three last of the columns of each body."""
         parts = []

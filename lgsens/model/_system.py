@@ -224,6 +224,11 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         k = self.group.dim
         return SparseMatrix(tuple(parts), (k, k), self.mass.dtype)
 
+    def body_blocks(self, matrix):
+        here = self.index
+        there = (here[:, :, None] >= 0) & (here[:, None, :] >= 0)
+        return jnp.where(there, matrix[here[:, :, None], here[:, None, :]], jnp.zeros((), matrix.dtype))
+
     def tangent_operators(self, x):
         # T is block diagonal: a unit vector for each of the three rotations, in all bodies at once, gives its columns.
         axes = self.index.T[ROTATION]
