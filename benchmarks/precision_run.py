@@ -222,5 +222,3 @@ def run(scenes: Iterable[str], chosen: Sequence[str] | None, repeats: int, path:
             "environment": environment(SINGLE_THREAD),
         }
         write(path, document)
-        del programs  # with their memory maps, of which a process has only so many
-        jax.clear_caches()

@@ -7,19 +7,24 @@
 The gradient is that of Ψ₀ with respect to stiffness, damping and the 30 coordinates of the hardpoints. Each family of
 programs runs at several numbers of steps or tolerances; its error is that of the gradient against the motion itself
 (the references of `rivals.py --references`), relative to the largest effect of a relative change of a parameter. For
-each error asked for, the fastest program of a family that reaches it stands in the table. All run in one process on one
-thread and take turns, `--repeats` rounds; medians count, compilation apart. Compiling takes many minutes: `--cache`
-keeps compiled programs in a folder, so that a run that was ended goes on.
+each error asked for, the fastest program of a family that reaches it stands in the table. All of a scene run in one
+process on one thread and take turns, `--repeats` rounds; medians count, compilation apart. Compiling takes many
+minutes: `--cache` keeps compiled programs in a folder, so that a run that was ended goes on.
 """
 
 import importlib
 import json
+import multiprocessing
 import os
 from pathlib import Path
 
 from benchmark import SINGLE_THREAD, options
 
 SCENES = ("quarter_car", "stiff_quarter_car")
+
+
+def measure(scene: str, *settings) -> None:
+    importlib.import_module("precision_run").run([scene], *settings)
 
 
 def main() -> None:
@@ -33,8 +38,14 @@ def main() -> None:
     path = arguments.out / "work_precision.json"
     os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
     if not (arguments.table or arguments.readme):
-        run = importlib.import_module("precision_run")
-        run.run(arguments.scenes, arguments.families, arguments.repeats, path, arguments.cache)
+        for scene in arguments.scenes:  # a process has memory maps for the programs of one of them
+            process = multiprocessing.get_context("spawn").Process(
+                target=measure, args=(scene, arguments.families, arguments.repeats, path, arguments.cache)
+            )
+            process.start()
+            process.join()
+            if process.exitcode:
+                raise SystemExit(f"The measurement of {scene} ended with {process.exitcode}.")
     tables = importlib.import_module("precision_tables")
     document = json.loads(path.read_text(encoding="utf-8"))
     text = tables.markdown(document)
