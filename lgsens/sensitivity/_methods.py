@@ -208,8 +208,14 @@ def _direct_rule(scheme, num_steps, primals, tangents):
     rows = jax.tree.map(lambda zeros: zeros[1:], zeros_like_trajectory(states))
     b = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), first, rows)
     product, forwards, backwards = _sweeps(scheme)
+
+    def matrix(unknown):
+        """L (δ, p'), of which every part seems to depend on the states: so none is constant in second derivatives."""
+        nothing = 0.0 * states.v[0, 0]
+        return jax.tree.map(lambda leaf: leaf + nothing * leaf, product(scheme, states, parameters, *unknown))
+
     delta, _ = lax.custom_linear_solve(
-        lambda unknown: product(scheme, states, parameters, *unknown),
+        matrix,
         (b, d_parameters),
         solve=lambda _, rhs: forwards(scheme, states, parameters, *rhs),
         transpose_solve=lambda _, rhs: backwards(scheme, states, parameters, *rhs),
