@@ -65,15 +65,13 @@ class ConstrainedInertia(eqx.Module):
     def of(cls, inertia: Inertia, system: AbstractSystem, q) -> "ConstrainedInertia":
         if inertia.blocks is None:
             jacobian = system.constraint_jacobian(q)
-            weighted = jacobian @ inertia.inverse
+            fixed = lax.stop_gradient(jacobian)
+            complement = fixed @ inertia.inverse @ fixed.T
         else:
-            # B N of the rows of each joint and the two bodies that they have: with the arrays it takes three times
-            # as long as the factors of S
+            # S by bodies: a gradient of the reduced quarter-car in 40 steps takes 44 ms, with products of arrays 52
             assert isinstance(system, AbstractSparseSystem)
             sparse = system.sparse_constraint_jacobian(q)
-            jacobian, weighted = sparse.dense(), sparse.times_bodies(inertia.blocks).dense()
-        fixed, weighted = lax.stop_gradient((jacobian, weighted))
-        complement = weighted @ fixed.T
+            jacobian, complement = sparse.dense(), lax.stop_gradient(sparse).congruence(inertia.blocks)
         scale = lax.rsqrt(jnp.diagonal(complement))
         unit = complement * scale[:, None] * scale[None, :]
         if inertia.redundant:

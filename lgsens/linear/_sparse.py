@@ -8,6 +8,7 @@ element, whatever the number of elements.
 """
 
 from collections.abc import Sequence
+from itertools import groupby
 from typing import Any
 
 import equinox as eqx
@@ -32,6 +33,12 @@ class Pattern:
 
     def transposed(self) -> "Pattern":
         return Pattern(self.columns, self.rows)
+
+    @property
+    def bodies(self) -> np.ndarray:
+        """`slots` of a pattern that has them."""
+        assert self.slots is not None, "the columns of this matrix do not belong to bodies"
+        return self.slots
 
 
 class Blocks(eqx.Module):
@@ -121,23 +128,11 @@ class SparseMatrix(eqx.Module):
         scaled = [Blocks(chosen(scale, p.pattern.rows)[:, :, None] * p.values, p.pattern) for p in self.parts]
         return self._with(scaled)
 
-    def times_bodies(self, blocks: Float[Array, "N 6 6"]) -> "SparseMatrix":
-        """A diag(block_1, block_2, …): a block for the six columns of each body."""
-        parts = []
-        for part in self.parts:
-            slots = part.pattern.slots
-            assert slots is not None, "the columns of this matrix do not belong to bodies"
-            split = part.values.reshape(*part.values.shape[:2], slots.shape[1], 6)
-            turned = jnp.sum(split[..., :, None] * blocks[slots][:, None], axis=-2)
-            parts.append(Blocks(turned.reshape(part.values.shape), part.pattern))
-        return self._with(parts)
-
     def times_rotations(self, operators: Float[Array, "N 3 3"]) -> "SparseMatrix":
         """A diag(I, operator_1, I, operator_2, …): an operator for the three last of the columns of each body."""
         parts = []
         for part in self.parts:
-            slots = part.pattern.slots
-            assert slots is not None, "the columns of this matrix do not belong to bodies"
+            slots = part.pattern.bodies
             width = part.values.shape[2] // slots.shape[1]
             split, own = part.values.reshape(*part.values.shape[:2], slots.shape[1], width), operators[slots][:, None]
             # written out, one loop over the result; as small products it took four times as long
@@ -145,6 +140,23 @@ class SparseMatrix(eqx.Module):
             whole = jnp.concatenate([split[..., : width - 3], turned], axis=-1)
             parts.append(Blocks(whole.reshape(part.values.shape), part.pattern))
         return self._with(parts)
+
+    def congruence(self, blocks: Float[Array, "N 6 6"]) -> Float[Array, "r r"]:
+        """A diag(block_1, block_2, …) Aᵀ as an array: only rows that a body has are multiplied with each other.
+
+        blocks: one for the six columns of each body, symmetric.
+        """
+        height = self.shape[0]
+        rows = [part.values.reshape(-1, 6) for part in self.parts]
+        entries = jnp.concatenate([*rows, jnp.zeros((1, 6), self.dtype)])
+        products, places = [jnp.zeros(0, self.dtype)], [np.zeros(0, int)]
+        for bodies, table, at in _rows_of_bodies([part.pattern for part in self.parts]):
+            panels = entries[table]
+            products.append(jnp.einsum("bij,brj,bsi->brs", blocks[bodies], panels, panels).ravel())
+            there = (at[:, :, None] >= 0) & (at[:, None, :] >= 0)
+            places.append(np.where(there, at[:, :, None] * height + at[:, None, :], height**2).ravel())
+        whole = jnp.zeros(height**2, self.dtype)
+        return whole.at[np.concatenate(places)].add(jnp.concatenate(products), mode="drop").reshape(height, height)
 
 
 def diagonal(values: Float[Array, " k"]) -> SparseMatrix:
@@ -184,6 +196,28 @@ def added(arrays: Sequence[tuple[Any, np.ndarray]], size: int, dtype=None) -> Fl
 
     gathered.defjvp(lambda primals, tangents: (gathered(*primals), scattered(*tangents)))
     return gathered(values)
+
+
+def _rows_of_bodies(patterns: Sequence[Pattern]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of bodies with about as many rows: their numbers (b,), which of all parts of rows that have one body they have
+    (b, rows), and the rows that these are parts of (b, rows). Shorter ones are padded: the one after the last, −1."""
+    shapes = [(len(p.rows), p.rows.shape[1], p.bodies.shape[1]) for p in patterns]
+    spread = lambda find, axis: [
+        np.broadcast_to(np.expand_dims(find(p), axis), shape).ravel() for p, shape in zip(patterns, shapes)
+    ]
+    rows = np.concatenate([*spread(lambda p: p.rows, 2), [-1]]).astype(int)
+    bodies = np.concatenate([*spread(lambda p: p.bodies, 1), [-1]])
+    own = {body: np.flatnonzero((bodies == body) & (rows >= 0)) for body in np.unique(bodies[rows >= 0])}
+    power = lambda body: (len(own[body]) - 1).bit_length()
+    found = []
+    for _, group in groupby(sorted(own, key=power), key=power):
+        group = np.fromiter(group, int)
+        most = max(len(own[body]) for body in group)
+        table = np.stack(
+            [np.pad(own[body], (0, most - len(own[body])), constant_values=len(rows) - 1) for body in group]
+        )
+        found.append((group, table, rows[table]))
+    return found
 
 
 def _table(places: np.ndarray, values: np.ndarray, size: int, *, nowhere: int) -> np.ndarray | None:

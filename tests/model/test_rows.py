@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.extend.core import jaxprs_in_params
+from helpers import equations
 from jaxtyping import Array, Float
 
 import lgsens as lg
@@ -88,13 +88,8 @@ def test_traced_and_given_numbers_make_the_same_system(scene):
 
 def arithmetic(jaxpr) -> Counter:
     """The operations of a jaxpr that compute, also those inside it: not what takes the leaves of bodies and joints."""
-    found = Counter()
-    for equation in jaxpr.eqns:
-        if equation.primitive.name in ("mul", "div", "sub", "add", "sqrt", "dot_general", "reduce_sum"):
-            found[equation.primitive.name] += 1
-        for inner in jaxprs_in_params(equation.params):
-            found += arithmetic(inner)
-    return found
+    counted = ("mul", "div", "sub", "add", "sqrt", "dot_general", "reduce_sum")
+    return Counter(each.primitive.name for each in equations(jaxpr) if each.primitive.name in counted)
 
 
 def test_the_equations_of_a_chain_take_as_many_operations_whatever_its_length():
