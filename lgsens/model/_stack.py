@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from lgsens.liegroups import Pose, R3xSO3
 from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint
-from lgsens.model._frames import BODY_A, BODY_B, Frame, ground_frame
+from lgsens.model._frames import ALL, BODY_A, BODY_B, Frame, ground_frame
 from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, LoadTangents
 from lgsens.model._rows import Row, joined
 from lgsens.model._topology import Ends
@@ -63,7 +63,7 @@ class Stack(eqx.Module, Generic[Element]):
         found = Ends(self.a, self.b, self.owners, self.kept)
         if not isinstance(self.elements, AbstractConstraint):
             return found
-        return found._replace(relative=self.elements.relative, coupled=self.elements.coupled)
+        return found._replace(relative=self.elements.relative, coupled=_coupled(self.elements))
 
     def map(self, function, ends: AtEnds, extra: Sequence[Any] = ()):
         """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra)` for every element; `ends`: of `at_ends`.
@@ -83,6 +83,18 @@ class Stack(eqx.Module, Generic[Element]):
             return function(element, Frame(position_a, orientation_a), Frame(position_b, orientation_b), *others)
 
         return jax.vmap(each, in_axes=(0, *axes, *extra_axes))(self.elements, *arrays, *extra)
+
+
+def _coupled(constraint: AbstractConstraint) -> tuple[tuple[int, ...], ...]:
+    """`coupled` of a constraint, validated: a coordinate in two sets would be added to K_t twice."""
+    sets = constraint.coupled
+    every = [coordinate for group in sets for coordinate in group]
+    if any(list(group) != sorted(group) for group in sets) or len(set(every)) < len(every) or set(every) - set(ALL):
+        raise ValueError(
+            f"{type(constraint).__name__}: `coupled` must be disjoint, increasing sets of coordinates from 0 to 11; "
+            f"got {sets!r}. Leave it out where all twelve may be coupled."
+        )
+    return sets
 
 
 def at_ends(stacks: Sequence[Stack], q: Pose, *arrays) -> list[AtEnds]:

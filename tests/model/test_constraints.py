@@ -13,6 +13,7 @@ from helpers import (
     random_body,
     random_point,
     random_rotation,
+    says,
 )
 
 import lgsens as lg
@@ -172,3 +173,20 @@ def test_constraint_without_tangents_gets_them():
         point = random_point(system, np.random.default_rng(seed))
         actual, expected = evaluate(own, point), evaluate(library, point)
         jax.tree.map(lambda x, y: close(x, y, ULPS), actual, expected)
+
+
+@pytest.mark.parametrize("sets", [((3, 4), (4, 5)), ((4, 3),), ((3, 3),), ((10, 11, 12),), ((-1, 0),)])
+def test_coupled_coordinates_are_validated(sets):
+    class Wrong(UserCoincidence):
+        @property
+        def coupled(self):
+            return sets
+
+    class Joint(UserJoint):
+        def constraints(self, a, b):
+            (right,) = UserJoint.constraints(self, a, b)
+            return (Wrong(right.point_a, right.point_b),)
+
+    model = lg.Model({"body": lg.RigidBody(1.0, (1.0, 1.0, 1.0))}, {"joint": Joint(None, "body", jnp.zeros(3))}, {})
+    with pytest.raises(ValueError, match=says("Wrong", "`coupled`", repr(sets), "Leave it out")):
+        model.system()
