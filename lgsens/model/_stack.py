@@ -53,6 +53,17 @@ class Stack(eqx.Module, Generic[Element]):
     kept: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
     places: tuple[int, ...] = eqx.field(static=True)
 
+    def __check_init__(self):
+        if not isinstance(self.elements, AbstractConstraint):
+            return
+        sets = self.elements.coupled
+        every = [coordinate for group in sets for coordinate in group]  # one in two sets would be added to K_t twice
+        if any(list(group) != sorted(group) for group in sets) or len(set(every)) < len(every) or set(every) - set(ALL):
+            raise ValueError(
+                f"{type(self.elements).__name__}: `coupled` must be disjoint, increasing sets of places from 0 to 11; "
+                f"got {sets!r}. Leave it out where all twelve may be coupled."
+            )
+
     @property
     def part(self) -> slice:
         """The element coordinates that belong to bodies; the ground has none."""
@@ -63,7 +74,7 @@ class Stack(eqx.Module, Generic[Element]):
         found = Ends(self.a, self.b, self.owners, self.kept)
         if not isinstance(self.elements, AbstractConstraint):
             return found
-        return found._replace(relative=self.elements.relative, coupled=_coupled(self.elements))
+        return found._replace(relative=self.elements.relative, coupled=self.elements.coupled)
 
     def map(self, function, ends: AtEnds, extra: Sequence[Any] = ()):
         """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra)` for every element; `ends`: of `at_ends`.
@@ -83,18 +94,6 @@ class Stack(eqx.Module, Generic[Element]):
             return function(element, Frame(position_a, orientation_a), Frame(position_b, orientation_b), *others)
 
         return jax.vmap(each, in_axes=(0, *axes, *extra_axes))(self.elements, *arrays, *extra)
-
-
-def _coupled(constraint: AbstractConstraint) -> tuple[tuple[int, ...], ...]:
-    """`coupled` of a constraint, validated: a coordinate in two sets would be added to K_t twice."""
-    sets = constraint.coupled
-    every = [coordinate for group in sets for coordinate in group]
-    if any(list(group) != sorted(group) for group in sets) or len(set(every)) < len(every) or set(every) - set(ALL):
-        raise ValueError(
-            f"{type(constraint).__name__}: `coupled` must be disjoint, increasing sets of coordinates from 0 to 11; "
-            f"got {sets!r}. Leave it out where all twelve may be coupled."
-        )
-    return sets
 
 
 def at_ends(stacks: Sequence[Stack], q: Pose, *arrays) -> list[AtEnds]:
