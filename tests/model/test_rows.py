@@ -95,3 +95,14 @@ def arithmetic(jaxpr) -> Counter:
 def test_the_equations_of_a_chain_take_as_many_operations_whatever_its_length():
     short, long = (arithmetic(jax.make_jaxpr(lambda model: model.system())(spatial_chain(n)).jaxpr) for n in (4, 12))
     assert short == long and sum(short.values()) > 10
+
+
+def test_poses_are_taken_once_for_each_side_of_all_elements(scene):
+    """Each gather's transpose is a scatter to compile; but of one alone XLA would make the poses anew for each end."""
+    system = scene.system()
+    program = jax.make_jaxpr(system.constraint)(system.pose)
+    orientations = system.pose.orientation.shape
+    taken = [
+        each.primitive.name == "gather" and each.invars[0].aval.shape == orientations for each in equations(program)
+    ]
+    assert sum(taken) == 2
