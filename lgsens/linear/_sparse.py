@@ -156,6 +156,7 @@ class SparseMatrix(eqx.Module):
             there = (at[:, :, None] >= 0) & (at[:, None, :] >= 0)
             places.append(np.where(there, at[:, :, None] * height + at[:, None, :], height**2).ravel())
         whole = jnp.zeros(height**2, self.dtype)
+        # a scatter: `added` would gather here, 10 instead of 5 µs for the reduced quarter-car
         return whole.at[np.concatenate(places)].add(jnp.concatenate(products), mode="drop").reshape(height, height)
 
 
@@ -201,12 +202,8 @@ def added(arrays: Sequence[tuple[Any, np.ndarray]], size: int, dtype=None) -> Fl
 def _rows_of_bodies(patterns: Sequence[Pattern]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Of bodies with about as many rows: their numbers (b,), which of all parts of rows that have one body they have
     (b, rows), and the rows that these are parts of (b, rows). Shorter ones are padded: the one after the last, −1."""
-    shapes = [(len(p.rows), p.rows.shape[1], p.bodies.shape[1]) for p in patterns]
-    spread = lambda find, axis: [
-        np.broadcast_to(np.expand_dims(find(p), axis), shape).ravel() for p, shape in zip(patterns, shapes)
-    ]
-    rows = np.concatenate([*spread(lambda p: p.rows, 2), [-1]]).astype(int)
-    bodies = np.concatenate([*spread(lambda p: p.bodies, 1), [-1]])
+    ends = [np.broadcast_arrays(p.rows[:, :, None], p.bodies[:, None, :]) for p in patterns]
+    rows, bodies = (np.concatenate([*(end[i].ravel() for end in ends), [-1]]).astype(int) for i in range(2))
     own = {body: np.flatnonzero((bodies == body) & (rows >= 0)) for body in np.unique(bodies[rows >= 0])}
     power = lambda body: (len(own[body]) - 1).bit_length()
     found = []

@@ -94,7 +94,7 @@ def operations(jaxpr):
     """Every operation in a jaxpr with the shapes it works on, also in those inside it."""
     for equation in equations(jaxpr):
         # what holds other operations may pass numbers on, those of the parts too
-        holds = any(True for _ in jaxprs_in_params(equation.params))
+        holds = list(jaxprs_in_params(equation.params))
         yield equation.primitive.name, *([] if holds else [getattr(v.aval, "shape", ()) for v in equation.outvars])
 
 
