@@ -21,6 +21,7 @@ from lgsens.model import (
     Orthogonality,
     SpringDamperLoad,
 )
+from lgsens.model._loads import Weight
 from lgsens.testing import CheckError, check_force, check_joint, check_sensitivities
 
 POINT, AXIS = (0.3, -0.7, 1.1), (1.0, 2.0, -0.5)
@@ -76,6 +77,12 @@ WRONG_CONSTRAINTS = {
         {"coupled": property(lambda self: ((3, 4, 5), (9, 10, 11)))},
         {"K = ∂(Bᵀλ)/∂x"},
         "rx_b]: 0, not",
+    ),
+    "a column left out": (
+        Coincidence,
+        {"acts_on": property(lambda self: (3, 4, 5, 9, 10, 11))},
+        {"B", "Bᵀλ"},
+        "[0, x_a]: 0, not",
     ),
     "stiffness transposed": (Coincidence, {"geometric_stiffness": unsymmetric}, {"K = ∂(Bᵀλ)/∂x"}, "K = ∂(Bᵀλ)/∂x"),
 }
@@ -233,6 +240,14 @@ def test_wrong_load(rule):
     assert failed(check_force(Kite(jnp.asarray(0.3), rule), potential=no_energy)) == WRONG_LOADS[rule]
 
 
+class Level(Weight):
+    """A weight that forgets its vertical component."""
+
+    @property
+    def acts_on(self):
+        return (6, 7)
+
+
 def test_wrong_potential_and_what_has_no_reaction():
     spring = SpringDamperLoad(*map(jnp.asarray, (POINT, AXIS, 3.0, 0.2, 0.4, 1.0)))
 
@@ -247,6 +262,7 @@ def test_wrong_potential_and_what_has_no_reaction():
     assert failed(check_force(spring, potential=energy(1.0))) == {("Q at rest", "given, −∂E/∂q")}
     gravity = lg.Gravity((0.0, 0.0, -9.81))
     assert check_force(gravity)
+    assert failed(check_force(Level(jnp.asarray(2.0), jnp.asarray(AXIS)), balanced=False)) == {("Q", "elsewhere, 0")}
     assert check_force(lg.AppliedForce("b", at=POINT, force=AXIS, signal=lg.BumpRoad(height=0.1, duration=0.5)))
 
 

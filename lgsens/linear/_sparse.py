@@ -147,7 +147,10 @@ class SparseMatrix(eqx.Module):
         blocks: one for the six columns of each body, symmetric.
         """
         height = self.shape[0]
-        rows = [part.values.reshape(-1, 6) for part in self.parts]
+        widths = [part.values.shape[2] // part.pattern.bodies.shape[1] for part in self.parts]  # 6 or the rotations' 3
+        rows = [
+            jnp.pad(part.values.reshape(-1, width), ((0, 0), (6 - width, 0))) for part, width in zip(self.parts, widths)
+        ]
         entries = jnp.concatenate([*rows, jnp.zeros((1, 6), self.dtype)])
         products, places = [jnp.zeros(0, self.dtype)], [np.zeros(0, int)]
         for bodies, table, at in _rows_of_bodies([part.pattern for part in self.parts]):

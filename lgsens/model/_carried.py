@@ -82,6 +82,10 @@ class _CarriedConstraint(AbstractConstraint):
     def relative(self):
         return self.element.relative
 
+    @property
+    def acts_on(self):
+        return self.element.acts_on
+
     def value(self, a, b):
         return self.element.value(_frame(a, self.a), _frame(b, self.b))
 

@@ -49,6 +49,11 @@ class AbstractConstraint(eqx.Module):
         square block of each, and these alone are added to K_t."""
         return (ALL,)
 
+    @property
+    def acts_on(self) -> tuple[int, ...]:
+        """The coordinates 0 … 11 that Φ depends on, all of them or the six rotations: B has no other columns."""
+        return ALL
+
     @abc.abstractmethod
     def value(self, a: Frame, b: Frame) -> Float[Array, " rows"]:
         """Φ at the given poses, zero when satisfied."""
@@ -121,8 +126,12 @@ class Orthogonality(AbstractClosedFormConstraint):
         return True
 
     @property
+    def acts_on(self):
+        return TURNING_A + TURNING_B
+
+    @property
     def coupled(self):
-        return (TURNING_A + TURNING_B,)
+        return (self.acts_on,)
 
     def value(self, a, b):
         return jnp.sum(a.axis(self.axis_a) * b.axis(self.axis_b))[None]

@@ -17,7 +17,7 @@ BODY_DIM = 6
 BODY_A, BODY_B = slice(0, 6), slice(6, 12)
 ROTATION = slice(3, 6)  # within one body
 ROTATION_A, TRANSLATION_B, ROTATION_B = slice(3, 6), slice(6, 9), slice(9, 12)  # within an element's 12
-ALL, TURNING_A, TURNING_B = tuple(range(12)), (3, 4, 5), (9, 10, 11)
+ALL, TRANSLATING_B, TURNING_A, TURNING_B = tuple(range(12)), (6, 7, 8), (3, 4, 5), (9, 10, 11)
 
 
 def embedded(part: Array, *places: slice | None) -> Array:

@@ -14,10 +14,12 @@ from jaxtyping import Array, Float
 
 from lgsens.liegroups import cross, skew
 from lgsens.model._frames import (
+    ALL,
     BODY_B,
     ROTATION,
     ROTATION_A,
     ROTATION_B,
+    TRANSLATING_B,
     TRANSLATION_B,
     Frame,
     embedded,
@@ -38,6 +40,11 @@ class LoadTangents(NamedTuple):
 class AbstractLoad(eqx.Module):
     """A force between the frames of two bodies; its tangents come from autodiff."""
 
+    @property
+    def acts_on(self) -> tuple[int, ...]:
+        """The entries 0 … 11 of Q that may be other than zero: no others are added to the residual."""
+        return ALL
+
     @abc.abstractmethod
     def force(self, a: Frame, b: Frame, va, vb, t) -> Float[Array, "12"]:
         """Q at the given poses, velocities [ẋ, Ω] of shape (6,) each, and time [s]."""
@@ -56,6 +63,10 @@ class Weight(AbstractClosedFormLoad):
 
     mass: Float[Array, ""]
     acceleration: Float[Array, "3"]
+
+    @property
+    def acts_on(self):
+        return TRANSLATING_B
 
     def force(self, a, b, va, vb, t):
         return embedded(self.mass * self.acceleration, TRANSLATION_B)

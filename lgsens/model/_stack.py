@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from lgsens.liegroups import Pose, R3xSO3
 from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint
-from lgsens.model._frames import ALL, BODY_A, BODY_B, Frame, ground_frame
+from lgsens.model._frames import ALL, BODY_A, BODY_B, TURNING_A, TURNING_B, Frame, ground_frame
 from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, LoadTangents
 from lgsens.model._rows import Row, joined
 from lgsens.model._topology import Ends
@@ -54,13 +54,24 @@ class Stack(eqx.Module, Generic[Element]):
     places: tuple[int, ...] = eqx.field(static=True)
 
     def __check_init__(self):
+        name, acts_on = type(self.elements).__name__, self.elements.acts_on
         if not isinstance(self.elements, AbstractConstraint):
+            if list(acts_on) != sorted(set(acts_on) & set(ALL)) or not acts_on:
+                raise ValueError(
+                    f"{name}: `acts_on` must be increasing places from 0 to 11; got {acts_on!r}. Leave it out where "
+                    "any entry of the force may be other than zero."
+                )
             return
+        if acts_on not in (ALL, TURNING_A + TURNING_B):
+            raise ValueError(
+                f"{name}: `acts_on` of a constraint must be {ALL} or the rotations {TURNING_A + TURNING_B}; got "
+                f"{acts_on!r}. Leave it out where Φ depends on a position."
+            )
         sets = self.elements.coupled
         every = [coordinate for group in sets for coordinate in group]  # one in two sets would be added to K_t twice
         if any(list(group) != sorted(group) for group in sets) or len(set(every)) < len(every) or set(every) - set(ALL):
             raise ValueError(
-                f"{type(self.elements).__name__}: `coupled` must be disjoint, increasing sets of places from 0 to 11; "
+                f"{name}: `coupled` must be disjoint, increasing sets of places from 0 to 11; "
                 f"got {sets!r}. Leave it out where all twelve may be coupled."
             )
 
@@ -69,9 +80,13 @@ class Stack(eqx.Module, Generic[Element]):
         """The element coordinates that belong to bodies; the ground has none."""
         return BODY_B if self.a is None else BODY_A if self.b is None else slice(BODY_A.start, BODY_B.stop)
 
+    def acting(self, arrays: Float[Array, "... 12"]) -> Float[Array, "... p"]:
+        """The entries that belong to bodies and that the element acts on, in the order of `Topology`'s columns."""
+        return entries_at(arrays[..., self.part], self.ends.places(self.elements.acts_on))
+
     @property
     def ends(self) -> Ends:
-        found = Ends(self.a, self.b, self.owners, self.kept)
+        found = Ends(self.a, self.b, self.owners, self.kept, acts_on=self.elements.acts_on)
         if not isinstance(self.elements, AbstractConstraint):
             return found
         return found._replace(relative=self.elements.relative, coupled=self.elements.coupled)
@@ -170,12 +185,17 @@ def constraint_stiffness(element: AbstractConstraint, a: Frame, b: Frame, lam):
     return jax.jacfwd(lambda x: lam @ constraint_jacobian(element, moved(a, x[BODY_A]), moved(b, x[BODY_B])))(zero)
 
 
+def entries_at(arrays: Float[Array, "... n"], places: np.ndarray, axis: int = -1) -> Float[Array, "... p"]:
+    """The entries at increasing `places` along an axis, by slices, of which XLA computes no others."""
+    if not len(places):
+        return lax.slice_in_dim(arrays, 0, 0, axis=axis)
+    runs = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1)
+    return jnp.concatenate([lax.slice_in_dim(arrays, run[0], run[-1] + 1, axis=axis) for run in runs], axis=axis)
+
+
 def square_blocks(matrices: Float[Array, "e n n"], places: np.ndarray) -> Float[Array, "e p p"]:
-    """The rows and columns at increasing `places`, by slices, of which XLA computes no others."""
-    runs = [slice(run[0], run[-1] + 1) for run in np.split(places, np.flatnonzero(np.diff(places) > 1) + 1)]
-    return jnp.concatenate(
-        [jnp.concatenate([matrices[:, rows, columns] for columns in runs], axis=2) for rows in runs], axis=1
-    )
+    """The rows and columns at increasing `places`."""
+    return entries_at(entries_at(matrices, places), places, axis=1)
 
 
 def load_tangents(element: AbstractLoad, a: Frame, b: Frame, va, vb, t) -> LoadTangents:

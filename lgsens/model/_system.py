@@ -254,12 +254,12 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             moment = moment + jax.vmap(cross)(spin, turned(self.inertia, spin))
         topology = self.topology
         forces = [(jnp.concatenate([force, moment], axis=1), topology.mass.rows)]
-        for stack, ends, pattern in zip(self.loads, at_ends(self.loads, q, twist), topology.loads):
+        for stack, ends, coordinates in zip(self.loads, at_ends(self.loads, q, twist), topology.forces):
             force = stack.map(lambda e, a, b, va, vb, t: e.force(a, b, va, vb, t), ends, (t,))
-            forces.append((-force[:, stack.part], pattern.rows))
+            forces.append((-stack.acting(force), coordinates))
         for stack, ends, pattern in zip(self.constraints, at_ends(self.constraints, q), topology.jacobian):
             force = stack.map(constraint_force, ends, (chosen(lam, pattern.rows),))
-            forces.append((force[:, stack.part], pattern.columns))
+            forces.append((stack.acting(force), pattern.columns))
         return added(forces, self.group.dim, v.dtype)
 
     @_traced_once
@@ -278,7 +278,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     def sparse_constraint_jacobian(self, q):
         q = self._placed(q)
         parts = [
-            Blocks(stack.map(constraint_jacobian, ends)[:, :, stack.part], pattern)
+            Blocks(stack.acting(stack.map(constraint_jacobian, ends)), pattern)
             for stack, ends, pattern in zip(self.constraints, at_ends(self.constraints, q), self.topology.jacobian)
         ]
         return SparseMatrix(tuple(parts), (self.topology.num_constraints, self.group.dim), self.mass.dtype)

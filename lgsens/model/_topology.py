@@ -7,7 +7,7 @@ import numpy as np
 
 from lgsens.liegroups import Poses
 from lgsens.linear import AbstractLinearSolver, Elimination, Graph, Joint, Pattern, elimination
-from lgsens.model._frames import BODY_DIM, ROTATION
+from lgsens.model._frames import ALL, BODY_DIM, ROTATION
 
 
 class Ends(NamedTuple):
@@ -19,11 +19,17 @@ class Ends(NamedTuple):
     kept: tuple[tuple[bool, ...], ...]
     relative: bool = False  # of constraints, as in `AbstractConstraint`
     coupled: tuple[tuple[int, ...], ...] = ()  # likewise
+    acts_on: tuple[int, ...] = ALL  # likewise, and of loads
 
     @property
     def slots(self) -> np.ndarray:
         """The bodies of each element, shape (elements, 1 or 2)."""
         return np.stack([np.asarray(side, int) for side in (self.a, self.b) if side is not None], axis=1)
+
+    def places(self, coordinates: tuple[int, ...]) -> np.ndarray:
+        """Where these of the twelve are among those of bodies; the ground has none."""
+        places = np.asarray(coordinates, int) - (0 if self.a is not None else BODY_DIM)
+        return places[(places >= 0) & (places < BODY_DIM * self.slots.shape[1])]
 
 
 class Topology:
@@ -44,8 +50,10 @@ class Topology:
         self.loads = [self._square(ends) for ends in loads]
         self.stiffness = [self._stiffness(ends) for ends in constraints]
         self.jacobian = [
-            Pattern(rows, self.coordinates(ends), ends.slots) for rows, ends in zip(self.rows, constraints)
+            Pattern(rows, self.coordinates(ends)[:, ends.places(ends.acts_on)], ends.slots)
+            for rows, ends in zip(self.rows, constraints)
         ]
+        self.forces = [self.coordinates(ends)[:, ends.places(ends.acts_on)] for ends in loads]
 
     def coordinates(self, ends: Ends) -> np.ndarray:
         """The coordinates of each element's bodies, shape (elements, 6 or 12); −1 where a body has none."""
@@ -58,10 +66,8 @@ class Topology:
     def _stiffness(self, ends: Ends) -> list[tuple[np.ndarray, Pattern]]:
         """Of each set of coupled coordinates those of bodies, by their places among these, and where they are."""
         coordinates, found = self.coordinates(ends), []
-        first = 0 if ends.a is not None else BODY_DIM  # the ground has none
         for group in ends.coupled:
-            places = np.asarray(group) - first
-            places = places[(places >= 0) & (places < coordinates.shape[1])]
+            places = ends.places(group)
             if len(places):
                 own = coordinates[:, places]
                 found.append((places, Pattern(own, own, ends.slots[:, np.unique(places // BODY_DIM)])))

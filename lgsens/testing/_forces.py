@@ -31,8 +31,9 @@ def check_force(
     """Check a force element, or one load, whose generalized force is Q = [F_a, M_a, F_b, M_b].
 
     At random poses, velocities and times: ∂Q/∂q under the retraction R exp(θ̃) and ∂Q/∂v, by autodiff and by
-    differences; of a load in closed form, `tangents` against autodiff, None standing for zero. Q by every number of it,
-    as `check_sensitivities` does. Between two bodies, action and reaction:
+    differences; of a load in closed form, `tangents` against autodiff, None standing for zero. That Q is zero where it
+    does not say that it `acts_on`. Q by every number of it, as `check_sensitivities` does. Between two bodies, action
+    and reaction:
 
         F_a + F_b = 0,     x_a × F_a + R_a M_a + x_b × F_b + R_b M_b = 0
 
@@ -100,6 +101,7 @@ def _program(load: AbstractLoad, potential: Potential | None, free):
         q, resting = force(zero, v), force(zero, zero)
         found = {
             "Q": q,
+            "Q elsewhere": q[np.setdiff1d(np.arange(DIM), load.acts_on)],
             "∂Q/∂q": position[:, free],
             "∂Q/∂v": velocity[:, free],
             "∂Q/∂q by autodiff": jax.jacfwd(force)(zero, v)[:, free],
@@ -128,6 +130,8 @@ def _compared(label: str, closed_form: bool, balanced: bool, by_position, by_vel
             yield same(label + name, found[name], found[f"{name} by autodiff"])
         yield slope(label + name, found[f"{name} by autodiff"], found["Q"])
     size = float(np.abs(by_position["Q"].value).max(initial=0.0))
+    if by_position["Q elsewhere"].value.size:
+        yield vanishes(f"{label}Q", "elsewhere, 0", by_position["Q elsewhere"], size)
     if balanced:
         yield vanishes(f"{label}F_a + F_b", "action, reaction", by_position["F_a + F_b"], size)
         yield vanishes(f"{label}moment of both", "action, reaction", by_position["moment of both"], size * length)

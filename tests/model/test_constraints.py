@@ -19,13 +19,18 @@ from helpers import (
 import lgsens as lg
 from lgsens.model import (
     AbstractConstraint,
+    AbstractForce,
     AbstractJoint,
+    AbstractLoad,
+    Attached,
     Coincidence,
     Distance,
     Frame,
     InPlane,
     Orthogonality,
 )
+from lgsens.model._loads import Weight
+from lgsens.model._stack import Stack
 from lgsens.testing import check_joint
 
 KINDS = {"Coincidence": Coincidence, "Orthogonality": Orthogonality, "InPlane": InPlane, "Distance": Distance}
@@ -175,6 +180,17 @@ def test_constraint_without_tangents_gets_them():
         jax.tree.map(lambda x, y: close(x, y, ULPS), actual, expected)
 
 
+def made_of(kind):
+    """A joint to the ground that is made of this kind of `UserCoincidence`."""
+
+    class Joint(UserJoint):
+        def constraints(self, a, b):
+            (right,) = UserJoint.constraints(self, a, b)
+            return (kind(right.point_a, right.point_b),)
+
+    return Joint(None, "body", jnp.zeros(3))
+
+
 @pytest.mark.parametrize("sets", [((3, 4), (4, 5)), ((4, 3),), ((3, 3),), ((10, 11, 12),), ((-1, 0),)])
 def test_coupled_coordinates_are_validated(sets):
     class Wrong(UserCoincidence):
@@ -182,11 +198,78 @@ def test_coupled_coordinates_are_validated(sets):
         def coupled(self):
             return sets
 
-    class Joint(UserJoint):
-        def constraints(self, a, b):
-            (right,) = UserJoint.constraints(self, a, b)
-            return (Wrong(right.point_a, right.point_b),)
-
-    model = lg.Model({"body": lg.RigidBody(1.0, (1.0, 1.0, 1.0))}, {"joint": Joint(None, "body", jnp.zeros(3))}, {})
+    model = lg.Model({"body": lg.RigidBody(1.0, (1.0, 1.0, 1.0))}, {"joint": made_of(Wrong)}, {})
     with pytest.raises(ValueError, match=says("Wrong", "`coupled`", repr(sets), "Leave it out")):
         model.system()
+
+
+ROTATIONS = (3, 4, 5, 9, 10, 11)
+
+
+@pytest.mark.parametrize("places", [(3, 4, 5), (0, 1, 2), (9, 10, 11, 3, 4, 5), ()])
+def test_what_a_constraint_acts_on_is_validated(places):
+    class Wrong(UserCoincidence):
+        @property
+        def acts_on(self):
+            return places
+
+    model = lg.Model({"body": lg.RigidBody(1.0, (1.0, 1.0, 1.0))}, {"joint": made_of(Wrong)}, {})
+    with pytest.raises(ValueError, match=says("Wrong", "`acts_on`", repr(ROTATIONS), repr(places), "Leave it out")):
+        model.system()
+
+
+@pytest.mark.parametrize("places", [(7, 6), (6, 6), (11, 12), (-1, 0), ()])
+def test_what_a_load_acts_on_is_validated(places):
+    class Wrong(Weight):
+        @property
+        def acts_on(self):
+            return places
+
+    stacked = Wrong(jnp.ones(1), jnp.ones((1, 3)))
+    with pytest.raises(ValueError, match=says("Wrong", "`acts_on`", repr(places), "Leave it out")):
+        Stack(elements=stacked, a=None, b=(0,), owners=("weight",), kept=((),), places=(0,))
+
+
+def test_only_what_elements_act_on_is_added():
+    """Of a hinge's five equations the three of its point have all columns, the two of its axis those of rotations; a
+    weight adds a force, and no moment."""
+    rng = np.random.default_rng(5)
+    bodies = {name: random_body(rng) for name in ("one", "two")}
+    joints = {"hinge": lg.RevoluteJoint("one", "two", at=jnp.zeros(3), axis=jnp.asarray([0.0, 0.0, 1.0]))}
+    system = lg.Model(bodies, joints, {"gravity": lg.Gravity(GRAVITY)}).system()
+    q, _ = system.reference()
+    assert [part.values.shape for part in system.sparse_constraint_jacobian(q).parts] == [(1, 3, 12), (2, 1, 6)]
+    assert [places.shape for places in system.topology.forces] == [(2, 3)]
+
+
+class Anchor(AbstractLoad):
+    """A force on the first body, or on the ground in its place."""
+
+    size: jax.Array
+
+    @property
+    def acts_on(self):
+        return (0, 1, 2)
+
+    def force(self, a, b, va, vb, t):
+        return jnp.zeros(12).at[0].set(self.size)
+
+
+class AnchorForce(AbstractForce):
+    a: str | None = eqx.field(static=True)
+
+    @property
+    def bodies(self):
+        return (self.a, "two")
+
+    def loads(self, bodies):
+        return (Attached(Anchor(jnp.asarray(3.0)), self.a, "two"),)
+
+
+@pytest.mark.parametrize("a, expected", [("one", -3.0), (None, 0.0)])
+def test_a_load_may_act_on_the_ground_alone(a, expected):
+    rng = np.random.default_rng(6)
+    system = lg.Model({name: random_body(rng) for name in ("one", "two")}, {}, {"anchor": AnchorForce(a)}).system()
+    q, _ = system.reference()
+    zero = jnp.zeros(system.group.dim)
+    np.testing.assert_array_equal(system.residual(q, zero, zero, zero[:0], 0.0), zero.at[0].set(expected))
