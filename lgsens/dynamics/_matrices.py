@@ -76,12 +76,12 @@ def factorized(
 ) -> Factors:
     """The factors of [[A, U], [L, 0]] by the linear solver of the system; `kind`, `softness` as in `Factors.of`.
 
-    `exact`: never of mixed precision.
+    `exact`: never of mixed precision, nor rounded.
     """
     sparse = system if isinstance(system, AbstractSparseSystem) else None
     plan, solver = (None, None) if sparse is None else (sparse.elimination, sparse.linear_solver)
     mixed = solver is not None and solver.mixed and not exact
-    return Factors.of(dynamic, upper, lower, scale, plan=plan, kind=kind, softness=softness, mixed=mixed)
+    return Factors.of(dynamic, upper, lower, scale, plan=plan, kind=kind, softness=softness, mixed=mixed, exact=exact)
 
 
 def for_once(*matrices: Matrix) -> tuple[Matrix, ...]:

@@ -187,7 +187,9 @@ def raveled(tree):
     flat, unravel = ravel_pytree(tree)
 
     def cut(vector):
-        return jax.tree.map(lambda leaf: leaf if leaf.size else jnp.broadcast_to(vector[0], leaf.shape), unravel(vector))
+        return jax.tree.map(
+            lambda leaf: leaf if leaf.size else jnp.broadcast_to(vector[0], leaf.shape), unravel(vector)
+        )
 
     return flat, cut
 

@@ -13,7 +13,7 @@ import lgsens as lg
 from lgsens.dynamics import mass_matrix, tangents
 from lgsens.examples import QuarterCar, four_bar, spatial_chain, spinning_top
 from lgsens.integrate import factorize_iteration_matrix
-from lgsens.linear import LU, Inverse
+from lgsens.linear import LU, Factors, Inverse
 from lgsens.linear._mixed import Refined, Rounded, factors_of
 
 SINGLE = float(np.finfo(np.float32).eps)
@@ -161,3 +161,49 @@ def test_gradients_by_every_number_are_those_of_double_precision(name):
 def test_bad_setting():
     with pytest.raises(ValueError, match=says("BlockSparse: `mixed` must be True or False, got 'yes'")):
         lg.BlockSparse(mixed="yes")
+
+
+LINKS = 40  # of 238 unknowns: 57,000 numbers in a dense inverse
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-45, 1e45])
+def test_an_inverse_of_many_numbers_is_rounded_in_any_unit(unit):
+    """Beyond 1e38 single precision has no numbers: S and the right-hand side are in units of the largest of S."""
+    matrix = conditioned(1e3, size=200)
+    k = 150
+    parts = (matrix[:k, :k], matrix[:k, k:], matrix[k:, :k])
+    b = np.random.default_rng(1).normal(size=len(matrix))
+    matrix[k:, k:] = 0.0
+    expected = np.linalg.solve(matrix, b)
+    factors = {
+        exact: Factors.of(*(jnp.asarray(unit * part) for part in parts), jnp.ones(()), kind=Inverse, exact=exact)
+        for exact in (False, True)
+    }
+    assert isinstance(factors[False].factors, Rounded) and isinstance(factors[True].factors, Inverse)
+    # a few round-offs times the condition of the whole
+    condition = np.linalg.cond(matrix)
+    for exact, eps in ((False, SINGLE), (True, EPS)):
+        solution = np.concatenate(factors[exact].solve(jnp.asarray(unit * b[:k]), jnp.asarray(unit * b[k:])))
+        error = np.abs(solution - expected).max() / np.abs(expected).max()
+        assert error < 4 * condition * eps
+        assert exact or error > 0.01 * SINGLE
+    assert isinstance(Factors.of(*map(jnp.asarray, parts), jnp.ones(()), kind=LU).factors, LU)
+    single = (jnp.asarray(part, jnp.float32) for part in parts)
+    assert isinstance(Factors.of(*single, jnp.ones((), jnp.float32), kind=Inverse).factors, Inverse)
+
+
+def test_steps_with_a_rounded_inverse_are_those_of_full_newton():
+    """Residuals are in double precision, so the motion is."""
+    model = spatial_chain(LINKS)
+    dense = lg.Model(model.bodies, model.joints, model.forces, linear_solver=lg.DenseLU())
+    rounded, full = (
+        lg.simulate(dense, t1=0.02, num_steps=20, integrator=lg.GeneralizedAlpha(factor_every=every))
+        for every in (20, 0)
+    )
+    assert len(rounded.states.v[0]) + len(rounded.states.lam[0]) >= 181  # the root of 2¹⁵
+    # each step adds the round-off of positions, in velocities over h; with an inverse in double precision the two differ
+    # by half as much
+    roundoff = 4 * 20 * EPS * float(np.ptp(np.asarray(full.states.q.position)))
+    np.testing.assert_allclose(rounded.states.q.position, full.states.q.position, rtol=0, atol=roundoff)
+    np.testing.assert_allclose(rounded.states.v, full.states.v, rtol=0, atol=roundoff / 1e-3)
+    assert int(rounded.stats.iterations.max()) <= 8  # as many as in double precision: it contracts
