@@ -201,8 +201,8 @@ def test_steps_with_a_rounded_inverse_are_those_of_full_newton():
         for every in (20, 0)
     )
     assert len(rounded.states.v[0]) + len(rounded.states.lam[0]) >= 181  # the root of 2¹⁵
-    # each step adds the round-off of positions, in velocities over h; with an inverse in double precision the two differ
-    # by half as much
+    # each step adds the round-off of positions, in velocities over h; with an inverse in double precision the two
+    # differ by half as much
     roundoff = 4 * 20 * EPS * float(np.ptp(np.asarray(full.states.q.position)))
     np.testing.assert_allclose(rounded.states.q.position, full.states.q.position, rtol=0, atol=roundoff)
     np.testing.assert_allclose(rounded.states.v, full.states.v, rtol=0, atol=roundoff / 1e-3)
