@@ -1,5 +1,6 @@
 """The matrix of a step, bordered by its constraints, in factors."""
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -42,30 +43,21 @@ class Factors(eqx.Module):
         """`plan`: None for arrays. `kind`: LU or `Inverse` of what is dense. `softness`: c of −diag(c) instead of 0.
         `mixed`: of mixed precision. `exact`: an `Inverse` of many numbers is kept as it is, not rounded."""
         m, size = lower.shape[0], dynamic.shape[0] + lower.shape[0]
-        numbers = size**2 if plan is None else plan.numbers
-        rounded = kind is Inverse and dynamic.dtype == jnp.float64 and numbers >= _MANY and not mixed and not exact
-
-        def of(values, matrix):
-            factors = lambda values: factors_of(matrix(values), kind, mixed=mixed)
-            return cls(rounded_inverse(values, factors) if rounded else factors(values), scale)
-
         corner = None if softness is None else -(scale**2) * softness
         if not isinstance(dynamic, SparseMatrix):
             above = jnp.concatenate([dynamic, scale * upper], axis=1)
             below = jnp.concatenate(
                 [scale * lower, jnp.zeros((m, m), dynamic.dtype) if corner is None else jnp.diag(corner)], axis=1
             )
-            return of(jnp.concatenate([above, below]), lambda array: array)
-        assert plan is not None
-        k = dynamic.shape[0]
-        (a, *at), (u, rows_u, columns_u), (b, rows_b, columns_b) = (x.entries() for x in (dynamic, upper, lower))
-        values = jnp.concatenate([a, scale * u, scale * b])
-        rows = np.concatenate([at[0], rows_u, k + rows_b])
-        columns = np.concatenate([at[1], k + columns_u, columns_b])
-        if corner is not None:
-            own = np.arange(k, k + m)
-            values, rows, columns = (jnp.concatenate([values, corner]), *(np.append(x, own) for x in (rows, columns)))
-        return of(values, lambda values: BlockMatrix.of(plan, values, rows, columns))
+            numbers, values = size**2, jnp.concatenate([above, below])
+            factors = partial(factors_of, kind=kind, mixed=mixed)
+        else:
+            assert plan is not None
+            numbers, (values, rows, columns) = plan.numbers, _bordered(dynamic, upper, lower, scale, corner)
+            factors = lambda values: factors_of(BlockMatrix.of(plan, values, rows, columns), kind, mixed=mixed)
+        if kind is Inverse and values.dtype == jnp.float64 and numbers >= _MANY and not (mixed or exact):
+            return cls(rounded_inverse(values, factors), scale)
+        return cls(factors(values), scale)
 
     def largest_inverse(self) -> Float[Array, ""]:
         """The largest number in the inverses of a sparse matrix with `Inverse`: of blocks, and of what is left."""
@@ -78,3 +70,14 @@ class Factors(eqx.Module):
         k = force.shape[0]
         solution = self.factors.solve(jnp.concatenate([force, self.scale * rate]), transposed=transposed)
         return solution[:k], self.scale * solution[k:]
+
+
+def _bordered(dynamic: SparseMatrix, upper: SparseMatrix, lower: SparseMatrix, scale, corner):
+    """The entries of S, flat, and their rows and columns."""
+    k, size = dynamic.shape[0], dynamic.shape[0] + lower.shape[0]
+    (a, *at), (u, rows_u, columns_u), (b, rows_b, columns_b) = (x.entries() for x in (dynamic, upper, lower))
+    values, own = [a, scale * u, scale * b], np.arange(k, size)
+    rows, columns = [at[0], rows_u, k + rows_b], [at[1], k + columns_u, columns_b]
+    if corner is not None:
+        values, rows, columns = [*values, corner], [*rows, own], [*columns, own]
+    return jnp.concatenate(values), np.concatenate(rows), np.concatenate(columns)
