@@ -42,14 +42,15 @@ class Factors(eqx.Module):
     ) -> "Factors":
         """`plan`: None for arrays. `kind`: LU or `Inverse` of what is dense. `softness`: c of −diag(c) instead of 0.
         `mixed`: of mixed precision. `exact`: an `Inverse` of many numbers is kept as it is, not rounded."""
-        m, size = lower.shape[0], dynamic.shape[0] + lower.shape[0]
+        m = lower.shape[0]
         corner = None if softness is None else -(scale**2) * softness
         if not isinstance(dynamic, SparseMatrix):
             above = jnp.concatenate([dynamic, scale * upper], axis=1)
             below = jnp.concatenate(
                 [scale * lower, jnp.zeros((m, m), dynamic.dtype) if corner is None else jnp.diag(corner)], axis=1
             )
-            numbers, values = size**2, jnp.concatenate([above, below])
+            values = jnp.concatenate([above, below])
+            numbers = values.size
             factors = partial(factors_of, kind=kind, mixed=mixed)
         else:
             assert plan is not None

@@ -178,7 +178,7 @@ def _trajectory(rule, scheme, num_steps, state0, parameters, *found) -> tuple[St
     return without_corrections(scheme, states), decoded(stats)
 
 
-def raveled(tree):
+def _raveled(tree):
     """The leaves as one vector, and the function that makes the tree of it; every leaf depends on the vector.
 
     Empty leaves are not cut from it: in a program with the transpose of an empty slice (λ without joints, in reverse
@@ -219,7 +219,7 @@ def _direct_rule(scheme, num_steps, primals, tangents):
     group = parameters.system.group
     # `custom_linear_solve` is transposed only where no part of b is a constant, and the tangent of a parameter that is
     # not differentiated is one: a zero. Cut from one vector, all depend on all.
-    flat, unravel = raveled((to_algebra(group, state0, d_state0), d_parameters))
+    flat, unravel = _raveled((to_algebra(group, state0, d_state0), d_parameters))
     first, d_parameters = unravel(flat)
     rows = jax.tree.map(lambda zeros: zeros[1:], zeros_like_trajectory(states))
     b = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), first, rows)

@@ -180,15 +180,16 @@ def test_constraint_without_tangents_gets_them():
         jax.tree.map(lambda x, y: close(x, y, ULPS), actual, expected)
 
 
-def made_of(kind):
-    """A joint to the ground that is made of this kind of `UserCoincidence`."""
+def hung_by(kind):
+    """A body on a joint to the ground that is made of this kind of `UserCoincidence`."""
 
     class Joint(UserJoint):
         def constraints(self, a, b):
             (right,) = UserJoint.constraints(self, a, b)
             return (kind(right.point_a, right.point_b),)
 
-    return Joint(None, "body", jnp.zeros(3))
+    body = lg.RigidBody(1.0, (1.0, 1.0, 1.0))
+    return lg.Model({"body": body}, {"joint": Joint(None, "body", jnp.zeros(3))}, {})
 
 
 @pytest.mark.parametrize("sets", [((3, 4), (4, 5)), ((4, 3),), ((3, 3),), ((10, 11, 12),), ((-1, 0),)])
@@ -198,7 +199,7 @@ def test_coupled_coordinates_are_validated(sets):
         def coupled(self):
             return sets
 
-    model = lg.Model({"body": lg.RigidBody(1.0, (1.0, 1.0, 1.0))}, {"joint": made_of(Wrong)}, {})
+    model = hung_by(Wrong)
     with pytest.raises(ValueError, match=says("Wrong", "`coupled`", repr(sets), "Leave it out")):
         model.system()
 
@@ -213,7 +214,7 @@ def test_what_a_constraint_acts_on_is_validated(places):
         def acts_on(self):
             return places
 
-    model = lg.Model({"body": lg.RigidBody(1.0, (1.0, 1.0, 1.0))}, {"joint": made_of(Wrong)}, {})
+    model = hung_by(Wrong)
     with pytest.raises(ValueError, match=says("Wrong", "`acts_on`", repr(ROTATIONS), repr(places), "Leave it out")):
         model.system()
 
