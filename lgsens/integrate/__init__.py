@@ -6,6 +6,7 @@ from lgsens.integrate._adaptive import (
     FirstState as FirstState,
     integrate_controlled as integrate_controlled,
 )
+from lgsens.integrate._guess import Guess as Guess
 from lgsens.integrate._integrate import (
     Mark as Mark,
     integrate as integrate,
@@ -15,7 +16,6 @@ from lgsens.integrate._integrate import (
 from lgsens.integrate._newton import (
     Chord as Chord,
     Constants as Constants,
-    Guess as Guess,
     Stats as Stats,
     take_step as take_step,
 )

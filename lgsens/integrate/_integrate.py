@@ -10,7 +10,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from lgsens.dynamics import AbstractSystem, State
-from lgsens.integrate._newton import Chord, Constants, Guess, Stats, Wear, no_solver, take_step
+from lgsens.integrate._guess import Guess
+from lgsens.integrate._newton import Chord, Constants, Stats, Wear, no_solver, take_step
 from lgsens.integrate._scheme import GeneralizedAlpha
 from lgsens.integrate._singular import Watch
 

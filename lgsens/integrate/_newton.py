@@ -4,11 +4,13 @@ An iteration with the matrix of an earlier step (modified Newton) evaluates the 
 1e-2 on the quarter-car when the matrix is up to 20 steps old. Started from extrapolated accelerations and multipliers
 it takes three or four to round-off, each a tenth of a full one. Motion and multipliers converge in turns, so a long
 chain contracts by 0.3 and by 1e-4 alternately: what counts is κ² = d_i/d_{i−2}, with d_i the increments. The next
-iteration leaves an error of about κ² d_i. Where that is the square of the tolerance, or a fraction of round-off
-(the errors of a thousand steps add up), the next iteration is the last: to ask for smaller increments instead would be
-to ask for what the round-off of the constraints does not allow. That round-off grows with the scene (to 500 ε in a
-chain of 512 links), so an iteration is also the last where increments of that size no longer fall: of at most one ε for
-each coordinate.
+iteration would move by about κ² d_{i−1}: where that is the square of the tolerance, or a fraction of round-off (the
+errors of a thousand steps add up), the last one was enough.
+
+Round-off, the increments that remain however often one iterates, grows with the scene: 4 ε for the 48 coordinates of
+the quarter-car, 230 ε for the 3072 of a chain of 512 links, about ε for each dozen. Increments near it bound κ from
+above and do not measure it. An iteration is also the last where increments of at most one ε for each coordinate no
+longer fall.
 """
 
 from functools import partial
@@ -20,6 +22,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.dynamics import AbstractSystem, State, mass_matrix, require_independent, softness
+from lgsens.integrate._guess import Guess
 from lgsens.integrate._lanes import in_any_lane, renewed_where
 from lgsens.integrate._scheme import AbstractStep, GeneralizedAlpha, Index3Step, Motion
 from lgsens.integrate._stabilized import StabilizedFactors, StabilizedStep
@@ -28,8 +31,8 @@ from lgsens.linear import LU, Factors, Inverse, Matrix
 Solver = Factors | StabilizedFactors
 _MODIFIED_LIMIT = 12  # iterations; more cost as much as a full one
 _STALLED = 0.3  # that from which on two full iterations cost less
-_FASTEST = 0.02  # contractions measured close to round-off are no better than this
-_ROUGH = 64  # round-offs: increments below say nothing of the contraction, and are noise where they fall no longer
+_FASTEST = 0.02  # contractions of earlier steps, when the matrix was newer, are no better than this
+_ROUGH = 64  # ε: increments below measure no contraction, and are noise where they fall no longer
 
 
 class Stats(NamedTuple):
@@ -73,29 +76,6 @@ class Constants(NamedTuple):
         if scheme.stabilized:
             return StabilizedStep.of(scheme, system, self.mass, self.inverse_mass, previous, h)
         return Index3Step(scheme, system, self.mass, self.scale, self.softness, previous, h)
-
-
-class Guess(NamedTuple):
-    """Where the next step's iteration starts, the parabola through the last three accelerations and multipliers, and
-    how fast modified Newton contracted in this one."""
-
-    a: tuple[Float[Array, " k"], Float[Array, " k"]]  # a_n, a_{n-1}
-    lam: tuple[Float[Array, " m"], Float[Array, " m"]]
-    contraction: Float[Array, ""]
-    start: tuple[Float[Array, " k"], Float[Array, " m"]] | None = None  # u and λ, where steps are not equal
-
-    @classmethod
-    def first(cls, state0: State) -> "Guess":
-        return cls((state0.a, state0.a), (state0.lam, state0.lam), jnp.ones((), state0.a.dtype))
-
-    def extrapolated(self, state: State):
-        """u and λ: 3 x_n − 3 x_{n−1} + x_{n−2}."""
-        if self.start is not None:
-            return self.start
-        return tuple(3.0 * (x - last) + before for x, (last, before) in ((state.a, self.a), (state.lam, self.lam)))
-
-    def after(self, state: State, contraction) -> "Guess":
-        return Guess((state.a, self.a[0]), (state.lam, self.lam[0]), contraction)
 
 
 class Chord(NamedTuple):
@@ -173,7 +153,8 @@ def take_step(
     scale, equations = constants.scale, constants.step(scheme, system, previous, h)
     eps = float(jnp.finfo(scale.dtype).eps)
     tolerance = max(scheme.tolerance, 64 * eps)
-    target = max(tolerance**2, 0.04 * eps)
+    round_off = max(1.0, len(scale) / 12) * eps
+    target = max(tolerance**2, 0.04 * round_off)
     noise = max(_ROUGH, len(scale)) * eps
     u, lam = guess.extrapolated(previous)
 
@@ -204,11 +185,13 @@ def take_step(
         """After an iteration, with the increment of the one before: is modified Newton done, or does it give up?"""
         size, before, count, full = iterate.increment, iterate.before, iterate.iterations, iterate.full
         measured = ~full & (count > 2) & (before > noise)
-        ratio = jnp.sqrt(size / jnp.where(measured, before, 1.0))
-        contraction = jnp.where(measured, jnp.maximum(ratio, _FASTEST), iterate.contraction)
+        ratio = jnp.sqrt(jnp.maximum(size, round_off) / jnp.where(measured, before, 1.0))
+        bounds = (size <= noise) & (count > 3)  # the one before was measured in this step, too
+        ratio = jnp.where(bounds, jnp.minimum(ratio, iterate.contraction), ratio)
+        contraction = jnp.where(measured, ratio, iterate.contraction)
         contraction = jnp.where(jnp.isfinite(contraction), contraction, 1.0)
         rough = (size <= noise) & (size > 0.25 * before)
-        settled = ~full & ((last * iterate.contraction**2 <= target) | rough)
+        settled = ~full & ((last * contraction**2 <= target) | rough)
         fast = (count < 4) | (contraction < _STALLED)  # by then the second pair is measured
         gives_up = ~full & ~settled & ~(fast & (count < _MODIFIED_LIMIT))
         astray = gives_up & (contraction >= 1.0)
@@ -273,7 +256,7 @@ def take_step(
         converged=converged,
         margin=jnp.where(converged, iterate.margin, jnp.nan),
     )
-    return state, guess.after(previous, iterate.contraction), stats, chord
+    return state, guess.after(previous, jnp.maximum(iterate.contraction, _FASTEST)), stats, chord
 
 
 def no_solver(scheme: GeneralizedAlpha, system: AbstractSystem, constants: Constants, state: State, t, h) -> Solver:

@@ -22,8 +22,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from lgsens.dynamics import AbstractSystem, State, constraint_jacobian
+from lgsens.integrate._guess import Guess
 from lgsens.integrate._lanes import renewed_where
-from lgsens.integrate._newton import Chord, Constants, Guess, Solver, Stats, Wear, no_solver, take_step
+from lgsens.integrate._newton import Chord, Constants, Solver, Stats, Wear, no_solver, take_step
 from lgsens.integrate._scheme import GeneralizedAlpha
 from lgsens.integrate._singular import Watch, margin_by_mass
 
@@ -126,7 +127,7 @@ class UnevenSteps(eqx.Module):
     def tried(self, progress: Progress, h, active) -> Attempt:
         """The state that a step of size h reaches; NaN unless `active` and converged."""
         start = moved(progress.state, h / progress.h)
-        guess = Guess((start.a, start.a), (start.lam, start.lam), progress.contraction, self._predicted(progress, h))
+        guess = Guess.first(start)._replace(contraction=progress.contraction, start=self._predicted(progress, h))
         shared, t = progress.shared, progress.t + h
         chord = None if shared is None else Chord(shared.solver, self._due(progress, shared, h))
         state, guess, stats, chord = take_step(
