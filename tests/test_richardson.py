@@ -74,6 +74,15 @@ def test_order_of_a_function():
 
 
 @pytest.mark.slow
+def test_three_runs():
+    """50, 100 and 200 steps leave a tenth and less of what the extrapolation of the finer two leaves."""
+    wanted = np.array([TOP, TOP_SLOPE])
+    of_both = lambda n: np.array([top_run(n)[0][0], top_run(n)[1][0]])
+    left = [np.abs(lg.richardson(of_both, n, runs).value - wanted) for n, runs in ((100, 2), (50, 3))]
+    assert np.all(left[1] < 0.1 * left[0]), left
+
+
+@pytest.mark.slow
 def test_order_of_a_trajectory():
     """The criterion by Gregory's rule on the coarse times, likewise; and the trapezoidal rule would spoil it."""
     finer = extrapolate_runs(top_run(100)[2], top_run(200)[2])
@@ -197,6 +206,7 @@ def test_failure_says_which_run(at, place):
         (lambda: lg.Richardson(RICHARDSON), says("Richardson: `integrator` must be a GeneralizedAlpha", "Richardson(")),
         (lambda: lg.richardson(lambda n: 1.0 / n, 0), says("`num_steps` must be at least 1", "0")),
         (lambda: lg.richardson(lambda n: 1.0 / n, 2.5), says("`num_steps` must be a Python int", "2.5")),
+        (lambda: lg.richardson(lambda n: 1.0 / n, 2, runs=1), says("`runs` must be a Python int of at least 2", "1")),
         (lambda: lg.richardson(3.0, 2), says("`fn` must be a function", "3.0")),
         (lambda: lg.richardson(lambda n: {"x": n}, 2), says("`fn` must return floats", "int", "['x']", "return only")),
         (
@@ -223,6 +233,15 @@ def test_richardson_removes_the_second_order():
     np.testing.assert_allclose(found.error["y"], found.value["y"] - fn(3.0, 20)["y"], rtol=1e-12)
     slope = jax.grad(lambda x: lg.richardson(lambda n: fn(x, n), 10).value["y"])(3.0)
     np.testing.assert_allclose(slope, 2.0 - 0.25e-4, rtol=4 * EPS)
+
+
+def test_three_runs_remove_the_fourth_order():
+    """1/n² + 1/n⁴ + 1/n⁶ with n, 2n, 4n becomes (1 − 20/2⁶ + 64/4⁶)/45 = 1/64 of 1/n⁶; the last correction is what two
+    runs of 2n and 4n miss but for that."""
+    fn = lambda n: 2.0 + 1.0 / n**2 + 1.0 / n**4 + 1.0 / n**6
+    found = lg.richardson(fn, 5, runs=3)
+    np.testing.assert_allclose(found.value - 2.0, 1.0 / 64.0 / 5.0**6, rtol=4 * EPS / 1e-6)  # of 2
+    np.testing.assert_allclose(found.error, found.value - lg.richardson(fn, 10).value, rtol=1e-9)  # EPS over 2.4e-5
 
 
 # Gregory's rule.

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from functools import reduce
 from typing import Any
 
 import equinox as eqx
@@ -37,19 +38,20 @@ class Setting(eqx.Module):
         num_steps: the number of steps, or of output intervals, of `simulate`.
         integrator: anything that `simulate` takes.
         extrapolate: evaluate the criterion with `num_steps` and with twice as many steps and extrapolate it, by
-            `richardson`. For schemes of second order; a criterion with a kink between two steps loses less than by
-            `integrator=Richardson(…)`, which extrapolates the states.
+            `richardson`; a number: with so many runs, of 1, 2, 4, … times as many steps. For schemes of second order; a
+            criterion with a kink between two steps loses less than by `integrator=Richardson(…)`, which extrapolates
+            the states.
         model: keyword arguments for the builder of the model, `{"links": "rods"}`: its fidelity, a linear solver.
         options: further keyword arguments for `simulate`.
         name: how tables call it; else what differs from the defaults.
         family: settings of one family are one curve in the plot; else the integrator and the version of the model.
 
-    All static and hashable. Raises `ValueError` for a number of steps that is none.
+    All static and hashable. Raises `ValueError` for a number of steps that is none, and for one run to extrapolate.
     """
 
     num_steps: int = eqx.field(static=True)
     integrator: Any = eqx.field(static=True, default=GeneralizedAlpha())
-    extrapolate: bool = eqx.field(static=True, default=False, kw_only=True)
+    extrapolate: bool | int = eqx.field(static=True, default=False, kw_only=True)
     model: Any = eqx.field(static=True, default=(), kw_only=True, converter=_items)
     options: Any = eqx.field(static=True, default=(), kw_only=True, converter=_items)
     name: str = eqx.field(static=True, default="", kw_only=True)
@@ -57,6 +59,16 @@ class Setting(eqx.Module):
 
     def __check_init__(self):
         as_count(self.num_steps, "num_steps", " (it is static)")
+        if not isinstance(self.extrapolate, bool) and not (isinstance(self.extrapolate, int) and self.extrapolate > 1):
+            raise ValueError(
+                "Setting: `extrapolate` must be True, False, or a number of runs of at least 2, "
+                f"got {self.extrapolate!r}."
+            )
+
+    @property
+    def runs(self) -> int:
+        """How many are extrapolated; 1: it is not."""
+        return 1 + self.extrapolate if isinstance(self.extrapolate, bool) else self.extrapolate
 
     @property
     def label(self) -> str:
@@ -70,7 +82,8 @@ class Setting(eqx.Module):
 
     def _described(self, integrator: str) -> str:
         options = [f"{name}={value!r}" for name, value in (*self.model, *self.options)]
-        return ", ".join(["extrapolated " * self.extrapolate + integrator, *options])
+        extrapolated = {1: "", 2: "extrapolated "}.get(self.runs, f"extrapolated ({self.runs} runs) ")
+        return ", ".join([extrapolated + integrator, *options])
 
     def trajectory(self, build: Build, p: Any, *, t0=0.0, t1, throw: bool = True) -> Trajectory:
         """The motion of build(p), with `num_steps` steps; arguments as in `evaluate`."""
@@ -101,19 +114,18 @@ class Setting(eqx.Module):
         return self.value_and_trajectory(fn, build, p, t0=t0, t1=t1, throw=throw)[0]
 
     def value_and_trajectory(self, fn: Function, build: Build, p, *, t0=0.0, t1, throw: bool = True):
-        """`evaluate`, and the motion behind it: of two runs the finer one, with the result of both."""
+        """`evaluate`, and the motion behind it: of several runs the finest one, with the result of all."""
+        found = []
 
-        def one(num_steps: int):
-            found = self._run(build, p, num_steps, t0, t1, throw)
-            return (fn(found, p) if isinstance(fn, Criterion) else fn(found)), found
+        def value(num_steps: int):
+            found.append(self._run(build, p, num_steps, t0, t1, throw))
+            return fn(found[-1], p) if isinstance(fn, Criterion) else fn(found[-1])
 
-        value, trajectory = one(self.num_steps)
-        if not self.extrapolate:
-            return value, trajectory
-        finer, fine = one(2 * self.num_steps)
-        value = richardson(lambda n: value if n == self.num_steps else finer, self.num_steps).value
-        result = jnp.where(trajectory.result == RESULTS.successful, fine.result, trajectory.result)
-        return value, eqx.tree_at(lambda found: found.result, fine, result)
+        if self.runs == 1:
+            return value(self.num_steps), found[0]
+        extrapolated = richardson(value, self.num_steps, self.runs).value
+        result = reduce(lambda a, b: jnp.where(a == RESULTS.successful, b, a), [run.result for run in found])
+        return extrapolated, eqx.tree_at(lambda run: run.result, found[-1], result)
 
 
 def _changes(value: Any) -> list[tuple[str, Any]]:

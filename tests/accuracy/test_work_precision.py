@@ -32,10 +32,14 @@ def table():
 @pytest.mark.slow  # eight programs
 def test_the_reference_knows_its_error():
     """Against the closed form; and a model with a damper is a row of its own, off by what the damper does."""
-    settings = [Setting(10, DOPRI8, model={"damping": 0.5}), Setting(20, extrapolate=True)]
+    settings = [
+        Setting(10, DOPRI8, model={"damping": 0.5}),
+        Setting(20, extrapolate=True),
+        Setting(20, extrapolate=3),
+    ]
     found = work_precision(CRITERION, build, P, settings, t1=T1, progress=False)
     value, gradient = exact_with_gradient()
-    reference, (row, extrapolated) = found.reference, found.rows
+    reference, (row, extrapolated, twice) = found.reference, found.rows
     assert reference.error < 1e-9 and reference.confirmed and len(reference.evidence) == 2
     assert abs(reference.value / value - 1) <= reference.value_error
     assert np.abs(reference.gradient - gradient).max() / np.abs(gradient).max() <= reference.gradient_error
@@ -43,6 +47,7 @@ def test_the_reference_knows_its_error():
     assert row.value_error == pytest.approx(0.12, rel=0.3) and not row.failure
     assert row.energy_drift < 1e-6  # the work of the damper is counted
     assert 0 < extrapolated.error < 1e-4  # (ωh)⁴/100 for ωh = 0.22, where 40 steps alone have (ωh)²/50
+    assert 0 < twice.error < 0.1 * extrapolated.error  # another (ωh)²
 
 
 def test_errors_are_those_of_the_closed_form(table):
@@ -154,11 +159,14 @@ def test_settings():
     assert setting.label == "GeneralizedAlpha(rho_inf=0.5, tolerance=1e-05), links='rods'"
     assert setting.curve == "GeneralizedAlpha, links='rods'"
     assert Setting(5, DOPRI8, extrapolate=True).label == "extrapolated IndexReducedODE(solver=Dopri8())"
+    assert Setting(5, extrapolate=3).label == "extrapolated (3 runs) GeneralizedAlpha()"
     assert Setting(5, lg.Richardson()).label == "Richardson()"
     assert (Setting(5, DOPRI8, name="a").label, Setting(5, DOPRI8, family="b").curve) == ("a", "b")
     assert len(set(accuracy.ladder())) == len(accuracy.ladder()) == 17
     assert {setting.num_steps for setting in accuracy.ladder(10)} == {5, 10, 20, 40, 80, 160, 640}
     with pytest.raises(ValueError, match="`num_steps` must be at least 1"):
         Setting(0)
+    with pytest.raises(ValueError, match="`extrapolate` must be True, False, or a number of runs of at least 2, got 1"):
+        Setting(5, extrapolate=1)
     with pytest.raises(ValueError, match="options must be a dict"):
         Setting(5, model=3)
