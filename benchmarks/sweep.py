@@ -3,8 +3,9 @@
     python benchmarks/sweep.py [--scenes …] [--sizes …] [--devices 2] [--out benchmarks/results]
     python benchmarks/sweep.py --readme   # the table of sweep.json, into benchmarks/README.md; measures nothing
 
-Each size is a compiled batch; medians of `--repeats` runs after a warm-up, compilation apart. `--devices 2` splits the
-processor into that many devices of JAX. Writes sweep.json, scene by scene, and prints a table.
+Each size is a compiled batch, which runs until `--designs` are done; medians of `--repeats` rounds after a warm-up,
+compilation apart. `--devices 2` splits the processor into that many devices of JAX. Writes sweep.json, scene by scene,
+and prints a table.
 """
 
 import json
@@ -58,27 +59,29 @@ KINDS = {"value": lambda criterion: criterion, "value and gradient": jax.value_a
 UNITS = {"designs/s": "designs_per_second", "µs per step": "us_per_step", "kB per design": "kilobytes_per_design"}
 
 
-def measure(scene: Scene, kind: str, devices, repeats: int) -> list[dict]:
-    """One row for each size of a batch."""
+def measure(scene: Scene, kind: str, devices, repeats: int, total: int) -> list[dict]:
+    """One row for each size of a batch, of so many designs."""
     traced = trace(KINDS[kind](scene.criterion), np.ones(1))
     rows = []
     for size in tqdm(scene.sizes, desc=kind, disable=None):
         if size < len(devices):
             continue
         program = compile_batch(traced, np.ones(size), size, size, devices)
-        designs = [np.linspace(scene.low, scene.high, program.size)]
+        count = size * max(1, total // size)
+        batches = np.linspace(scene.low, scene.high, count).reshape(size, -1).T  # those of a batch far apart
         seconds = []
         for _ in range(1 + repeats):
             started = time.perf_counter()
-            _, ok = program.run(designs)
+            ok = [program.run([designs])[1].all() for designs in batches]
             seconds.append(time.perf_counter() - started)
-            assert ok.all()
+            assert all(ok)
         median = statistics.median(seconds[1:])
         rows.append(
             {
                 "size": program.size,
-                "designs_per_second": program.size / median,
-                "us_per_step": 1e6 * median / program.size / scene.steps,
+                "designs": count,
+                "designs_per_second": count / median,
+                "us_per_step": 1e6 * median / count / scene.steps,
                 "kilobytes_per_design": 1e-3 * program.memory * len(devices) / program.size,
                 "compile_seconds": program.seconds,
                 "seconds": seconds[1:],
@@ -106,6 +109,7 @@ def main() -> None:
     parser.add_argument("--devices", type=int, default=1, help="devices of JAX on this processor")
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
     parser.add_argument("--sizes", nargs="+", type=int, help="sizes of batches, in place of each scene's own")
+    parser.add_argument("--designs", type=int, default=1024, help="designs of each row (default: %(default)s)")
     parser.add_argument("--readme", action="store_true", help="put the table of sweep.json into benchmarks/README.md")
     arguments = parser.parse_args()
     path = arguments.out / "sweep.json"
@@ -123,7 +127,9 @@ def main() -> None:
                 "name": name,
                 "devices": arguments.devices,
                 "environment": environment(settings),
-                "rows": {kind: measure(scene, kind, jax.devices(), arguments.repeats) for kind in KINDS},
+                "rows": {
+                    kind: measure(scene, kind, jax.devices(), arguments.repeats, arguments.designs) for kind in KINDS
+                },
             }
             write(path, scenes)
     text = table(scenes)
