@@ -41,6 +41,7 @@ def measure(links: int, solver: str, repeats: int) -> dict:
         system = dataclasses.replace(system, linear_solver=lg.DenseLU())
     plan = system.elimination
     found["levels"] = [] if plan is None else [[*level.own.shape, level.boundary.shape[1]] for level in plan.levels]
+    found["looped"] = 0 if plan is None else plan.looped
     found["dense_rest"] = len(system.constraint_names) + system.group.dim if plan is None else len(plan.rest)
     calls: dict = {}
     for steps in STEPS:
@@ -92,12 +93,14 @@ def table(document: dict) -> str:
         "|---|---|---|---|---|---|---|---|",
     ]
     for row in document["rows"]:
+        looped = row.get("looped", 0)
+        levels = f"{len(row['levels']) - looped}" + (f" and a loop of {looped}" if looped else "")
         lines.append(
             f"| {row['links']} | {row['solver']} "
             f"| {row['simulate_us_per_step']:.0f} ({row['simulate_cpu_us_per_step']:.0f}) "
             f"| {row['gradient_us_per_step']:.0f} ({row['gradient_cpu_us_per_step']:.0f}) "
             f"| {row['simulate_compile_s']:.1f}, {row['gradient_compile_s']:.1f} | {row['gradient_temporary_mb']:.1f} "
-            f"| {len(row['levels'])} | {row['dense_rest']} |"
+            f"| {levels} | {row['dense_rest']} |"
         )
     for one in document["slopes"]:
         lines.append(

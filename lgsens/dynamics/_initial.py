@@ -150,7 +150,7 @@ def is_redundant(system: AbstractSystem, jacobian: Matrix) -> Bool[Array, ""]:
         return independence(jacobian) < jnp.finfo(jacobian.dtype).eps ** 0.6
     dtype, ones = jacobian.dtype, jnp.ones(jacobian.shape[1], jacobian.dtype)
     unit = jacobian.with_unit_rows()
-    factors = factorized(system, diagonal(ones), unit.T, unit, jnp.ones((), dtype), Inverse, exact=True)
+    factors = factorized(system, diagonal(ones), unit.T, unit, jnp.ones((), dtype), Inverse, once=True, exact=True)
     return ~(factors.largest_inverse() < jnp.finfo(dtype).eps ** -0.8)  # NaN is redundant
 
 

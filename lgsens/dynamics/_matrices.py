@@ -72,14 +72,17 @@ def factorized(
     kind: Any = LU,
     softness=None,
     *,
+    once: bool = False,
     exact: bool = False,
 ) -> Factors:
     """The factors of [[A, U], [L, 0]] by the linear solver of the system; `kind`, `softness` as in `Factors.of`.
 
-    `exact`: never of mixed precision, nor rounded.
+    `once`: once in a run, where compilation takes longest. `exact`: never of mixed precision, nor rounded.
     """
     sparse = system if isinstance(system, AbstractSparseSystem) else None
     plan, solver = (None, None) if sparse is None else (sparse.elimination, sparse.linear_solver)
+    if plan is not None and once:
+        plan = plan.once
     mixed = solver is not None and solver.mixed and not exact
     return Factors.of(dynamic, upper, lower, scale, plan=plan, kind=kind, softness=softness, mixed=mixed, exact=exact)
 
@@ -122,7 +125,7 @@ class ConstrainedMass(eqx.Module):
         if factors is not None or (_sparse(system) is None and soft is None):
             return cls(mass, jacobian, factors, soft is not None)
         fixed, border = for_once(*lax.stop_gradient((mass, jacobian)))
-        factors = factorized(system, fixed, border.T, border, mass_scale(mass), softness=soft)
+        factors = factorized(system, fixed, border.T, border, mass_scale(mass), softness=soft, once=True)
         return cls(mass, jacobian, factors, soft is not None)
 
     def solve(self, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:

@@ -1,35 +1,29 @@
-"""Block elimination of a sparse matrix, level by level (`_ordering`).
+"""Block elimination of a sparse matrix, level by level (`_ordering`): where everything is.
 
-For a cluster with its own unknowns 1 and its boundary 2,
-
-    [[S₁₁, S₁₂],  [x₁;  = [b₁;        x₁ = S₁₁⁻¹ (b₁ − S₁₂ x₂),     (S₂₂ − S₂₁ S₁₁⁻¹ S₁₂) x₂ = b₂ − S₂₁ S₁₁⁻¹ b₁
-     [S₂₁, S₂₂]]   x₂]     b₂]
-
-With X = S₁₁⁻¹ S₁₂ and Y = S₂₁ S₁₁⁻¹ kept, a solve is products only; that with Sᵀ exchanges X and Yᵀ. What the levels
-leave is dense. All entries that are ever needed lie in one array: the blocks S₁₁, S₁₂ and S₂₁ of level after level, and
-the rest; an entry belongs to the level that eliminates its row or its column first.
+All entries that are ever needed lie in one array: the blocks S₁₁, S₁₂ and S₂₁ (`_block_factors`) of level after level,
+and the rest; an entry belongs to the level that eliminates its row or its column first.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
+from typing import NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Float
 
 from lgsens.linear._ordering import Level
-from lgsens.linear._sparse import added, chosen
 
 
 class Elimination:
-    """What is eliminated in which level, and where entries are; static, and equal only to itself."""
+    """What is eliminated in which level, and where entries are; static, and equal only to itself.
 
-    def __init__(self, levels: Sequence[Level], size: int):
-        self.levels, self.size = tuple(levels), size
+    `looped`: how many of the last levels one loop eliminates. They have the same shape, and compile once.
+    `once`: the plan for a matrix that is factorized once in a run; None: this one.
+    """
+
+    def __init__(self, levels: Sequence[Level], size: int, looped: int = 0, once: "Elimination | None" = None):
+        self.levels, self.size, self.looped, self.once = tuple(levels), size, looped, once or self
+        self.unrolled = len(self.levels) - looped
+        assert len({(own.shape, boundary.shape) for own, boundary in self.levels[self.unrolled :]}) <= 1
         gone = np.concatenate([level.own.ravel() for level in levels]) if levels else np.zeros(0, int)
         self.rest = np.setdiff1d(np.arange(size), gone).astype(np.int32)  # as in `Pattern`
 
@@ -148,124 +142,36 @@ class Elimination:
             found.append(np.where(places < 0, -1, places - end))
         return found
 
+    @cached_property
+    def loop(self) -> "Loop | None":
+        """The places of the levels in the loop."""
+        if not self.looped:
+            return None
+        first = self.unrolled
+        own, size = self.levels[first].own, int(self._starts[2 * first + 2] - self._starts[2 * first])
+
+        def from_the_first(places, size):
+            """Of each level, counted from the end of the level: from the start of the first one."""
+            moved = [np.where(some < 0, -1, some + size * i) for i, some in enumerate(places[first:], 1)]
+            return np.stack(moved).astype(np.int32)
+
+        return Loop(size, own.shape, from_the_first(self.coupled, size), from_the_first(self.boundaries, own.size))
+
+
+class Loop(NamedTuple):
+    """Levels of the same shape that are eliminated in a loop: they and the rest are the end of entries and vectors.
+
+    size: how many entries a level has. own: the shape of its unknowns, (clusters, p).
+    coupled: (levels, clusters q q) and boundary: (levels, clusters, q), where in those ends S₂₁ S₁₁⁻¹ S₁₂ and the
+    boundaries of a level are; −1: nowhere.
+    """
+
+    size: int
+    own: tuple[int, int]
+    coupled: np.ndarray
+    boundary: np.ndarray
+
 
 def _sizes(own, boundary) -> tuple[int, int]:
     p, q = own.shape[1], boundary.shape[1]
     return len(own) * p * (p + q), len(own) * q * p
-
-
-class Eliminated(eqx.Module):
-    """One level: S₁₁⁻¹, X and Y of its clusters."""
-
-    inverse: Float[Array, "c p p"]
-    right: Float[Array, "c p q"]  # X
-    left: Float[Array, "c q p"]  # Y
-
-
-class BlockMatrix(eqx.Module):
-    """A sparse matrix in the places of its factors, with `@` by vectors from both sides."""
-
-    entries: Float[Array, " numbers"]
-    plan: Elimination = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, plan: Elimination, values, rows: np.ndarray, columns: np.ndarray) -> "BlockMatrix":
-        entries = jnp.zeros(plan.numbers, values.dtype).at[plan.places(rows, columns)].add(values)
-        return cls(entries.at[plan.filling()].set(1.0), plan)
-
-    @property
-    def dtype(self):
-        return self.entries.dtype
-
-    def rest(self, entries) -> Float[Array, "r r"]:
-        """What the levels leave of the entries."""
-        count = len(self.plan.rest)
-        return entries[self.plan.numbers - count**2 :].reshape(count, count)
-
-    def _times(self, x, turned: Callable, exchanged: bool):
-        x = jnp.concatenate([x, jnp.zeros(1, x.dtype)])
-        products = [(turned(self.rest(self.entries)[None])[0] @ x[self.plan.rest], self.plan.rest)]
-        for i, (own, boundary) in enumerate(self.plan.levels):
-            pivot, right, left = map(turned, self.plan.blocks(self.entries, i))
-            right, left = (left, right) if exchanged else (right, left)
-            products.append((_product(pivot, x[own]) + _product(right, x[boundary]), own))
-            products.append((_product(left, x[own]), boundary))
-        return added(products, len(x), x.dtype)[:-1]
-
-    def __matmul__(self, x):
-        return self._times(x, lambda blocks: blocks, exchanged=False)
-
-    def __rmatmul__(self, x):
-        return self._times(x, _turned, exchanged=True)
-
-
-class BlockFactors(eqx.Module):
-    """The factors of a sparse matrix: its levels, and what is left of it."""
-
-    eliminated: tuple[Eliminated, ...]
-    rest: Any  # LU or Inverse
-    plan: Elimination = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, matrix: BlockMatrix, kind: Any) -> "BlockFactors":
-        """`kind`: LU or Inverse, for the rest."""
-        entries, plan = matrix.entries, matrix.plan
-        eliminated = []
-        for i, places in enumerate(plan.coupled):
-            (pivot, right, left), entries = plan.first(entries, i)
-            inverse = inverses(pivot)
-            level = Eliminated(inverse, inverse @ right, left @ inverse)
-            eliminated.append(level)
-            there = np.flatnonzero(places >= 0)
-            entries = entries.at[places[there]].add(-(level.left @ right).ravel()[there])
-        return cls(tuple(eliminated), kind.of(entries.reshape(2 * (len(plan.rest),))), plan)
-
-    def solve(self, rhs, *, transposed: bool = False):
-        """S⁻¹ rhs or S⁻ᵀ rhs, one column or several.
-
-        What a level leaves is the end of a vector in the order of elimination: no level touches those before it.
-        """
-        if rhs.ndim == 2:
-            return jax.vmap(lambda column: self.solve(column, transposed=transposed), in_axes=1, out_axes=1)(rhs)
-        b, known = chosen(rhs, self.plan.order), []
-        for level, (own, _), boundary in zip(self.eliminated, self.plan.levels, self.plan.boundaries):
-            left = _turned(level.right) if transposed else level.left
-            known.append(b[: own.size].reshape(own.shape))
-            b = b[own.size :]
-            b = b - added([(_product(left, known[-1]), boundary)], len(b), b.dtype)
-        x = self.rest.solve(b, transposed=transposed) if len(b) else b
-        for level, own, boundary in reversed(list(zip(self.eliminated, known, self.plan.boundaries))):
-            inverse, right = (
-                (_turned(level.inverse), _turned(level.left)) if transposed else (level.inverse, level.right)
-            )
-            own = _product(inverse, own) - _product(right, chosen(x, boundary))
-            x = jnp.concatenate([own.ravel(), x])
-        return x[self.plan.position]
-
-
-def inverses(blocks: Float[Array, "c p p"]) -> Float[Array, "c p p"]:
-    """The inverses of small matrices by Gauss–Jordan elimination without exchanges, all matrices side by side.
-
-    An eighth of the time of batched LAPACK on 256 matrices of 6 rows; and two batched LAPACK calls at once can wait for
-    each other for ever on a machine of two cores (jaxlib 0.10).
-    """
-    size = blocks.shape[1]
-    places = jnp.arange(size)
-
-    def eliminate(j, matrix):
-        here = places == j
-        pivot = 1.0 / matrix[j, j]
-        row = jnp.where(here[:, None], pivot[None, :], matrix[j] * pivot[None, :])
-        column = jnp.where(here[:, None], -jnp.ones_like(row), matrix[:, j])
-        rest = jnp.where((here[:, None] | here[None, :])[:, :, None], jnp.zeros_like(matrix), matrix)
-        return rest - column[:, None, :] * row[None, :, :]
-
-    return jnp.moveaxis(lax.fori_loop(0, size, eliminate, jnp.moveaxis(blocks, 0, 2)), 2, 0)
-
-
-def _turned(blocks):
-    return jnp.swapaxes(blocks, 1, 2)
-
-
-def _product(blocks, x):
-    return jnp.einsum("cij,cj->ci", blocks, x)

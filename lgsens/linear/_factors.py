@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lgsens.linear._block_factors import BlockFactors, BlockMatrix
 from lgsens.linear._dense import LU, Inverse
-from lgsens.linear._elimination import BlockFactors, BlockMatrix, Elimination
+from lgsens.linear._elimination import Elimination
 from lgsens.linear._mixed import factors_of, rounded_inverse
 from lgsens.linear._sparse import SparseMatrix
 

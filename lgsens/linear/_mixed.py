@@ -24,8 +24,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens.linear._block_factors import BlockFactors, BlockMatrix
 from lgsens.linear._dense import Inverse
-from lgsens.linear._elimination import BlockFactors, BlockMatrix
 
 _ENOUGH = 1e-14  # of the solution: the estimated change in the next turn
 _STALLED = 0.5

@@ -210,6 +210,18 @@ def _level(chosen: Sequence[Cluster], nodes, fill: int) -> Level:
     return Level(_filled(own, fill), _filled(boundary, fill))
 
 
+def of_one_shape(some: Sequence[Level], count: int, fill: int) -> list[Level]:
+    """Levels with the same clusters, `count` in each, filled up."""
+    p, q = (max(level[i].shape[1] for level in some) for i in range(2))
+
+    def parts(unknowns, width):
+        rows, columns = -len(unknowns) % count, width - unknowns.shape[1]
+        full = np.pad(unknowns, ((0, rows), (0, columns)), constant_values=fill)
+        return full.reshape(-1, count, width)
+
+    return [Level(*both) for own, boundary in some for both in zip(parts(own, p), parts(boundary, q))]
+
+
 def _filled(rows: Sequence[Sequence[int]], fill: int) -> np.ndarray:
     full = np.full((len(rows), max(map(len, rows))), fill, np.int32)
     for row, values in zip(full, rows):

@@ -15,8 +15,8 @@ from lgsens.dynamics import initial_state, is_redundant, tangents, times_tangent
 from lgsens.dynamics._matrices import ConstrainedMass
 from lgsens.examples import QuarterCar, four_bar, spatial_chain
 from lgsens.integrate import factorize_iteration_matrix
-from lgsens.linear import LU, Inverse
-from lgsens.linear._ordering import levels
+from lgsens.linear import LU, Elimination, Factors, Inverse
+from lgsens.linear._ordering import levels, of_one_shape
 
 H = 1e-3
 
@@ -125,6 +125,41 @@ def test_levels_grow_with_the_logarithm():
     numbers = [plan.numbers - len(plan.rest) ** 2 for plan in plans.values()]
     assert numbers[2] < 2.6 * numbers[1] < 2.6**2 * numbers[0]
     assert all(len(plan.rest) < 130 for plan in plans.values())
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("kind", [LU, Inverse])
+def test_levels_in_a_loop(first, kind):
+    """The same solutions, of S and its transpose, whether levels are split and filled up for a loop or not."""
+    system, rng = systems("branched")[1], np.random.default_rng(4)
+    some, size = levels(system.topology._graph, early=True)[:-1], system.elimination.size
+    assert len({(own.shape, boundary.shape) for own, boundary in some[first:]}) > 1
+    equal = of_one_shape(some[first:], 2, size)
+    assert len(equal) == len(some) - first + (first == 0)  # three clusters are two and two, one of them filled up
+    plan, looped = Elimination(some, size), Elimination([*some[:first], *equal], size, len(equal))
+    q, v = system.reference()
+    mass, jacobian = system.sparse_mass_matrix(), system.sparse_constraint_jacobian(q)
+    # not symmetric: K and its transpose exchange X and Y
+    dynamic = mass + 0.3 * tangents(system, q, v, v, jnp.ones(jacobian.shape[0]), jnp.zeros(())).stiffness
+    factors = [Factors.of(dynamic, jacobian.T, jacobian, jnp.ones(()), plan=p, kind=kind) for p in (plan, looped)]
+    columns = [jnp.asarray(rng.normal(size=(size, 2))) for size in (len(v), jacobian.shape[0])]
+    for transposed in (False, True):
+        expected, actual = (np.concatenate(f.solve(*columns, transposed=transposed)) for f in factors)
+        close(actual, expected, ulps=1e5)  # condition, as above
+        b = jacobian.dense()
+        full = np.block([[dynamic.dense(), b.T], [b, np.zeros((len(b), len(b)))]])
+        close((full.T if transposed else full) @ actual, np.concatenate(columns), ulps=1e5)
+
+
+def test_a_long_chain_compiles_as_a_short_one():
+    """What a run factorizes once has one loop for all levels, steps have one for the small levels of a long chain."""
+    assert spatial_chain(8).system().elimination.once.looped == 0
+    short, long = (spatial_chain(links).system().elimination for links in (64, 512))
+    assert short.looped == 0 < len(short.levels) <= 4
+    assert len(long.levels) - long.looped <= 4
+    assert len(long.rest) == len(long.once.rest)
+    for plan in (short, long):
+        assert plan.once.looped == len(plan.once.levels)
 
 
 def test_everything_is_eliminated_once():
