@@ -21,6 +21,7 @@ from jaxtyping import PyTree
 from lgsens._errors import failures_as_nan
 from lgsens._trajectory import Saved, Trajectory
 from lgsens.dynamics import RESULTS
+from lgsens.linear import many_runs
 
 AXIS = "designs"
 # The most lanes per device. What the lanes of a batch carry around their loops should stay in the caches of a core
@@ -97,7 +98,7 @@ def trace(fn: Callable[[PyTree], PyTree], designs: PyTree) -> Traced:
         return values, succeeded(values)
 
     started = time.perf_counter()
-    with failures_as_nan():
+    with failures_as_nan(), many_runs():
         jaxpr, (shapes, _) = jax.make_jaxpr(single, return_shape=True)(*one)
     run = jaxpr_as_fun(jaxpr)
     return Traced(run, shapes, _carried(jaxpr.jaxpr), time.perf_counter() - started)

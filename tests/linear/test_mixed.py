@@ -13,7 +13,7 @@ import lgsens as lg
 from lgsens.dynamics import mass_matrix, tangents
 from lgsens.examples import QuarterCar, four_bar, spatial_chain, spinning_top
 from lgsens.integrate import factorize_iteration_matrix
-from lgsens.linear import LU, Factors, Inverse
+from lgsens.linear import LU, Factors, Inverse, many_runs
 from lgsens.linear._mixed import Refined, Rounded, factors_of
 
 SINGLE = float(np.finfo(np.float32).eps)
@@ -204,3 +204,24 @@ def test_steps_with_a_rounded_inverse_are_those_of_full_newton():
     np.testing.assert_allclose(rounded.states.q.position, full.states.q.position, rtol=0, atol=roundoff)
     np.testing.assert_allclose(rounded.states.v, full.states.v, rtol=0, atol=roundoff / 1e-3)
     assert int(rounded.stats.iterations.max()) <= 8  # as many as in double precision: it contracts
+
+
+def test_inverses_of_many_runs_are_rounded_earlier():
+    """Those of a batch share the caches; the motion is that of one run."""
+
+    def inverse(size):
+        parts = [jnp.asarray(part) for part in (np.eye(size - 4), np.eye(size - 4, 4), np.eye(4, size - 4))]
+        return type(Factors.of(*parts, jnp.ones(()), kind=Inverse).factors)
+
+    assert inverse(40) is inverse(12) is Inverse
+    with many_runs():
+        assert (inverse(40), inverse(12)) == (Rounded, Inverse)
+
+    def height(tilt):
+        chain = spatial_chain(3, tilt=tilt)  # 33 unknowns, 1089 numbers
+        return lg.simulate(chain, t1=0.02, num_steps=20).body("link2").position[-1, 2]
+
+    tilts = np.asarray([0.4, 0.8, 1.2])
+    # round-off of positions in each step, as above
+    expected = [height(tilt) for tilt in tilts]
+    np.testing.assert_allclose(lg.sweep(height, tilts).values, expected, rtol=0, atol=4 * 20 * EPS)
