@@ -25,7 +25,7 @@ from lgsens.linear import many_runs
 
 AXIS = "designs"
 # The most lanes per device. What the lanes of a batch carry around their loops should stay in the caches of a core
-# (`benchmarks/sweep.py`: 256 tops of 2 kB and 24 to 32 quarter-cars of 80 kB are the fastest); elsewhere memory decides.
+# (`benchmarks/sweep.py`: 256 tops of 2 kB, 24 to 32 quarter-cars of 80 kB are the fastest); elsewhere memory decides.
 CACHE = 2 * 2**20  # bytes
 LANES = 256
 LANES_ELSEWHERE = 8192
