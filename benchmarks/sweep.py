@@ -51,7 +51,7 @@ def quarter_car(damping):
 
 SCENES = {
     "top": Scene(top, 0.5, 1.0, 200, (1, 16, 64, 128, 256, 1024)),
-    "quarter_car": Scene(quarter_car, 2000.0, 8000.0, 100, (1, 4, 16, 32, 128, 1024)),
+    "quarter_car": Scene(quarter_car, 2000.0, 8000.0, 100, (1, 16, 26, 128, 1024)),
 }
 
 
