@@ -64,7 +64,7 @@ def least_squares(
     *,
     parametrization: PyTree = None,
     solver: Any = None,
-    max_steps: int = 50,
+    max_steps: int = 100,
 ) -> LeastSquaresResult:
     """min ½ |r(x)|², by Gauss–Newton with Jacobians in forward mode, one simulation with n tangents each.
 
@@ -76,7 +76,8 @@ def least_squares(
             points; None: x over its size.
         solver: of optimistix, in the variables of the parametrization; None: `LineSearchGaussNewton()`;
             `optimistix.LevenbergMarquardt(rtol, atol)` where data determine the parameters badly.
-        max_steps: the most steps, of which rejected ones are some.
+        max_steps: the most steps, of which rejected ones are some: close to the optimum they drown in the round-off of
+            |r|², and how many are rejected before the last one is chance.
 
     It can be traced: `jax.jit` it for many data sets, `jax.vmap` or `lgsens.sweep` it over them. Not converging is
     data, `LeastSquaresResult.converged`. Raises `ValueError` as `variables`, and for fewer residuals than parameters.
