@@ -71,10 +71,13 @@ def elimination(solver: AbstractLinearSolver | None, graph: Graph) -> Eliminatio
     best = min(sparse, key=_cost, default=dense)
     if solver is None and _cost(dense) <= _cost(best):
         return None
-    # a chain of 512 links compiles in 0.73 of the time, with a gradient in 0.8, and runs no slower; with a limit of 1.1
-    # its gradient takes 1.05 of the time
-    steps = _with_loop(best, 1.06)
-    return Elimination(steps.levels, size, steps.looped, once=_with_loop(best, math.inf))
+    # limit 1.06: a chain of 512 links compiles in 0.73 of the time, with a gradient in 0.8, and runs no slower; with a
+    # limit of 1.1 its gradient takes 1.05 of the time
+    steps, once = _with_loop(best, 1.06), _with_loop(best, math.inf)
+    return best if once is best else Elimination(steps.levels, size, steps.looped, once)
+
+
+_MANY_LEVELS = 4  # that a loop pays for: it compiles about as long as two, and four of 64 links gain little
 
 
 def _with_loop(plan: Elimination, limit: float) -> Elimination:
@@ -94,7 +97,6 @@ def _with_loop(plan: Elimination, limit: float) -> Elimination:
 # Times in µs on a core of 3 GHz, from batches of LAPACK's LU and inverses, of products, and of scatters in XLA. What a
 # level costs whatever its size is from the quarter-car (94 unknowns) and a chain of 8 links (88): a level and an LU of
 # the rest take 0.79 and 0.83 of a dense LU in a run, 0.68 and 0.67 with the gradient.
-_MANY_LEVELS = 4  # that a loop pays for: it compiles about as long as two, and four of 64 links gain little
 _SMALLEST = 64  # unknowns; below, an LU takes less time than its dispatch could be shortened
 
 
