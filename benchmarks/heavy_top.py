@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 import lgsens as lg
 from lgsens import plotting
-from lgsens._cli_report import version
+from lgsens.cli._report import version
 from lgsens.examples import PROBLEMS, heavy_top
 
 STATES = Path(__file__).parents[1] / "tests" / "data" / "heavy_top_bruls2012.json"

@@ -20,7 +20,7 @@ import numpy as np
 from tqdm import tqdm
 
 import lgsens as lg
-from lgsens._cost import median_seconds
+from lgsens.criteria._cost import median_seconds
 from lgsens.examples import COMPARISON
 
 FACTORS = (1, 2)  # step counts, as multiples of the problem's

@@ -2,7 +2,7 @@
 
 import sys
 
-from lgsens._cli import main
+from lgsens.cli._main import main
 
 if __name__ == "__main__":
     sys.exit(main(["paper", *sys.argv[1:]]))

@@ -21,7 +21,7 @@ import numpy as np
 from tqdm import tqdm
 
 import lgsens as lg
-from lgsens._cost import median_seconds
+from lgsens.criteria._cost import median_seconds
 from lgsens.examples import PROBLEMS, QuarterCar
 
 DATA = Path(__file__).parents[1] / "tests" / "data"

@@ -24,8 +24,8 @@ from rival_tables import put_into
 from tqdm import tqdm
 
 import lgsens as lg
-from lgsens._batches import compile_batch, trace
 from lgsens.examples import QuarterCar, spinning_top
+from lgsens.sweeps._batches import compile_batch, trace
 
 
 class Scene(NamedTuple):

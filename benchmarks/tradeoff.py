@@ -47,8 +47,8 @@ def measure(name: str, path: Path, rounds: int, cache: str | None) -> None:
     """Measure a scene and write it to `path`."""
     import jax
 
-    from lgsens._cli_tradeoff import SCENES, document
     from lgsens.accuracy import work_precision
+    from lgsens.cli._tradeoff import SCENES, document
 
     jax.config.update("jax_enable_x64", True)
     if cache is not None:
@@ -109,8 +109,8 @@ def write(record: dict, path: Path) -> None:
 def report(path: Path, by: str) -> None:
     """Recommend, write that too, draw, and print everything."""
     from lgsens import plotting
-    from lgsens._cli_tradeoff import TARGETS, recommendations
     from lgsens.accuracy import Table, plot, recommend
+    from lgsens.cli._tradeoff import TARGETS, recommendations
 
     record = json.loads(path.read_text(encoding="utf-8"))
     table = Table.from_document(record)

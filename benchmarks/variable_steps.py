@@ -21,7 +21,7 @@ import jax
 import numpy as np
 
 import lgsens as lg
-from lgsens._cost import median_seconds
+from lgsens.criteria._cost import median_seconds
 from lgsens.examples import QuarterCar
 
 ALPHA = lg.GeneralizedAlpha(0.9)

@@ -8,32 +8,28 @@ group, Multibody System Dynamics, 2014). SI units; `jax.config.update("jax_enabl
 
 import importlib
 
-from lgsens._advice import Advice as Advice, Costs as Costs, direct_or_adjoint as direct_or_adjoint
-from lgsens._cost import measure_costs as measure_costs
-from lgsens._differentiate import Sensitivities as Sensitivities, differentiate as differentiate
-from lgsens._errors import SimulationError as SimulationError
-from lgsens._growth import Growth as Growth, sensitivity_growth as sensitivity_growth
-from lgsens._index_reduced_ode import IndexReducedODE as IndexReducedODE
-from lgsens._kinematics import Kinematics as Kinematics, kinematics as kinematics
-from lgsens._rank import ConstraintRank as ConstraintRank, constraint_rank as constraint_rank
-from lgsens._reference_methods import FiniteDifferences as FiniteDifferences, IndexReduced as IndexReduced
-from lgsens._richardson import Extrapolated as Extrapolated, Richardson as Richardson, richardson as richardson
-from lgsens._simulate import (
-    equilibrium as equilibrium,
-    initial_state as initial_state,
-    simulate as simulate,
-)
-from lgsens._sweep import SweepResult as SweepResult, sweep as sweep
-from lgsens._trajectory import (
-    BodyMotion as BodyMotion,
-    Instant as Instant,
-    Saved as Saved,
-    StateError as StateError,
-    Trajectory as Trajectory,
-)
-from lgsens._uneven_runs import GivenSteps as GivenSteps
 from lgsens._xla import without_ynn_fusions
-from lgsens.criteria import Criterion as Criterion, soft_maximum as soft_maximum, time_integral as time_integral
+from lgsens.analysis import (
+    ConstraintRank as ConstraintRank,
+    Growth as Growth,
+    Kinematics as Kinematics,
+    constraint_rank as constraint_rank,
+    kinematics as kinematics,
+    sensitivity_growth as sensitivity_growth,
+)
+from lgsens.criteria import (
+    Advice as Advice,
+    Costs as Costs,
+    Criterion as Criterion,
+    FiniteDifferences as FiniteDifferences,
+    IndexReduced as IndexReduced,
+    Sensitivities as Sensitivities,
+    differentiate as differentiate,
+    direct_or_adjoint as direct_or_adjoint,
+    measure_costs as measure_costs,
+    soft_maximum as soft_maximum,
+    time_integral as time_integral,
+)
 from lgsens.dynamics import RESULTS as RESULTS, AbstractSystem as AbstractSystem, State as State
 from lgsens.integrate import AdaptiveSteps as AdaptiveSteps, GeneralizedAlpha as GeneralizedAlpha
 from lgsens.linear import BlockSparse as BlockSparse, DenseLU as DenseLU
@@ -66,6 +62,23 @@ from lgsens.sensitivity import (
     ContinuousDirect as ContinuousDirect,
     DirectDifferentiation as DirectDifferentiation,
 )
+from lgsens.simulation import (
+    BodyMotion as BodyMotion,
+    Extrapolated as Extrapolated,
+    GivenSteps as GivenSteps,
+    IndexReducedODE as IndexReducedODE,
+    Instant as Instant,
+    Richardson as Richardson,
+    Saved as Saved,
+    SimulationError as SimulationError,
+    StateError as StateError,
+    Trajectory as Trajectory,
+    equilibrium as equilibrium,
+    initial_state as initial_state,
+    richardson as richardson,
+    simulate as simulate,
+)
+from lgsens.sweeps import SweepResult as SweepResult, sweep as sweep
 
 _NAMESPACES = (
     "accuracy",

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import lgsens as lg
-from lgsens._sweep_folder import Store
 from lgsens.examples import spinning_top
+from lgsens.sweeps._folder import Store
 
 COUNT = 4096
 BATCH = 128

@@ -8,7 +8,7 @@ from importlib import resources
 
 import pytest
 
-from lgsens._cli import main
+from lgsens.cli._main import main
 
 PNG = b"\x89PNG\r\n\x1a\n"
 SHIPPED = (resources.files("lgsens.examples") / "data" / "five_link_suspension.toml").read_text(encoding="utf-8")

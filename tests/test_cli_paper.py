@@ -10,8 +10,8 @@ from pathlib import Path
 import jax
 import pytest
 
-from lgsens import _cli_paper
-from lgsens._cli import main
+from lgsens.cli import _paper
+from lgsens.cli._main import main
 
 PNG = b"\x89PNG\r\n\x1a\n"
 ROOT = Path(__file__).parents[1]
@@ -33,8 +33,8 @@ def test_all_four_methods_are_of_second_order(coarse):
     png = (out / "fig2.png").read_bytes()
     assert png.startswith(PNG) and len(png) > 20_000  # an empty canvas has some 3 kB
     (panel,) = document["panels"].values()
-    assert list(panel["methods"]) == list(_cli_paper.METHODS)
-    assert panel["methods"].keys().isdisjoint(_cli_paper.TREATMENTS)
+    assert list(panel["methods"]) == list(_paper.METHODS)
+    assert panel["methods"].keys().isdisjoint(_paper.TREATMENTS)
     for name, curve in panel["methods"].items():
         assert curve["h"] == pytest.approx([0.01, 0.005], rel=1e-14)
         assert abs(curve["slope"] - 2.0) <= 0.1, name
@@ -73,7 +73,7 @@ def test_the_document_says_with_what_and_not_by_whom(coarse):
 def test_the_table_shows_the_numbers(coarse):
     _, _, document = coarse
     panel = document["panels"]["fig2"]
-    text = _cli_paper.table(panel)
+    text = _paper.table(panel)
     assert "dPsi/dalpha_0 [m^2 s/rad]" in text and f"{panel['reference']['value']:.14e}" in text
     for name, curve in panel["methods"].items():
         errors, slopes, times = re.findall(rf"^{name}  +(.*)$", text, re.MULTILINE)
@@ -88,10 +88,10 @@ def test_figures_and_table_of_any_study(coarse, tmp_path, capsys, monkeypatch):
     _, _, document = coarse
 
     def gradient(study, panel, method, num_steps):
-        reference = isinstance(method, _cli_paper.IndexReduced)
+        reference = isinstance(method, _paper.IndexReduced)
         return panel.published * (1.0 if reference else 1.0 + (panel.t1 / num_steps) ** 2)
 
-    monkeypatch.setattr(_cli_paper, "_gradient", gradient)
+    monkeypatch.setattr(_paper, "_gradient", gradient)
     assert main(["paper", "--out", str(tmp_path / "all")]) == 0
     captured = capsys.readouterr()
     assert sorted(path.name for path in (tmp_path / "all").iterdir()) == ["fig2.png", "fig4.png", "paper.json"]
@@ -102,7 +102,7 @@ def test_figures_and_table_of_any_study(coarse, tmp_path, capsys, monkeypatch):
         for curve in panel["methods"].values():
             assert curve["slopes_between"] == pytest.approx([2.0] * len(curve["slopes_between"]), abs=1e-6)
             assert curve["slope"] == pytest.approx(2.0, abs=1e-6)
-    assert set(panels["fig4b"]["methods"]) - set(panels["fig4a"]["methods"]) == set(_cli_paper.TREATMENTS)
+    assert set(panels["fig4b"]["methods"]) - set(panels["fig4a"]["methods"]) == set(_paper.TREATMENTS)
     assert "24/24" in captured.err  # six methods, four steps
     assert captured.out.count("relative error, h [s] =") == 3
     # The end of the bump is a node of every grid.
@@ -157,7 +157,7 @@ def test_a_failure_leaves_no_empty_folder(tmp_path, capsys, monkeypatch):
     def gradient(*_):
         raise ValueError("nothing to differentiate")
 
-    monkeypatch.setattr(_cli_paper, "_gradient", gradient)
+    monkeypatch.setattr(_paper, "_gradient", gradient)
     status, _, err = run(capsys, "--out", tmp_path / "out")
     assert status == 2 and "nothing to differentiate" in err
     assert not (tmp_path / "out").exists()

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lgsens._cli import main
-from lgsens._cli_report import kept_curves
+from lgsens.cli._main import main
+from lgsens.cli._report import kept_curves
 from lgsens.examples import CurveBounds, QuarterCar, SuspensionDesign
 
 CAMBER, TOE = np.radians(0.3), np.radians(0.1)

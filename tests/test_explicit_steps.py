@@ -9,9 +9,9 @@ import pytest
 from helpers import EPS, close
 
 import lgsens as lg
-from lgsens._explicit_steps import Numbers, equal_steps
 from lgsens.dynamics import Inertia, initial_state
 from lgsens.examples import four_bar, spinning_top
+from lgsens.integrate._explicit_steps import Numbers, equal_steps
 
 STEPS = 3
 

@@ -11,7 +11,7 @@ import pytest
 from jaxtyping import Array, Float
 
 import lgsens as lg
-from lgsens._index_reduced import integrate_index_reduced
+from lgsens.criteria._index_reduced import integrate_index_reduced
 from lgsens.dynamics import autodiff_tangents
 from lgsens.examples import QuarterCar, four_bar, spinning_top
 from lgsens.liegroups import Rn

@@ -170,7 +170,7 @@ def factorizations(jaxpr) -> int:
 
 def test_one_factorization_for_all_parameters():
     """The derivative by every number of the model adds one factorization, a batch over the positions."""
-    from lgsens._kinematics import _Drive, _place
+    from lgsens.analysis._kinematics import _Drive, _place
 
     system = driven_four_bar().system()
     values = jnp.asarray(ANGLES[:5, None])

@@ -10,16 +10,24 @@ import pytest
 import lgsens
 
 ROOT = Path(lgsens.__file__).parent
-# What each package may import besides itself. `_validate` is the one module below all of them.
-BELOW = {
-    "liegroups": set(),
-    "linear": set(),
-    "dynamics": {"liegroups", "linear"},
-    "model": {"liegroups", "linear", "dynamics"},
-    "integrate": {"liegroups", "linear", "dynamics"},
-    "sensitivity": {"liegroups", "linear", "dynamics", "integrate"},
-}
+# The packages from the ground up: each may import those of earlier ranks. `_validate` is below all of them.
+RANKS = (
+    ("liegroups", "linear"),
+    ("dynamics",),
+    ("model", "integrate"),
+    ("sensitivity",),
+    ("simulation",),
+    ("criteria",),
+    ("analysis",),
+    ("sweeps", "examples"),
+    ("plotting",),
+    ("accuracy", "optimize", "testing"),
+    ("cli",),
+)
+BELOW = {name: {below for rank in RANKS[:i] for below in rank} for i, rank in enumerate(RANKS) for name in rank}
+AT_ROOT = {"__init__", "__main__", "_progress", "_validate", "_xla"}
 FOUNDATION = "lgsens._validate"
+FOUNDATIONS = {FOUNDATION, "lgsens._progress"}
 MAX_LINES = 350
 
 
@@ -53,17 +61,21 @@ def layer(name: str) -> str:
     return parts[1] if len(parts) > 1 and parts[1] in BELOW else ""
 
 
+def test_every_package_has_a_rank():
+    assert {path.parent.name for path in ROOT.glob("*/__init__.py")} == set(BELOW)
+    assert {path.stem for path in ROOT.glob("*.py")} == AT_ROOT
+
+
 def test_the_parser_sees_what_there_is():
-    assert set(BELOW) <= {layer(name) for name in FILES}
     assert imports("lgsens.liegroups._products") == {"lgsens.liegroups._base"}  # a relative import
-    assert {"lgsens.dynamics", "lgsens.model", "lgsens._errors"} <= imports("lgsens._simulate")
-    assert "lgsens._simulate" in imports("lgsens")
+    assert {"lgsens.dynamics", "lgsens.model", "lgsens.simulation._errors"} <= imports("lgsens.simulation._simulate")
+    assert "lgsens.simulation._simulate" in imports("lgsens")
 
 
 @pytest.mark.parametrize("name", [name for name in FILES if layer(name)])
 def test_imports_go_downwards(name):
     own = layer(name)
-    for imported in imports(name) - {FOUNDATION}:
+    for imported in imports(name) - FOUNDATIONS:
         assert layer(imported) in BELOW[own] | {own}, f"{name} imports {imported}"
     assert FOUNDATION not in imports(name) or own != "liegroups"
 
@@ -127,7 +139,7 @@ def test_config_is_recognized():
     assert not touches_config(ast.parse("import jax\njax.jit(config.update)"))
 
 
-@pytest.mark.parametrize("name", [name for name in FILES if not name.rpartition(".")[2].startswith("_cli")])
+@pytest.mark.parametrize("name", [name for name in FILES if layer(name) != "cli"])
 def test_the_library_never_touches_jaxs_config(name):
     assert not touches_config(TREES[name])
 

@@ -11,8 +11,8 @@ import pytest
 from helpers import EPS, says
 
 import lgsens as lg
-from lgsens._richardson import extrapolate_runs
 from lgsens.examples import four_bar, spinning_top
+from lgsens.simulation._richardson import extrapolate_runs
 
 SCHEME = lg.GeneralizedAlpha(rho_inf=0.9)
 RICHARDSON = lg.Richardson(SCHEME)

@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lgsens._trajectory import Trajectory
 from lgsens.dynamics import AbstractSystem, State
+from lgsens.simulation import Trajectory
 
 _CHUNK = 64  # states that are evaluated together: one compilation for all numbers of steps
 

@@ -43,11 +43,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lgsens._trajectory import StateError, Trajectory
 from lgsens._validate import require
 from lgsens.dynamics import AbstractSystem, State, kkt_solve, split_velocity
 from lgsens.integrate import GeneralizedAlpha
 from lgsens.sensitivity import Parameters, Variation, direct_sweep
+from lgsens.simulation import StateError, Trajectory
 
 _LEAST_STEPS = 3
 

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from lgsens._trajectory import Trajectory
 from lgsens._validate import as_float
 from lgsens.accuracy._setting import Build, Function, Setting
 from lgsens.dynamics import RESULTS
+from lgsens.simulation import Trajectory
 
 
 class Study(NamedTuple):

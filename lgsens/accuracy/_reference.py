@@ -23,10 +23,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lgsens._index_reduced_ode import IndexReducedODE
 from lgsens.accuracy._programs import Evaluated, Study, evaluate
 from lgsens.accuracy._setting import Setting
 from lgsens.integrate import GeneralizedAlpha
+from lgsens.simulation import IndexReducedODE
 
 TARGET = 1e-11  # an error at which a route need not go on
 _TRUSTED = 1e-3  # an error above which a route is no reference

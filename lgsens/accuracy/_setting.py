@@ -8,14 +8,11 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
-from lgsens._index_reduced_ode import IndexReducedODE
-from lgsens._richardson import richardson
-from lgsens._simulate import simulate
-from lgsens._trajectory import Trajectory
 from lgsens._validate import as_count
 from lgsens.criteria import Criterion
 from lgsens.dynamics import RESULTS
 from lgsens.integrate import GeneralizedAlpha
+from lgsens.simulation import IndexReducedODE, Trajectory, richardson, simulate
 
 # A user's own function: of the trajectory, or a `Criterion`, which is one of the trajectory and the parameters.
 Function = Callable[[Trajectory], Any] | Criterion

@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._simulate import simulate
 from lgsens._validate import as_float
 from lgsens.examples._four_bar import four_bar
+from lgsens.simulation import simulate
 
 
 class AccelerationTest(eqx.Module):

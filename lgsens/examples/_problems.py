@@ -10,8 +10,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._simulate import simulate
-from lgsens._trajectory import Trajectory
 from lgsens.criteria import Criterion
 from lgsens.examples._four_bar import four_bar
 from lgsens.examples._free_rigid_body import free_rigid_body
@@ -24,6 +22,7 @@ from lgsens.examples._slider_crank import slider_crank
 from lgsens.examples._top import spinning_top
 from lgsens.integrate import GeneralizedAlpha
 from lgsens.model import Model
+from lgsens.simulation import Trajectory, simulate
 
 
 class Reference(NamedTuple):

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._kinematics import Kinematics, kinematics
 from lgsens._validate import require, suggestion
+from lgsens.analysis import Kinematics, kinematics
 from lgsens.examples._hardpoint_file import Reader, read
 from lgsens.examples._point_masses import with_point_masses
 from lgsens.examples._suspension_curves import SuspensionCurves, suspension_curves

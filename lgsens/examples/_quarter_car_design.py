@@ -7,13 +7,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._simulate import simulate
-from lgsens._trajectory import Trajectory
 from lgsens._validate import suggestion
 from lgsens.criteria import time_integral
 from lgsens.examples._curve_bounds import CurveBounds
 from lgsens.examples._hardpoint_file import Reader, read
 from lgsens.examples._quarter_car import GRAVITY, QuarterCar
+from lgsens.simulation import Trajectory, simulate
 
 # What the user may ask for, and the members of the design that it frees.
 PARAMETERS = {

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._kinematics import Kinematics
+from lgsens.analysis import Kinematics
 
 
 class SuspensionCurves(NamedTuple):

@@ -6,6 +6,12 @@ from lgsens.integrate._adaptive import (
     FirstState as FirstState,
     integrate_controlled as integrate_controlled,
 )
+from lgsens.integrate._explicit_steps import (
+    Coefficients as Coefficients,
+    Numbers as Numbers,
+    equal_steps as equal_steps,
+    projection as projection,
+)
 from lgsens.integrate._guess import Guess as Guess
 from lgsens.integrate._integrate import (
     Mark as Mark,

@@ -9,11 +9,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
-from lgsens._sweep import as_designs, sweep
 from lgsens._validate import as_count
 from lgsens.optimize._augmented_lagrangian import NOT_YET
 from lgsens.optimize._box import checked_box
 from lgsens.optimize._minimize import REASONS, Problem, check_tolerances, prepared
+from lgsens.sweeps import as_designs, sweep
 
 
 class MultiStartResult(NamedTuple):

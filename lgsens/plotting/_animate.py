@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lgsens._kinematics import Kinematics
-from lgsens._trajectory import Trajectory
 from lgsens._validate import as_count
+from lgsens.analysis import Kinematics
 from lgsens.model import Angle, MultibodySystem
 from lgsens.plotting._mechanism import VIEW, draw, frame
 from lgsens.plotting._shapes import Mark, Shapes, placed, shapes, stretched
 from lgsens.plotting._style import ROAD, ROLES, figure
+from lgsens.simulation import Trajectory
 
 SWEEP = 4.0  # seconds that a sweep through the positions of a kinematic analysis takes
 PER_SECOND = 30  # frames

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from lgsens._trajectory import Trajectory
 from lgsens._validate import suggestion
 from lgsens.dynamics import State
 from lgsens.model import MultibodySystem
 from lgsens.plotting._style import CURVES, figure, plain
+from lgsens.simulation import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lgsens._cli import main
-from lgsens._cli_tradeoff import SCENES
 from lgsens.accuracy import Setting
+from lgsens.cli._main import main
+from lgsens.cli._tradeoff import SCENES
 from lgsens.examples import PROBLEMS
 
 PNG = b"\x89PNG\r\n\x1a\n"

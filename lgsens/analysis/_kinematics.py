@@ -8,11 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from lgsens._errors import throw_if_failed
-from lgsens._trajectory import AbstractMotion
 from lgsens._validate import as_float, suggestion
 from lgsens.dynamics import RESULTS, AbstractDrive, State, forces_of_motion, positions
 from lgsens.model import Distance, DistanceJoint, Model, MultibodySystem, RotationDriver, TranslationDriver
+from lgsens.simulation import AbstractMotion, throw_if_failed
 
 _DRIVERS = (TranslationDriver, RotationDriver, DistanceJoint)
 

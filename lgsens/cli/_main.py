@@ -10,10 +10,10 @@ from typing import NoReturn
 
 import jax
 
-from lgsens import _cli_curves, _cli_optimize, _cli_paper, _cli_top, _cli_tradeoff
-from lgsens._cli_report import version
-from lgsens._errors import SimulationError
+from lgsens.cli import _curves, _optimize, _paper, _top, _tradeoff
+from lgsens.cli._report import version
 from lgsens.examples import PARAMETERS
+from lgsens.simulation import SimulationError
 
 BAD_INPUT = 2
 
@@ -102,7 +102,7 @@ def _parser() -> argparse.ArgumentParser:
         help="wheel travel up and down over which curves are kept and drawn [m] (default: %(default)s)",
     )
     optimize.add_argument("--quiet", action="store_true", help="no progress bar and no table")
-    optimize.set_defaults(run=_cli_optimize.run)
+    optimize.set_defaults(run=_optimize.run)
 
     curves = commands.add_parser(
         "curves",
@@ -124,7 +124,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     curves.add_argument("--points", type=_count, default=41, help="positions (default: %(default)s)")
     curves.add_argument("--quiet", action="store_true", help="no table")
-    curves.set_defaults(run=_cli_curves.run)
+    curves.set_defaults(run=_curves.run)
 
     top = commands.add_parser(
         "top",
@@ -132,7 +132,7 @@ def _parser() -> argparse.ArgumentParser:
         description="The sensitivity of the paper's spinning top (§8) by every method, beside its reference.",
     )
     top.add_argument("--h", type=_positive, default=1e-3, help="step size [s] (default: %(default)s)")
-    top.set_defaults(run=_cli_top.run)
+    top.set_defaults(run=_top.run)
 
     paper = commands.add_parser(
         "paper",
@@ -142,10 +142,10 @@ def _parser() -> argparse.ArgumentParser:
         "Most of the ten minutes is compilation.",
     )
     _add_out(paper, "out/paper", "paper.json and the figures")
-    paper.add_argument("--only", choices=list(_cli_paper.STUDIES), help="one of the figures (default: all)")
+    paper.add_argument("--only", choices=list(_paper.STUDIES), help="one of the figures (default: all)")
     paper.add_argument("--coarse", action="store_true", help="two large steps instead of four or five: a quick look")
     paper.add_argument("--quiet", action="store_true", help="no progress bar and no tables")
-    paper.set_defaults(run=_cli_paper.run)
+    paper.set_defaults(run=_paper.run)
 
     tradeoff = commands.add_parser(
         "tradeoff",
@@ -156,7 +156,7 @@ def _parser() -> argparse.ArgumentParser:
     tradeoff.add_argument(
         "scene",
         metavar="SCENE",
-        help=f"{', '.join(_cli_tradeoff.SCENES)}, or FILE.py that defines `build(p)`, `criterion(trajectory)`, "
+        help=f"{', '.join(_tradeoff.SCENES)}, or FILE.py that defines `build(p)`, `criterion(trajectory)`, "
         "`parameters` and `t1`, and if it likes `settings`, `scale` and `t0`, as in lgsens.accuracy.work_precision",
     )
     _add_out(tradeoff, "out/tradeoff", "tradeoff.json and tradeoff.png")
@@ -164,7 +164,7 @@ def _parser() -> argparse.ArgumentParser:
         "--targets",
         type=_positive,
         nargs="+",
-        default=list(_cli_tradeoff.TARGETS),
+        default=list(_tradeoff.TARGETS),
         help="relative errors for which to recommend a setting (default: 1e-2 1e-4 1e-6 1e-8)",
     )
     tradeoff.add_argument("--rounds", type=_count, default=5, help="timed calls, at least 5 (default: %(default)s)")
@@ -175,7 +175,7 @@ def _parser() -> argparse.ArgumentParser:
         help="the cost: time of the clock or of the processor (default: %(default)s)",
     )
     tradeoff.add_argument("--quiet", action="store_true", help="no progress bar and no table")
-    tradeoff.set_defaults(run=_cli_tradeoff.run)
+    tradeoff.set_defaults(run=_tradeoff.run)
     return parser
 
 

@@ -11,14 +11,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
-from lgsens._advice import direct_or_adjoint
-from lgsens._criterion_use import Use, checked_for
-from lgsens._errors import throw_if_failed
-from lgsens._reference_methods import STENCIL, FiniteDifferences, IndexReduced
-from lgsens._simulate import as_system, check_integrator, interval, outcome, run
-from lgsens._start import begin
 from lgsens._validate import as_count, as_float
-from lgsens.criteria import Criterion
+from lgsens.criteria._advice import direct_or_adjoint
+from lgsens.criteria._criterion import Criterion
+from lgsens.criteria._criterion_use import Use, checked_for
+from lgsens.criteria._reference_methods import STENCIL, FiniteDifferences, IndexReduced
 from lgsens.dynamics import RESULTS, AbstractSystem, State, is_redundant, softness
 from lgsens.integrate import GeneralizedAlpha
 from lgsens.model import Model
@@ -32,6 +29,7 @@ from lgsens.sensitivity import (
     configuration_cotangent,
     direct_on_the_fly,
 )
+from lgsens.simulation import as_system, begin, check_integrator, interval, outcome, run, throw_if_failed
 
 Method = AbstractSensitivity | ContinuousAdjoint | FiniteDifferences | IndexReduced
 
@@ -132,7 +130,7 @@ def differentiate(
 
 
 def _index_reduced(criteria, build, start, p, t0, t1, method: IndexReduced):
-    from lgsens._index_reduced import integrate_index_reduced  # diffrax takes its time to import
+    from lgsens.criteria._index_reduced import integrate_index_reduced  # diffrax takes its time to import
 
     if start is not None:
         raise ValueError("IndexReduced starts from the consistent initial state of the model; leave `state0` out.")

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from lgsens import plotting
-from lgsens._cli_report import document, output_folder, table
+from lgsens.cli._report import document, output_folder, table
 from lgsens.dynamics import RESULTS
 from lgsens.examples import CurveBounds, QuarterCar, Response, SuspensionCurves, SuspensionDesign
 from lgsens.optimize import GradientCheck, OptimizationResult, check_gradient, minimize

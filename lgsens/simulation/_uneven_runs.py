@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from lgsens._start import Begin, begin
-from lgsens._trajectory import Trajectory
 from lgsens._validate import as_float, is_concrete, require
 from lgsens.dynamics import AbstractSystem, Initial, State, require_independent
 from lgsens.integrate import AdaptiveSteps, FirstState, GeneralizedAlpha, Stats, integrate_controlled
 from lgsens.sensitivity import AdjointVariable, DirectDifferentiation, Parameters, times
+from lgsens.simulation._start import Begin, begin
+from lgsens.simulation._trajectory import Trajectory
 
 
 class GivenSteps(eqx.Module):

@@ -9,12 +9,12 @@ import jax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
-from lgsens._advice import TYPICAL, Costs
-from lgsens._differentiate import differentiate
-from lgsens._simulate import simulate
 from lgsens._validate import as_count
-from lgsens.criteria import Criterion
+from lgsens.criteria._advice import TYPICAL, Costs
+from lgsens.criteria._criterion import Criterion
+from lgsens.criteria._differentiate import differentiate
 from lgsens.sensitivity import AdjointVariable, DirectDifferentiation
+from lgsens.simulation import simulate
 
 
 def median_seconds(*functions: Callable[[], Any], repeats: int = 5) -> list[float]:

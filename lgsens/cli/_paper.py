@@ -14,12 +14,10 @@ import jax
 import numpy as np
 
 from lgsens import plotting
-from lgsens._cli_report import output_folder, version
-from lgsens._cli_top import REFERENCE
-from lgsens._differentiate import Method, differentiate
 from lgsens._progress import progress_bar
-from lgsens._reference_methods import IndexReduced
-from lgsens.criteria import Criterion
+from lgsens.cli._report import output_folder, version
+from lgsens.cli._top import REFERENCE
+from lgsens.criteria import Criterion, IndexReduced, Method, differentiate
 from lgsens.examples import PROBLEMS
 from lgsens.integrate import GeneralizedAlpha
 from lgsens.model import Model

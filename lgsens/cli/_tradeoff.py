@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 
 from lgsens import plotting
-from lgsens._cli_report import output_folder, version
-from lgsens._index_reduced_ode import IndexReducedODE
 from lgsens.accuracy import Recommendation, Setting, Table, grid, ladder, plot, recommend, work_precision
+from lgsens.cli._report import output_folder, version
 from lgsens.criteria import Criterion
 from lgsens.examples import PROBLEMS, QuarterCar
 from lgsens.integrate import GeneralizedAlpha
+from lgsens.simulation import IndexReducedODE
 
 TARGETS = (1e-2, 1e-4, 1e-6, 1e-8)
 NAMES = {

@@ -8,12 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from lgsens._errors import throw_if_failed
-from lgsens._index_reduced_ode import IndexReducedODE, integrate_ode, ode_failure
-from lgsens._richardson import Richardson, extrapolate_runs
-from lgsens._start import Begin, begin
-from lgsens._trajectory import Instant, Saved, Trajectory
-from lgsens._uneven_runs import UnevenIntegrator, check_uneven, run_uneven
 from lgsens._validate import as_count, as_float, require
 from lgsens.dynamics import (
     RESULTS,
@@ -27,6 +21,12 @@ from lgsens.dynamics import (
 from lgsens.integrate import GeneralizedAlpha, Stats, singular_steps
 from lgsens.model import Model
 from lgsens.sensitivity import AbstractSensitivity, DirectDifferentiation, Parameters, saved_run, times
+from lgsens.simulation._errors import throw_if_failed
+from lgsens.simulation._index_reduced_ode import IndexReducedODE, integrate_ode, ode_failure
+from lgsens.simulation._richardson import Richardson, extrapolate_runs
+from lgsens.simulation._start import Begin, begin
+from lgsens.simulation._trajectory import Instant, Saved, Trajectory
+from lgsens.simulation._uneven_runs import UnevenIntegrator, check_uneven, run_uneven
 
 
 def as_system(model: Model | AbstractSystem) -> AbstractSystem:

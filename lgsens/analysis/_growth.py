@@ -15,14 +15,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from lgsens._errors import throw_if_failed
-from lgsens._simulate import as_system, check_integrator, interval, run
-from lgsens._start import begin
 from lgsens._validate import as_count
 from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk, initial_state, split_velocity
 from lgsens.integrate import GeneralizedAlpha
 from lgsens.model import Model
 from lgsens.sensitivity import DirectDifferentiation
+from lgsens.simulation import as_system, begin, check_integrator, interval, run, throw_if_failed
 
 _DIRECTIONS = 3  # one is nearly orthogonal to the direction that grows with little probability, three never are
 _REGULAR = 16.0  # of twice the time; in a regular motion sensitivities grow like t, under a constant force like t²

@@ -12,10 +12,10 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jaxtyping import PyTree
 
-from lgsens._batches import compile_batch, trace
 from lgsens._progress import progress_bar
-from lgsens._sweep_folder import Store, in_folder, in_memory
 from lgsens._validate import as_count, leaf_name
+from lgsens.sweeps._batches import compile_batch, trace
+from lgsens.sweeps._folder import Store, in_folder, in_memory
 
 
 class SweepResult(NamedTuple):

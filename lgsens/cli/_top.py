@@ -7,10 +7,10 @@ import time
 import jax
 import jax.numpy as jnp
 
-from lgsens._simulate import simulate
 from lgsens.criteria import time_integral
 from lgsens.examples import spinning_top
 from lgsens.sensitivity import AbstractSensitivity, AdjointVariable, DirectDifferentiation
+from lgsens.simulation import simulate
 
 # Converged, l = 1 m and α₀ = π/4; the paper prints the value at α₀ = 0.785398, and l = 0.5 m by mistake.
 REFERENCE = -0.0021318254254500

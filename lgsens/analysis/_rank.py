@@ -6,10 +6,9 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from lgsens._errors import left_null_space, redundant_names
-from lgsens._simulate import as_system
 from lgsens.dynamics import AbstractSystem, assemble
 from lgsens.model import Model, MultibodySystem
+from lgsens.simulation import as_system, left_null_space, redundant_names
 
 _DIRECTIONS = 4  # of motion, in which the neighbourhood of the reference is looked at
 _DISTANCE = 0.01  # how far, in rad or lengths of the scene

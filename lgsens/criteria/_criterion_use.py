@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import Literal
 
-from lgsens.criteria import Criterion
+from lgsens.criteria._criterion import Criterion
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.sensitivity import ContinuousAdjoint
 

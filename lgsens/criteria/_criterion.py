@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from lgsens._trajectory import Instant, Trajectory
 from lgsens._validate import as_float, require
 from lgsens.dynamics import AbstractSystem, State
+from lgsens.simulation import Instant, Trajectory
 
 Pointwise = Callable[[Instant, Any], Float[Array, ""]]
 

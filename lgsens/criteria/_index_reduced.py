@@ -38,9 +38,9 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from lgsens._errors import SimulationError, throw_if_failed
 from lgsens._validate import as_count, as_float, is_concrete, require
 from lgsens.dynamics import RESULTS, AbstractSystem, State, accelerations, initial_state
+from lgsens.simulation import SimulationError, throw_if_failed
 
 Pointwise = Callable[[Array, AbstractSystem, State, Array], Float[Array, " c"]]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from lgsens import plotting
-from lgsens._cli_report import output_folder
+from lgsens.cli._report import output_folder
 from lgsens.examples import QuarterCar, SuspensionCurves
 
 # Heading, member of SuspensionCurves, factor to the unit shown, decimals.

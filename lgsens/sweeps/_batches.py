@@ -18,10 +18,9 @@ from jax.extend.core import jaxpr_as_fun, jaxprs_in_params
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
-from lgsens._errors import failures_as_nan
-from lgsens._trajectory import Saved, Trajectory
 from lgsens.dynamics import RESULTS
 from lgsens.linear import many_runs
+from lgsens.simulation import Saved, Trajectory, failures_as_nan
 
 AXIS = "designs"
 # The most lanes per device. What the lanes of a batch carry around their loops should stay in the caches of a core

@@ -33,10 +33,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from lgsens._trajectory import StateError, Trajectory
 from lgsens._validate import as_count
 from lgsens.dynamics import RESULTS, State
 from lgsens.integrate import GeneralizedAlpha
+from lgsens.simulation._trajectory import StateError, Trajectory
 
 
 class Richardson(eqx.Module):

@@ -28,10 +28,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from lgsens._explicit_steps import Coefficients, Numbers, equal_steps, projection
-from lgsens._trajectory import Stages
 from lgsens._validate import as_count
 from lgsens.dynamics import RESULTS, AbstractSystem, Inertia, State, factorized_accelerations
+from lgsens.integrate import Coefficients, Numbers, equal_steps, projection
+from lgsens.simulation._trajectory import Stages
 
 MODES = ("reverse", "forward")
 

@@ -1,0 +1,3 @@
+"""The console script `lgsens`."""
+
+from lgsens.cli._main import main as main

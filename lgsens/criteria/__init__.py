@@ -1,0 +1,15 @@
+"""Criteria of a trajectory (paper, §5), their derivatives by every method, and what these cost."""
+
+from lgsens.criteria._advice import Advice as Advice, Costs as Costs, direct_or_adjoint as direct_or_adjoint
+from lgsens.criteria._cost import measure_costs as measure_costs
+from lgsens.criteria._criterion import (
+    Criterion as Criterion,
+    soft_maximum as soft_maximum,
+    time_integral as time_integral,
+)
+from lgsens.criteria._differentiate import (
+    Method as Method,
+    Sensitivities as Sensitivities,
+    differentiate as differentiate,
+)
+from lgsens.criteria._reference_methods import FiniteDifferences as FiniteDifferences, IndexReduced as IndexReduced

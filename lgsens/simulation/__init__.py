@@ -1,0 +1,35 @@
+"""A model in, a trajectory out: `simulate`, how it starts, what it returns, failures as data."""
+
+from lgsens.simulation._errors import (
+    SimulationError as SimulationError,
+    failures_as_nan as failures_as_nan,
+    left_null_space as left_null_space,
+    redundant_names as redundant_names,
+    throw_if_failed as throw_if_failed,
+)
+from lgsens.simulation._index_reduced_ode import IndexReducedODE as IndexReducedODE
+from lgsens.simulation._richardson import (
+    Extrapolated as Extrapolated,
+    Richardson as Richardson,
+    richardson as richardson,
+)
+from lgsens.simulation._simulate import (
+    as_system as as_system,
+    check_integrator as check_integrator,
+    equilibrium as equilibrium,
+    initial_state as initial_state,
+    interval as interval,
+    outcome as outcome,
+    run as run,
+    simulate as simulate,
+)
+from lgsens.simulation._start import begin as begin
+from lgsens.simulation._trajectory import (
+    AbstractMotion as AbstractMotion,
+    BodyMotion as BodyMotion,
+    Instant as Instant,
+    Saved as Saved,
+    StateError as StateError,
+    Trajectory as Trajectory,
+)
+from lgsens.simulation._uneven_runs import GivenSteps as GivenSteps
