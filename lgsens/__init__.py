@@ -31,7 +31,11 @@ from lgsens.criteria import (
     time_integral as time_integral,
 )
 from lgsens.dynamics import RESULTS as RESULTS, AbstractSystem as AbstractSystem, State as State
-from lgsens.integrate import AdaptiveSteps as AdaptiveSteps, GeneralizedAlpha as GeneralizedAlpha
+from lgsens.integrate import (
+    AdaptiveSteps as AdaptiveSteps,
+    GeneralizedAlpha as GeneralizedAlpha,
+    GivenSteps as GivenSteps,
+)
 from lgsens.linear import BlockSparse as BlockSparse, DenseLU as DenseLU
 from lgsens.model import (
     AppliedForce as AppliedForce,
@@ -65,7 +69,6 @@ from lgsens.sensitivity import (
 from lgsens.simulation import (
     BodyMotion as BodyMotion,
     Extrapolated as Extrapolated,
-    GivenSteps as GivenSteps,
     IndexReducedODE as IndexReducedODE,
     Instant as Instant,
     Richardson as Richardson,

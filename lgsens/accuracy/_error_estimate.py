@@ -45,8 +45,8 @@ import numpy as np
 
 from lgsens._validate import require
 from lgsens.dynamics import AbstractSystem, State, kkt_solve, split_velocity
-from lgsens.integrate import GeneralizedAlpha
-from lgsens.sensitivity import Parameters, Variation, direct_sweep
+from lgsens.integrate import EqualGrid, GeneralizedAlpha, Variation
+from lgsens.sensitivity import Parameters, direct_sweep
 from lgsens.simulation import StateError, Trajectory
 
 _LEAST_STEPS = 3
@@ -126,7 +126,7 @@ def _estimated(scheme: GeneralizedAlpha, trajectory: Trajectory) -> StateError:
         lam=jnp.zeros_like(states.lam),
         a=none.at[0].set(h**2 * omega),
     )
-    parameters = Parameters(system, t[0], h)
+    parameters = Parameters(system, EqualGrid(t[0], h, t.shape[0] - 1))
     e, _ = direct_sweep(scheme, states, parameters, defects, jax.tree.map(jnp.zeros_like, parameters))
     return StateError(-e.w, -e.v, -e.vdot, -e.lam)
 

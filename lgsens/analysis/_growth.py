@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from lgsens._validate import as_count
 from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk, initial_state, split_velocity
-from lgsens.integrate import GeneralizedAlpha
+from lgsens.integrate import AbstractIntegrator, GeneralizedAlpha
 from lgsens.model import Model
 from lgsens.sensitivity import DirectDifferentiation
 from lgsens.simulation import as_system, begin, check_integrator, interval, run, throw_if_failed
@@ -60,7 +60,7 @@ class Growth(NamedTuple):
 
 
 def sensitivity_growth(
-    model: Model | AbstractSystem, *, t0=0.0, t1, num_steps: int, integrator: GeneralizedAlpha = GeneralizedAlpha()
+    model: Model | AbstractSystem, *, t0=0.0, t1, num_steps: int, integrator: AbstractIntegrator = GeneralizedAlpha()
 ) -> Growth:
     """How a small change of the initial state grows along a simulation, and whether its gradients are those of chaos.
 
@@ -73,15 +73,15 @@ def sensitivity_growth(
     Raises as `simulate`. Source: the rate is the largest Lyapunov exponent (Benettin et al., Meccanica 15, 1980).
     """
     system = as_system(model)
-    check_integrator(integrator)
     num_steps = as_count(num_steps, "num_steps", " (it is static)")
+    check_integrator(integrator, num_steps)
     t0, t1 = interval(t0, t1)
     growth, result, details = _growth_jit(system, t0, t1, num_steps, integrator)
     return throw_if_failed(growth, result, details, system.constraint_names)
 
 
 @eqx.filter_jit
-def _growth_jit(system: AbstractSystem, t0, t1, num_steps: int, integrator: GeneralizedAlpha):
+def _growth_jit(system: AbstractSystem, t0, t1, num_steps: int, integrator: AbstractIntegrator):
     initial = initial_state(system, t0)
     group, q0, v0, scale = system.group, initial.state.q, initial.state.v, system.coordinate_scale()
 
@@ -90,7 +90,7 @@ def _growth_jit(system: AbstractSystem, t0, t1, num_steps: int, integrator: Gene
         v, _ = split_velocity(system, q, v0 + y)
         vdot, lam, jerk = acceleration_and_jerk(system, q, v, t0)
         moved = initial._replace(state=State(q=q, v=v, vdot=vdot, lam=lam, a=vdot), jerk=jerk)
-        start = begin(integrator, system, t0, (t1 - t0) / num_steps, None, moved)
+        start = begin(integrator.scheme, system, t0, None, moved)
         trajectory, details = run(system, start, t0, t1, num_steps, integrator, DirectDifferentiation())
         return trajectory.states.q, (trajectory.t, trajectory.result, details)
 

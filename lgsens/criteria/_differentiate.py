@@ -17,7 +17,7 @@ from lgsens.criteria._criterion import Criterion
 from lgsens.criteria._criterion_use import Use, checked_for
 from lgsens.criteria._reference_methods import STENCIL, FiniteDifferences, IndexReduced
 from lgsens.dynamics import RESULTS, AbstractSystem, State, is_redundant, softness
-from lgsens.integrate import GeneralizedAlpha
+from lgsens.integrate import AbstractIntegrator, EqualGrid, GeneralizedAlpha
 from lgsens.model import Model
 from lgsens.sensitivity import (
     AbstractSensitivity,
@@ -29,7 +29,7 @@ from lgsens.sensitivity import (
     configuration_cotangent,
     direct_on_the_fly,
 )
-from lgsens.simulation import as_system, begin, check_integrator, interval, outcome, run, throw_if_failed
+from lgsens.simulation import Begin, as_system, begin, check_integrator, interval, outcome, run, throw_if_failed
 
 Method = AbstractSensitivity | ContinuousAdjoint | FiniteDifferences | IndexReduced
 
@@ -58,7 +58,7 @@ def differentiate(
     t0=0.0,
     t1,
     num_steps: int,
-    integrator: GeneralizedAlpha = GeneralizedAlpha(),
+    integrator: AbstractIntegrator = GeneralizedAlpha(),
     method: Method | None = None,
     state0: Callable[[Any], State] | None = None,
     throw: bool = True,
@@ -93,10 +93,10 @@ def differentiate(
         raise ValueError(f"`criteria` must be a Criterion or a pytree of them, got {criteria!r}.")
     if not callable(build):
         raise ValueError(f"`build` must be a function of the parameters that returns a Model, got {build!r}.")
-    check_integrator(integrator)
     if method is not None and not isinstance(method, Method):
         raise ValueError(f"`method` must be a method such as AdjointVariable() or ContinuousAdjoint(), got {method!r}.")
     num_steps = as_count(num_steps, "num_steps", " (it is static)")
+    check_integrator(integrator, num_steps)
     t0, t1 = interval(t0, t1)
     p = jax.tree_util.tree_map_with_path(lambda path, leaf: as_float(leaf, None, f"`p`{jax.tree_util.keystr(path)}"), p)
     size = sum(leaf.size for leaf in jax.tree.leaves(p))
@@ -171,28 +171,24 @@ class _Task(NamedTuple):
     build: Callable[[Any], Any]
     start: Callable[[Any], State] | None
     unravel: Callable[[Array], Any]
-    integrator: GeneralizedAlpha
+    integrator: AbstractIntegrator
     num_steps: int
     t0: Float[Array, ""]
     t1: Float[Array, ""]
 
-    @property
-    def h(self):
-        return (self.t1 - self.t0) / self.num_steps
-
     def system(self, p) -> AbstractSystem:
         return as_system(self.build(self.unravel(p)))
 
-    def begin(self, p):
+    def begin(self, p) -> tuple[AbstractSystem, Begin]:
         """The system and how its motion begins."""
         system = self.system(p)
         state0 = None if self.start is None else self.start(self.unravel(p))
-        return system, begin(self.integrator, system, self.t0, self.h, state0)
+        return system, begin(self.integrator.scheme, system, self.t0, state0)
 
     def simulate(self, p, sensitivity: AbstractSensitivity):
         """Ψ of all criteria, and the run."""
-        system, start = self.begin(p)
-        trajectory, details = run(system, start, self.t0, self.t1, self.num_steps, self.integrator, sensitivity)
+        system, begun = self.begin(p)
+        trajectory, details = run(system, begun, self.t0, self.t1, self.num_steps, self.integrator, sensitivity)
         values = jnp.stack([criterion(trajectory, self.unravel(p)) for criterion in self.criteria])
         return values, (trajectory, details)
 
@@ -217,7 +213,7 @@ def _differentiate_jit(criteria, names, build, start, p, t0, t1, num_steps, inte
         found = _differences(task, flat, method)
     elif isinstance(method, ContinuousAdjoint):
         found = _continuous_adjoint(task, flat, method, uses)
-    elif isinstance(method, DirectDifferentiation) and integrator.iterations is None and not integrator.stabilized:
+    elif isinstance(method, DirectDifferentiation) and not integrator.extrapolated:
         found = _on_the_fly(task, flat)
     else:
         found = _through_the_trajectory(task, flat, method)
@@ -233,13 +229,19 @@ def _differentiate_jit(criteria, names, build, start, p, t0, t1, num_steps, inte
 
 
 def _on_the_fly(task: _Task, p) -> _Found:
-    def start(p):
-        system, started = task.begin(p)
-        return (started.state, Parameters(system, task.t0, task.h)), started
+    integrator, scheme = task.integrator, task.integrator.scheme
 
-    run = direct_on_the_fly(task.integrator, task.num_steps, start, _stacked(task.criteria, task.unravel), p)
-    turns = task.h * run.rates
-    return _Found(run.value, run.gradient, *outcome(task.integrator, run.begun, run.stats, turns, task.t0, task.h))
+    def start(p):
+        system, begun = task.begin(p)
+        laid = integrator.lay(system, begun.start, begun.jerk, task.t0, task.t1, task.num_steps)
+        state0 = begun.start.at(system, laid.grid.first_size)
+        return (state0, Parameters(system, laid.grid)), (begun, laid._replace(found=None, stats=None))
+
+    found = direct_on_the_fly(scheme, start, _stacked(task.criteria, task.unravel), p)
+    begun, laid = found.begun
+    t = laid.grid.times()
+    ended = outcome(scheme, begun, found.stats, jnp.diff(t) * found.rates, t, laid)
+    return _Found(found.value, found.gradient, *ended)
 
 
 def _through_the_trajectory(task: _Task, p, method: AbstractSensitivity) -> _Found:
@@ -259,14 +261,14 @@ def _continuous_adjoint(task: _Task, p, method: ContinuousAdjoint, uses: list[Us
 
     def initial(p):
         """Everything that the motion depends on; v_0 as it is, without the scheme's own O(h²)."""
-        system, started = task.begin(p)
-        return system, started.state.q, started.consistent_v
+        system, begun = task.begin(p)
+        return system, begun.start.state.q, begun.consistent_v
 
     (system, q0, _), pull_back = jax.vjp(initial, p)
     cotangents = method.cotangents(
         task.integrator,
         trajectory.states,
-        Parameters(system, task.t0, task.h),
+        Parameters(system, EqualGrid(task.t0, (task.t1 - task.t0) / task.num_steps, task.num_steps)),
         _stacked(task.criteria, task.unravel),
         p,
         uses=(any(use.in_integrand for use in uses), any(use.in_terminal for use in uses)),

@@ -40,13 +40,12 @@ def split_velocity(
     return tangential, v - tangential
 
 
-def given_way(system: AbstractSystem, q, lam, share):
-    """q moved M-orthogonally by what satisfies Φ(q) = share × c λ: where joints of a `softness` c carry λ."""
+def given_way(system: AbstractSystem, q, lam) -> Float[Array, " k"] | None:
+    """The least displacement, in the metric of M, with Φ = c λ: what joints of a `softness` c give way under λ."""
     soft = softness(system)
     if soft is None:
-        return q
-    x, _ = ConstrainedMass.of(system, q).solve(jnp.zeros(system.group.dim, lam.dtype), share * soft * lam)
-    return system.group.retract(q, x)
+        return None
+    return ConstrainedMass.of(system, q).solve(jnp.zeros(system.group.dim, lam.dtype), soft * lam)[0]
 
 
 def accelerations(system: AbstractSystem, q, v, t, factors: Factors | None = None):

@@ -19,6 +19,7 @@ class State(eqx.Module):
         vdot: its time derivative v̇, shape (k,).
         lam: Lagrange multipliers λ of the constraints, shape (m,).
         a: the algorithmic acceleration of the generalized-α scheme, eq. (29), shape (k,).
+        inner: what a scheme has found within the step that ends here (stages), a pytree of arrays; None: nothing.
 
     Source: Sonneville & Brüls (2014), §3–4.
     """
@@ -28,6 +29,7 @@ class State(eqx.Module):
     vdot: Float[Array, " k"]
     lam: Float[Array, " m"]
     a: Float[Array, " k"]
+    inner: Any = None
 
 
 class Tangents(NamedTuple):

@@ -1,46 +1,40 @@
-"""The Lie-group generalized-α integrator (paper, §4)."""
+"""Schemes, grids, and the march through time (paper, §4)."""
 
 from lgsens.integrate._adaptive import (
     AdaptiveSteps as AdaptiveSteps,
     ControlledStats as ControlledStats,
-    FirstState as FirstState,
     integrate_controlled as integrate_controlled,
 )
+from lgsens.integrate._alpha import AbstractAlpha as AbstractAlpha
 from lgsens.integrate._explicit_steps import (
     Coefficients as Coefficients,
     Numbers as Numbers,
     equal_steps as equal_steps,
     projection as projection,
 )
-from lgsens.integrate._guess import Guess as Guess
-from lgsens.integrate._integrate import (
+from lgsens.integrate._generalized_alpha import GeneralizedAlpha as GeneralizedAlpha
+from lgsens.integrate._given import GivenSteps as GivenSteps
+from lgsens.integrate._grid import (
+    AbstractGrid as AbstractGrid,
+    AbstractLink as AbstractLink,
+    EqualGrid as EqualGrid,
+    Node as Node,
+    UnevenGrid as UnevenGrid,
+    earlier as earlier,
+    later as later,
+    with_first as with_first,
+)
+from lgsens.integrate._index3 import factorize_iteration_matrix as factorize_iteration_matrix
+from lgsens.integrate._integrator import AbstractIntegrator as AbstractIntegrator, Laid as Laid
+from lgsens.integrate._linearized import AbstractLinearizedStep as AbstractLinearizedStep, Variation as Variation
+from lgsens.integrate._march import (
     Mark as Mark,
-    integrate as integrate,
-    integrate_onward as integrate_onward,
-    integrate_outputs as integrate_outputs,
+    Progress as Progress,
+    Walk as Walk,
+    first_mark as first_mark,
+    march as march,
+    march_on as march_on,
+    states_of as states_of,
 )
-from lgsens.integrate._newton import (
-    Chord as Chord,
-    Constants as Constants,
-    Stats as Stats,
-    take_step as take_step,
-)
-from lgsens.integrate._scheme import (
-    GeneralizedAlpha as GeneralizedAlpha,
-    Motion as Motion,
-    advance as advance,
-    factorize_iteration_matrix as factorize_iteration_matrix,
-    increment as increment,
-    missed_increment as missed_increment,
-)
+from lgsens.integrate._scheme import AbstractScheme as AbstractScheme, Start as Start, Stats as Stats, rows as rows
 from lgsens.integrate._singular import margin_of as margin_of, singular_steps as singular_steps
-from lgsens.integrate._stabilized import (
-    StabilizedFactors as StabilizedFactors,
-    StabilizedStep as StabilizedStep,
-    StabilizedTangents as StabilizedTangents,
-    by_configuration as by_configuration,
-    halves as halves,
-    with_corrections as with_corrections,
-    without_corrections as without_corrections,
-)
-from lgsens.integrate._uneven import integrate_uneven as integrate_uneven, moved as moved

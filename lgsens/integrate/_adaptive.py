@@ -32,10 +32,13 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.dynamics import AbstractSystem, State
+from lgsens.integrate._generalized_alpha import GeneralizedAlpha
+from lgsens.integrate._grid import Node, UnevenGrid, with_first
+from lgsens.integrate._integrator import AbstractIntegrator, Laid
 from lgsens.integrate._lanes import in_any_lane
-from lgsens.integrate._newton import Stats
-from lgsens.integrate._scheme import GeneralizedAlpha, missed_increment
-from lgsens.integrate._uneven import Attempt, Progress, UnevenSteps, chosen, moved
+from lgsens.integrate._march import Progress, Walk, chosen
+from lgsens.integrate._pace import UnevenPace
+from lgsens.integrate._scheme import AbstractScheme, Start, Stats
 
 _AIM = 0.5  # θ: few steps are rejected
 _LIMIT = 1.0  # κ: no step is more than 2.6 times as long as the one before
@@ -43,8 +46,8 @@ _ATTEMPTS = 20  # at one step
 _LEAST = 1e-6  # errors below this fraction of the tolerance count as so large
 
 
-class AdaptiveSteps(eqx.Module):
-    """Generalized-α with steps under error control: an integrator of `simulate`.
+class AdaptiveSteps(AbstractIntegrator):
+    """Steps under error control: an integrator of `simulate`.
 
         h³ |c_i| ≤ tolerance s_i,     c = (1/6 − β − Δ/2) v̈ + ad(v) v̇/12,  Δ = α_m − α_f
 
@@ -52,7 +55,7 @@ class AdaptiveSteps(eqx.Module):
     scene.
 
     Arguments:
-        integrator: the scheme, a `GeneralizedAlpha`.
+        integrator: the scheme, `GeneralizedAlpha` or another one.
         tolerance: the error that a step may add to a configuration, relative to 1 rad or the length of the scene.
             Global errors fall as tolerance^(2/3): a thousandth of it, a hundredth of them, in ten times the steps.
         longest: the longest step, as a fraction of the interval t1 − t0. A system at rest does not see ahead: no longer
@@ -71,29 +74,29 @@ class AdaptiveSteps(eqx.Module):
     All static and hashable. Raises `ValueError` for settings out of range.
     """
 
-    integrator: GeneralizedAlpha = eqx.field(static=True, default=GeneralizedAlpha())
+    integrator: AbstractScheme = eqx.field(static=True, default=GeneralizedAlpha())
     tolerance: float = eqx.field(static=True, default=1e-6, kw_only=True)
     longest: float = eqx.field(static=True, default=0.02, kw_only=True)
 
     def __check_init__(self):
-        if not isinstance(self.integrator, GeneralizedAlpha):
+        if not isinstance(self.integrator, AbstractScheme):
             raise ValueError(f"AdaptiveSteps: `integrator` must be a GeneralizedAlpha, got {self.integrator!r}.")
         if not isinstance(self.tolerance, int | float) or not 0.0 < self.tolerance < math.inf:
             raise ValueError(f"AdaptiveSteps: `tolerance` must be positive, got {self.tolerance!r}; try 1e-6.")
         if not isinstance(self.longest, int | float) or not 0.0 < self.longest <= 1.0:
             raise ValueError(f"AdaptiveSteps: `longest` must be in (0, 1], got {self.longest!r}; 0.02 is the default.")
 
+    @property
+    def scheme(self):
+        return self.integrator
 
-class FirstState(NamedTuple):
-    """The initial state for a first step of any size: v + h² v_2, a + h a_1."""
-
-    state: State
-    v_2: Float[Array, " k"]
-    a_1: Float[Array, " k"]
-
-    def at(self, h) -> State:
-        state = self.state
-        return State(state.q, state.v + h**2 * self.v_2, state.vdot, state.lam, state.a + h * self.a_1)
+    def lay(self, system, start, jerk, t0, t1, num_steps):
+        mean = (t1 - t0) / num_steps
+        # What error control decides has no derivative: its sizes, as parts of the interval, are constants of the run.
+        frozen = jax.lax.stop_gradient((system, start, jerk, t0, mean))
+        found = jax.lax.stop_gradient(integrate_controlled(self, num_steps, *frozen))
+        grid = UnevenGrid.first(t0, found.h / frozen[4] * mean)
+        return Laid(grid, (found.states, Stats(*found.stats[: len(Stats._fields)])), found.stats, found.finished)
 
 
 class ControlledStats(NamedTuple):
@@ -130,31 +133,29 @@ class Controlled(NamedTuple):
 
 
 class _Trial(NamedTuple):
+    """A step of size h, tried, and where it leads."""
+
     h: Float[Array, ""]
-    found: Attempt
+    done: Progress
+    stats: Stats
     error: Float[Array, ""]
-    iterations: Int[Array, ""]
     rejected: Int[Array, ""]
     trying: Bool[Array, ""]
 
-    def chosen(self, which, other: "_Trial") -> "_Trial":
-        """`self` where `which`, else `other`; but the matrix of `self` in any case."""
-        less = lambda trial: trial._replace(found=trial.found._replace(shared=None))
-        small = chosen(which, less(self), less(other))
-        return small._replace(found=small.found._replace(shared=self.found.shared))
-
 
 def integrate_controlled(
-    settings: AdaptiveSteps, num_steps: int, system: AbstractSystem, first: FirstState, t0, h
+    settings: AdaptiveSteps, num_steps: int, system: AbstractSystem, first: Start, jerk, t0, h
 ) -> Controlled:
-    """At most `num_steps` steps from t0 to t0 + num_steps h; those not needed have size 0 and repeat the last state."""
+    """At most `num_steps` steps from t0 to t0 + num_steps h; those not needed have size 0 and repeat the last state.
+
+    `jerk`: v̈ at t0, from which the first size is taken.
+    """
     scheme, total = settings.integrator, num_steps * h
-    steps = UnevenSteps.of(scheme, system)
-    scale = steps.constants.scale
+    walk, scale = Walk.of(scheme, system), system.coordinate_scale()
     tolerance = max(settings.tolerance, 16 * float(jnp.finfo(h.dtype).eps))
 
     def relative(v, vdot, jerk, h):
-        missed = missed_increment(scheme, system, v, vdot, jerk)
+        missed = scheme.missed_increment(system, v, vdot, jerk)
         return h**3 * jnp.max(jnp.abs(missed) / scale) / tolerance
 
     def fitted(h, remaining):
@@ -163,61 +164,62 @@ def integrate_controlled(
         return remaining / jnp.ceil(jnp.maximum(remaining / h - 0.1, least * (1.0 - 1e-9)))
 
     def step(carry, n):
-        progress, proposed, before, elapsed = carry
+        progress, size, proposed, before, elapsed = carry
         active = progress.running & (elapsed < total)
         remaining = jnp.where(active, total - elapsed, h)
         wanted = fitted(proposed, remaining)
 
-        def begins(trial: _Trial) -> Progress:
-            """A first step begins with the state that belongs to its size."""
-            return progress._replace(
-                state=chosen(n == 0, first.at(trial.h), progress.state),
-                h=jnp.where(n == 0, trial.h, progress.h),
-                shared=trial.found.shared,
-            )
+        def begins(trial: _Trial) -> tuple[Progress, Float[Array, ""]]:
+            """A first step begins with the state that belongs to its size, another with what earlier trials leave."""
+            state = chosen(n == 0, first.at(system, trial.h), progress.state)
+            memory = scheme.rejected(progress.memory, trial.done.memory)
+            return Progress(state, memory, progress.running), jnp.where(n == 0, trial.h, size)
 
         def attempt(trial: _Trial) -> _Trial:
-            progress = begins(trial)
-            start = moved(progress.state, trial.h / progress.h)
-            found = steps.tried(progress, trial.h, trial.trying)
-            error = relative(start.v, start.vdot, (found.state.a - start.a) / trial.h, trial.h)
-            accepted = found.stats.converged & (error <= 1.0)
-            shorter = jnp.where(found.stats.converged, jnp.clip(0.8 * error ** (-1.0 / 3.0), 0.1, 0.8), 0.25)
+            start, size = begins(trial)
+            state, h = start.state, trial.h
+            begun = eqx.tree_at(lambda s: s.a, state, scheme.resized(state.vdot, state.a, h / size))
+            done, stats = walk.take(start, begun, Node(t0 + elapsed, t0 + (elapsed + h), h), trial.trying)
+            error = relative(begun.v, begun.vdot, (done.state.a - begun.a) / h, h)
+            accepted = stats.converged & (error <= 1.0)
+            shorter = jnp.where(stats.converged, jnp.clip(0.8 * error ** (-1.0 / 3.0), 0.1, 0.8), 0.25)
             rejected = trial.rejected + (~accepted).astype(jnp.int32)
             again = ~accepted & (rejected < _ATTEMPTS)
-            iterations = trial.iterations + found.stats.iterations
             given_up = ~accepted & ~again
-            found = found._replace(
-                state=jax.tree.map(lambda leaf: jnp.where(given_up, jnp.nan, leaf), found.state),
-                stats=found.stats._replace(converged=found.stats.converged & ~given_up),
+            done = Progress(
+                state=jax.tree.map(lambda leaf: jnp.where(given_up, jnp.nan, leaf), done.state),
+                memory=done.memory,
+                running=stats.converged & ~given_up,
             )
-            new = _Trial(jnp.where(again, trial.h * shorter, trial.h), found, error, iterations, rejected, again)
-            return new.chosen(trial.trying, trial)
+            stats = stats._replace(iterations=trial.stats.iterations + stats.iterations, converged=done.running)
+            new = _Trial(jnp.where(again, h * shorter, h), done, stats, error, rejected, again)
+            kept = walk.chosen(trial.trying, done, trial.done)
+            others = chosen(trial.trying, new._replace(done=None), trial._replace(done=None))
+            return others._replace(done=kept)
 
         none = jnp.zeros((), jnp.int32)
         stats = Stats(none, h * 0.0, h * 0.0, progress.running, jnp.nan * h)
-        nothing = Attempt(progress.state, progress.contraction, stats, progress.shared)
         trial = lax.while_loop(
-            lambda trial: in_any_lane(trial.trying), attempt, _Trial(wanted, nothing, h * 0.0, none, none, active)
+            lambda trial: in_any_lane(trial.trying), attempt, _Trial(wanted, progress, stats, h * 0.0, none, active)
         )
-        begun = begins(trial)
-        progress = steps.after(begun, trial.found, trial.h).chosen(active, progress)
+        _, size = begins(trial)
+        progress = walk.chosen(active, trial.done, progress)
         error = jnp.maximum(trial.error, _LEAST)
-        rho = (_AIM / error * _AIM / before) ** (1.0 / 12.0) * (begun.h / trial.h) ** 0.25
+        rho = (_AIM / error * _AIM / before) ** (1.0 / 12.0) * (size / trial.h) ** 0.25
         grown = trial.h * (1.0 + _LIMIT * jnp.arctan((rho - 1.0) / _LIMIT))
         elapsed = jnp.where(active, jnp.where(trial.h >= remaining, total, elapsed + trial.h), elapsed)
         h_taken = jnp.where(active | ~progress.running, trial.h, 0.0)
-        stats = trial.found.stats._replace(iterations=trial.iterations)
-        carry = (progress, grown, error, elapsed)
-        return carry, (h_taken, progress.state, stats, trial.error * tolerance, trial.rejected)
+        carry = (progress, jnp.where(active, trial.h, size), grown, error, elapsed)
+        return carry, (h_taken, progress.state, trial.stats, trial.error * tolerance, trial.rejected)
 
-    jerk = first.a_1 / (scheme.alpha_m - scheme.alpha_f)
     expected = relative(first.state.v, first.state.vdot, jerk, h)
     guess = h * jnp.minimum(1.0, (_AIM / jnp.maximum(expected, _LEAST)) ** (1.0 / 3.0))
-    begin = (steps.first(first.at(guess), t0, guess), guess, jnp.full((), _AIM, h.dtype), h * 0.0)
-    (_, _, _, elapsed), (sizes, later, newton, errors, rejected) = lax.scan(step, begin, jnp.arange(num_steps))
-    begun = first.at(sizes[0])
-    states = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), begun, later)
+    begun = first.at(system, guess)
+    memory = scheme.memory(system, walk.shared, begun, Node(t0, t0 + guess, guess), UnevenPace.first(guess))
+    running = jnp.all(jnp.isfinite(begun.a))
+    begin = (Progress(begun, memory, running), guess, guess, jnp.full((), _AIM, h.dtype), h * 0.0)
+    (*_, elapsed), (sizes, later, newton, errors, rejected) = lax.scan(step, begin, jnp.arange(num_steps))
+    states = with_first(first.at(system, sizes[0]), later)
     taken = jnp.sum((sizes > 0.0) & newton.converged).astype(jnp.int32)
     stats = ControlledStats(*newton, errors, rejected, taken)
     return Controlled(sizes, states, stats, elapsed >= total)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import State
+from lgsens.integrate._pace import Weights
 
 
 class Past(NamedTuple):
@@ -31,19 +32,21 @@ class Past(NamedTuple):
     def none(cls, x) -> "Past":
         return cls(x, x, x, jnp.zeros_like(x))
 
-    def predicted(self, x) -> Float[Array, " n"]:
+    def predicted(self, x, weights: Weights = None) -> Float[Array, " n"]:
         """x_{n+1}, from x = x_n."""
         missed, square = x - self.expected, jnp.sum(self.missed**2)
         theta = jnp.sum(missed * self.missed) / jnp.where(square > 0.0, square, 1.0)
         # not finite where squares overflow
         theta = jnp.where(jnp.isfinite(theta), jnp.clip(theta, -1.0, 1.0), 0.0)
-        return self._parabola(x) + theta * missed
+        return self._parabola(x, weights) + theta * missed
 
-    def after(self, x) -> "Past":
-        return Past(x, self.last, self._parabola(x), x - self.expected)
+    def after(self, x, weights: Weights = None) -> "Past":
+        return Past(x, self.last, self._parabola(x, weights), x - self.expected)
 
-    def _parabola(self, x):
-        return 3.0 * (x - self.last) + self.before
+    def _parabola(self, x, weights: Weights):
+        if weights is None:
+            return 3.0 * (x - self.last) + self.before
+        return weights[0] * x + weights[1] * self.last + weights[2] * self.before
 
 
 class Guess(NamedTuple):
@@ -53,17 +56,14 @@ class Guess(NamedTuple):
     a: Past
     lam: Past
     contraction: Float[Array, ""]
-    start: tuple[Float[Array, " k"], Float[Array, " m"]] | None = None  # u and λ, where steps are not equal
 
     @classmethod
     def first(cls, state0: State) -> "Guess":
         return cls(Past.none(state0.a), Past.none(state0.lam), jnp.ones((), state0.a.dtype))
 
-    def extrapolated(self, state: State):
+    def extrapolated(self, state: State, weights: tuple[Weights, Weights]):
         """u and λ."""
-        if self.start is not None:
-            return self.start
-        return self.a.predicted(state.a), self.lam.predicted(state.lam)
+        return self.a.predicted(state.a, weights[0]), self.lam.predicted(state.lam, weights[1])
 
-    def after(self, state: State, contraction) -> "Guess":
-        return Guess(self.a.after(state.a), self.lam.after(state.lam), contraction)
+    def after(self, state: State, contraction, weights: tuple[Weights, Weights]) -> "Guess":
+        return Guess(self.a.after(state.a, weights[0]), self.lam.after(state.lam, weights[1]), contraction)

@@ -21,61 +21,20 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from lgsens.dynamics import AbstractSystem, State, mass_matrix, require_independent, softness
+from lgsens.dynamics import State
+from lgsens.integrate._alpha import AbstractAlpha
+from lgsens.integrate._alpha_step import AbstractStep
 from lgsens.integrate._guess import Guess
 from lgsens.integrate._lanes import in_any_lane, renewed_where
-from lgsens.integrate._scheme import AbstractStep, GeneralizedAlpha, Index3Step, Motion
-from lgsens.integrate._stabilized import StabilizedFactors, StabilizedStep
-from lgsens.linear import LU, Factors, Inverse, Matrix
+from lgsens.integrate._pace import Weights
+from lgsens.integrate._scheme import Stats
+from lgsens.linear import LU
 
-Solver = Factors | StabilizedFactors
+Solver = Any  # factors
 _MODIFIED_LIMIT = 12  # iterations; more cost as much as a full one
 _STALLED = 0.3  # that from which on two full iterations cost less
 _FASTEST = 0.02  # contractions of earlier steps, when the matrix was newer, are no better than this
 _ROUGH = 64  # ε: increments below measure no contraction, and are noise where they fall no longer
-
-
-class Stats(NamedTuple):
-    """What Newton did in each step (in `take_step`: in one).
-
-    Attributes:
-        iterations: iterations of each step, those of modified Newton included, shape (n,), int32; 0 after a failure.
-        increment: the last increment of each step, relative as in `GeneralizedAlpha.tolerance`, shape (n,).
-        residual: the largest entry of the residual r before that increment [N or N m], shape (n,).
-        converged: whether each step converged, shape (n,), bool.
-        margin: how far the step is from a singular configuration (`_singular`), NaN where that was not looked at,
-            shape (n,).
-    """
-
-    iterations: Int[Array, " n"]
-    increment: Float[Array, " n"]
-    residual: Float[Array, " n"]
-    converged: Bool[Array, " n"]
-    margin: Float[Array, " n"]
-
-
-class Constants(NamedTuple):
-    """What all steps share."""
-
-    mass: Matrix  # M, (k, k)
-    scale: Float[Array, " k"]
-    softness: Float[Array, " m"] | None  # c; None: no constraint may be redundant
-    inverse_mass: Matrix = None  # M⁻¹, (k, k), where the scheme is stabilized; M is dense there
-
-    @classmethod
-    def of(cls, system: AbstractSystem, *, stabilized: bool = False) -> "Constants":
-        scale = system.coordinate_scale()
-        if stabilized:
-            require_independent(system, "GeneralizedAlpha(stabilized=True)")
-            mass = system.mass_matrix()
-            return cls(mass, scale, None, jnp.linalg.inv(mass))
-        return cls(mass_matrix(system), scale, softness(system))
-
-    def step(self, scheme: GeneralizedAlpha, system: AbstractSystem, previous: State, h) -> AbstractStep:
-        """The equations of the step from `previous`."""
-        if scheme.stabilized:
-            return StabilizedStep.of(scheme, system, self.mass, self.inverse_mass, previous, h)
-        return Index3Step(scheme, system, self.mass, self.scale, self.softness, previous, h)
 
 
 class Chord(NamedTuple):
@@ -83,34 +42,7 @@ class Chord(NamedTuple):
 
     solver: Solver
     due: Bool[Array, ""]  # whether the step begins with a new one; after a step, whether it made one
-
-
-class Wear(NamedTuple):
-    """What has been done with the matrix that steps share.
-
-    A matrix that serves s steps of n_1, …, n_s iterations costs (R + Σ n_i)/s iterations per step if making it costs R.
-    This is least where the next step would take more than that; it is taken to need as many as the last one. R is 6
-    for the top (9 unknowns), 10 for 35, 20 for the quarter-car (94) and for chains in blocks, and flat: with half or
-    twice of it times change by 3 %. (A new matrix wherever the contraction exceeds 0.1, the rule before, was made three
-    times as often on the quarter-car, and cost 42 % more: 59 and 42 µs per step of 1 ms.)
-    """
-
-    steps: Int[Array, ""]
-    iterations: Int[Array, ""]
-    last: Int[Array, ""]  # of the last step
-
-    @classmethod
-    def unused(cls) -> "Wear":
-        return cls(*(jnp.zeros((), jnp.int32) for _ in range(3)))
-
-    def after(self, made, iterations) -> "Wear":
-        """After a step of so many iterations, which made a new matrix or not."""
-        return Wear(jnp.where(made, 0, self.steps) + 1, jnp.where(made, 0, self.iterations) + iterations, iterations)
-
-    def out(self, unknowns: int):
-        """Whether a new matrix pays."""
-        renewal = min(20, 4 + unknowns // 5)
-        return (self.steps > 1) & (self.last * self.steps > renewal + self.iterations)
+    kind: Any  # of factors
 
 
 class _Iterate(NamedTuple):
@@ -130,33 +62,33 @@ class _Iterate(NamedTuple):
 
 
 def take_step(
-    scheme: GeneralizedAlpha,
-    system: AbstractSystem,
-    constants: Constants,
+    scheme: AbstractAlpha,
+    equations: AbstractStep,
+    scale: Float[Array, " k"],
     previous: State,
     guess: Guess,
+    weights: tuple[Weights, Weights],
     chord: Chord | None,
     running,
     t,
     h,
-    kind: Any = Inverse,
 ) -> tuple[State, Guess, Stats, Chord | None]:
     """The state at t = t_n + h, the guess for the next step, and what Newton did; NaN unless `running` and converged.
 
-    `chord` has the iteration matrix of an earlier step, for modified Newton, in factors of `kind`; it is returned with
-    the last one made. None: full Newton only.
+    `previous`, not resized, and `weights` of past u and λ: where the iteration starts. `chord` has the iteration matrix
+    of an earlier step, for modified Newton; it is returned with the last one made. None: full Newton only.
 
     Modified Newton, and the full Newton that takes over where it gives up, are rounds of one loop: a new matrix at the
     iterate where one is due, then iterations until the next is. What makes a matrix, nearly all that there is to
     compile, so is compiled once.
     """
-    scale, equations = constants.scale, constants.step(scheme, system, previous, h)
     eps = float(jnp.finfo(scale.dtype).eps)
     tolerance = max(scheme.tolerance, 64 * eps)
     round_off = max(1.0, len(scale) / 12) * eps
     target = max(tolerance**2, 0.04 * round_off)
     noise = max(_ROUGH, len(scale)) * eps
-    u, lam = guess.extrapolated(previous)
+    u, lam = guess.extrapolated(previous, weights)
+    kind = None if chord is None else chord.kind
 
     def matrix(iterate: _Iterate, kind) -> tuple[Solver, Float[Array, ""]]:
         return equations.factors(equations.motion(iterate.u, iterate.lam), iterate.lam, t, kind)
@@ -243,7 +175,7 @@ def take_step(
             iterate, solver = lax.while_loop(lambda carry: in_any_lane(carry[0].going), round_of, carry)
         else:
             iterate, solver = round_of(carry)
-        chord = Chord(solver, running & (due | iterate.full))
+        chord = Chord(solver, running & (due | iterate.full), kind)
     motion = equations.motion(iterate.u, iterate.lam)
     state = State(q=motion.q, v=motion.v, vdot=motion.vdot, lam=iterate.lam, a=iterate.u)
     finite = jnp.all(jnp.isfinite(iterate.u)) & jnp.all(jnp.isfinite(iterate.lam))
@@ -256,11 +188,4 @@ def take_step(
         converged=converged,
         margin=jnp.where(converged, iterate.margin, jnp.nan),
     )
-    return state, guess.after(previous, jnp.maximum(iterate.contraction, _FASTEST)), stats, chord
-
-
-def no_solver(scheme: GeneralizedAlpha, system: AbstractSystem, constants: Constants, state: State, t, h) -> Solver:
-    """Zeros in the shapes of the inverse of an iteration matrix, to begin with."""
-    at_state = Motion(state.v, state.q, state.v, state.vdot)
-    inverse = lambda: constants.step(scheme, system, state, h).factors(at_state, state.lam, t, Inverse)[0]
-    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(inverse))
+    return state, guess.after(previous, jnp.maximum(iterate.contraction, _FASTEST), weights), stats, chord

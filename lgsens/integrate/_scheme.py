@@ -1,230 +1,225 @@
-"""The Lie-group generalized-α scheme as a value, eqs. (24)–(30).
+"""A scheme: one step E(y_n, y_{n+1}; system, t_n, h) = 0, and all that the march, grids and sensitivities ask of it.
 
-With u = a_{n+1}, one step from (q, v, v̇, a) at t_n solves for u and λ
-
-    x   = h v + h² ((½ − β) a + β u)                      (27)
-    q⁺  = q exp(x̃)                                       (24)
-    v⁺  = v + h ((1 − γ) a + γ u)                         (28)
-    v̇⁺  = ((1 − α_m) u + α_m a − α_f v̇) / (1 − α_f)       (29)
-    r(q⁺, v⁺, v̇⁺, λ⁺, t⁺) = 0,   Φ(q⁺)/(βh²) = 0          (25), (26)
-
-The unknown is u and not x, and the constraint is divided by βh²: with ∂x/∂u = βh² the matrix of eq. (30)
-becomes
-
-    S = [[c M + γh C_t + βh² K_t T(x),  Bᵀ],
-         [B T(x),                       0 ]],      c = (1 − α_m)/(1 − α_f),
-
-which does not degenerate as h → 0 (Bottasso, Bauchau & Cardona 2007; its condition at h = 1e-3 would
-else be 1e18). Its constraint rows and multipliers are further scaled by the size of M. Where constraints may be
-redundant, Φ(q⁺)/(βh²) − c λ⁺ = 0, with −diag(c) in the corner of S (`dynamics/_redundant.py`).
+A new scheme is one class. What it must say are its equations, a function of both states; from these follow, for scenes
+that are not large, Newton's iteration of a step, the exact linearization that forward and transposed sweeps solve, and
+the product with it that second derivatives are taken of. Schemes that want to be fast say more.
 """
 
 import abc
-import math
+import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import jax.scipy.linalg as jsl
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
 
-from lgsens.dynamics import (
-    AbstractSystem,
-    State,
-    Tangents,
-    factorized,
-    mass_scale,
-    softness,
-    tangents,
-    times_tangent_operator,
-)
-from lgsens.integrate._singular import margin_of
-from lgsens.linear import LU, Factors, Matrix
+from lgsens.dynamics import AbstractSystem, Initial, State
+from lgsens.integrate._grid import Node
+from lgsens.integrate._integrator import AbstractIntegrator
+from lgsens.integrate._linearized import AbstractLinearizedStep, DenseLinearizedStep, Variation
+from lgsens.integrate._pace import AbstractPace
 
 
-class GeneralizedAlpha(eqx.Module):
-    """The generalized-α integrator: numerical damping and the settings of its Newton iteration.
+class Stats(NamedTuple):
+    """What Newton did in each step (of one step: in one).
 
-        α_m = (2ρ − 1)/(ρ + 1),  α_f = ρ/(ρ + 1),  γ = ½ + α_f − α_m,  β = (γ + ½)²/4
-
-    Arguments:
-        rho_inf: spectral radius ρ∞ at infinite frequency, in [0, 1): 0 damps the fastest modes in one step,
-            values near 1 keep energy and let noise in the multipliers persist.
-        tolerance: the last Newton increment of a configuration, relative to 1 rad or the length of the
-            scene, at which a step has converged. The error left is its square; below 64 round-offs
-            it is raised to that (single precision).
-        max_iterations: full Newton iterations per step before the step has failed.
-        iterations: a fixed budget instead, so many iterations in every step and no test between them: of modified
-            Newton, with a matrix renewed every `factor_every` steps and at no other time, or of full Newton where that
-            is 0. Every step then costs the same, in each lane of a batch too. A step whose last increment is above
-            `tolerance` has failed all the same, and `Stats.increment` says what it was; with a larger tolerance the
-            motion is off by about the last increment times the contraction of one iteration, and so is its derivative,
-            which is that of converged steps. Too few feed their error to the steps that follow: at h = 1 ms a top
-            takes 2 full ones, or 4 with a matrix up to 20 steps old (with 3 it diverges). None: as many as it takes.
-        factor_every: the most steps that share one inverse of the iteration matrix (modified Newton); a new one is made
-            earlier where the iterations that it saves are worth it. Its iterations cost a tenth of a full one, and go
-            on until the error left is what full Newton would leave; a step that they do not bring there is finished by
-            full Newton. 0: full Newton always. The sensitivities do not depend on it: theirs is always the exact
-            matrix of the converged step.
-        second_order_start: start with a₀ = v̇₀ + (α_m − α_f) h v̈₀, because a_n stands for the acceleration at
-            t_n + (α_m − α_f) h, and with v₀ moved by O(h²) along the constraint directions, where the scheme keeps
-            it anyway: positions, velocities and multipliers are then second order from the first step.
-            False: a₀ = v̇₀ and v₀ as it is; multipliers are first order in the first steps (Arnold,
-            Brüls & Cardona, Numerische Mathematik 129, 2015, doi:10.1007/s00211-014-0633-1).
-        stabilized: satisfy B v = 0 in every step besides Φ = 0 (stabilized index 2, after Gear, Gupta & Leimkuhler),
-            at the price of m more unknowns in a step; see `_stabilized.py`. Dense. False: index 3, where B v is O(h²).
-
-    All static and hashable. Raises `ValueError` for ρ∞ outside [0, 1), a tolerance that is not positive, fewer than 1
-    iteration, a negative `factor_every`, or a `stabilized` that is not a bool. Source: Sonneville & Brüls (2014), §4;
-    Brüls, Cardona & Arnold (2012).
+    Attributes:
+        iterations: iterations of each step, those of modified Newton included, shape (n,), int32; 0 after a failure.
+        increment: the last increment of each step, relative as in `GeneralizedAlpha.tolerance`, shape (n,).
+        residual: the largest entry of the residual r before that increment [N or N m], shape (n,).
+        converged: whether each step converged, shape (n,), bool.
+        margin: how far the step is from a singular configuration (`_singular`), NaN where that was not looked at,
+            shape (n,).
     """
 
-    rho_inf: float = eqx.field(static=True, default=0.9)
-    tolerance: float = eqx.field(static=True, default=1e-10, kw_only=True)
-    max_iterations: int = eqx.field(static=True, default=10, kw_only=True)
-    factor_every: int = eqx.field(static=True, default=20, kw_only=True)
-    second_order_start: bool = eqx.field(static=True, default=True, kw_only=True)
-    iterations: int | None = eqx.field(static=True, default=None, kw_only=True)
-    stabilized: bool = eqx.field(static=True, default=False, kw_only=True)
-
-    def __check_init__(self):
-        if not isinstance(self.rho_inf, int | float) or not 0.0 <= self.rho_inf < 1.0:
-            raise ValueError(
-                f"GeneralizedAlpha: `rho_inf` must be a number in [0, 1), got {self.rho_inf!r}; 0.9 damps little, "
-                "0 most."
-            )
-        if not isinstance(self.tolerance, int | float) or not 0.0 < self.tolerance < math.inf:
-            raise ValueError(
-                f"GeneralizedAlpha: `tolerance` must be positive, got {self.tolerance!r}; 1e-10 is the default."
-            )
-        if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
-            raise ValueError(
-                f"GeneralizedAlpha: `max_iterations` must be an int, at least 1, got {self.max_iterations!r}."
-            )
-        if not isinstance(self.factor_every, int) or self.factor_every < 0:
-            raise ValueError(
-                "GeneralizedAlpha: `factor_every` must be an int, at least 0 (0: full Newton always), got "
-                f"{self.factor_every!r}."
-            )
-        if self.iterations is not None and (not isinstance(self.iterations, int) or self.iterations < 1):
-            raise ValueError(
-                "GeneralizedAlpha: `iterations` must be an int, at least 1, or None (until they converge), got "
-                f"{self.iterations!r}."
-            )
-        if not isinstance(self.stabilized, bool):
-            raise ValueError(
-                f"GeneralizedAlpha: `stabilized` must be True (index 2) or False (index 3), got {self.stabilized!r}."
-            )
-
-    @property
-    def alpha_m(self) -> float:
-        return (2.0 * self.rho_inf - 1.0) / (self.rho_inf + 1.0)
-
-    @property
-    def alpha_f(self) -> float:
-        return self.rho_inf / (self.rho_inf + 1.0)
-
-    @property
-    def gamma(self) -> float:
-        return 0.5 + self.alpha_f - self.alpha_m
-
-    @property
-    def beta(self) -> float:
-        return (self.gamma + 0.5) ** 2 / 4.0
-
-    @property
-    def inertia_factor(self) -> float:
-        """c = ∂v̇⁺/∂u."""
-        return (1.0 - self.alpha_m) / (1.0 - self.alpha_f)
+    iterations: Int[Array, " n"]
+    increment: Float[Array, " n"]
+    residual: Float[Array, " n"]
+    converged: Bool[Array, " n"]
+    margin: Float[Array, " n"]
 
 
-class Motion(NamedTuple):
-    """The increment and the kinematic state that u gives, eqs. (24), (27)–(29)."""
+class Start(NamedTuple):
+    """The initial state for a first step of any size h: q exp(h² q̃_2), v + h² v_2, a + h a_1; None: nothing."""
 
-    x: Float[Array, " k"]
-    q: Any
-    v: Float[Array, " k"]
-    vdot: Float[Array, " k"]
+    state: State
+    q_2: Float[Array, " k"] | None = None
+    v_2: Float[Array, " k"] | None = None
+    a_1: Float[Array, " k"] | None = None
 
-
-def increment(scheme: GeneralizedAlpha, previous: State, u, h) -> Float[Array, " k"]:
-    """x of eq. (27)."""
-    return h * previous.v + h**2 * ((0.5 - scheme.beta) * previous.a + scheme.beta * u)
-
-
-def advance(scheme: GeneralizedAlpha, system: AbstractSystem, previous: State, u, h, correction=None) -> Motion:
-    """What follows from the unknown u = a_{n+1}; `correction` is added to it in x alone."""
-    x = increment(scheme, previous, u if correction is None else u + correction, h)
-    v = previous.v + h * ((1.0 - scheme.gamma) * previous.a + scheme.gamma * u)
-    vdot = ((1.0 - scheme.alpha_m) * u + scheme.alpha_m * previous.a - scheme.alpha_f * previous.vdot) / (
-        1.0 - scheme.alpha_f
-    )
-    return Motion(x, system.group.retract(previous.q, x), v, vdot)
+    def at(self, system: AbstractSystem, h) -> State:
+        state = self.state
+        return dataclasses.replace(
+            state,
+            q=state.q if self.q_2 is None else system.group.retract(state.q, h**2 * self.q_2),
+            v=state.v if self.v_2 is None else state.v + h**2 * self.v_2,
+            a=state.a if self.a_1 is None else state.a + h * self.a_1,
+        )
 
 
-def missed_increment(scheme: GeneralizedAlpha, system: AbstractSystem, v, vdot, jerk) -> Float[Array, " k"]:
-    """c: with exact values and a_n = v̇(t_n + Δ h), Δ = α_m − α_f, the increment (27) misses the true one by h³ c.
+class AbstractScheme(AbstractIntegrator):
+    """A one-step scheme on a constrained system; static and hashable.
 
-    The true one is h v + h²/2 v̇ + h³ (v̈/6 + ad(v) v̇/12), from ẋ = T⁻¹(x) v and T⁻¹ = I + ½ ad(x) + …; hence
-    c = (1/6 − β − Δ/2) v̈ + ad(v) v̇/12.
+    Attributes:
+        tolerance: the last Newton increment of a configuration, relative to 1 rad or the length of the scene.
+        max_iterations: Newton iterations per step before the step has failed.
     """
-    delta = scheme.alpha_m - scheme.alpha_f
-    return (1.0 / 6.0 - scheme.beta - delta / 2.0) * jerk + system.group.ad_mv(v, vdot) / 12.0
 
+    tolerance: eqx.AbstractVar[float]
+    max_iterations: eqx.AbstractVar[int]
 
-def factorize_iteration_matrix(
-    scheme: GeneralizedAlpha, system: AbstractSystem, tangents: Tangents, mass, x, h, kind: Any = LU
-) -> Factors:
-    """The factors of S above: one LU, which serves Newton, the DDM, and transposed, the AVM. Or its `Inverse`."""
-    jacobian = tangents.constraint_jacobian
-    stiffness, lower = times_tangent_operator(system, x, (tangents.stiffness, jacobian))
-    dynamic = scheme.inertia_factor * mass + (scheme.gamma * h) * tangents.damping + (scheme.beta * h**2) * stiffness
-    return factorized(system, dynamic, jacobian.T, lower, mass_scale(mass), kind, softness(system))
-
-
-class AbstractStep(eqx.Module):
-    """The equations of one step from `previous`, for Newton: the unknowns are u and the multipliers of the scheme."""
+    @property
+    def scheme(self):
+        return self
 
     @abc.abstractmethod
-    def motion(self, u, lam) -> Motion:
-        """What follows from the unknowns."""
+    def equations(self, system: AbstractSystem, node: Node, previous: State, state: State) -> State:
+        """E: the configuration that the step predicts as `q`, what is left of all other equations elsewhere.
 
-    @abc.abstractmethod
-    def defect(self, motion: Motion, lam, t) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
-        """What is left of the dynamic equilibrium [N or N m], and of the constraints, as accelerations."""
+        As many equations as unknowns, in the shapes of the state. Differentiable; its derivative by q_{n+1} at the
+        solution is the exact linearization.
+        """
 
-    @abc.abstractmethod
-    def factors(self, motion: Motion, lam, t, kind: Any = LU) -> tuple[Any, Float[Array, ""]]:
-        """The factors of the iteration matrix, whose solution for the defect is what Newton takes from the unknowns;
-        and their margin (`_singular`)."""
+    # How a motion begins, and what is seen of it.
 
-    @abc.abstractmethod
-    def change(self, du, dlam) -> Float[Array, " k"]:
-        """How far increments of the unknowns move the configuration, over βh²."""
+    def start(self, system: AbstractSystem, initial: Initial) -> Start:
+        """What the scheme starts from, given consistent values."""
+        return Start(initial.state)
+
+    def complete(self, system: AbstractSystem, state: State) -> State:
+        """A state with what else the scheme carries."""
+        return state
+
+    def physical(self, states: State) -> State:
+        """A state, or stacked ones, without what else the scheme carries."""
+        return states
+
+    def resized(self, vdot, a, ratio) -> Float[Array, " k"]:
+        """a of a state as a step begins with it that is `ratio` times as long as the one that led there."""
+        return a
+
+    def missed_increment(self, system: AbstractSystem, v, vdot, jerk) -> Float[Array, " k"]:
+        """c, where the increment of a configuration misses the true one by h³ c: for the control of step sizes.
+
+        Here that of the trapezoidal rule, (v̈ + ad(v) v̇)/12, which a scheme of second order has or has less of.
+        """
+        return (jerk + system.group.ad_mv(v, vdot)) / 12.0
+
+    # The march.
+
+    def shared(self, system: AbstractSystem) -> Any:
+        """What all steps share."""
+        return None
+
+    def memory(
+        self, system: AbstractSystem, shared: Any, state: State, node: Node, pace: AbstractPace, *, exact: bool = False
+    ) -> Any:
+        """What the iteration of the next step knows of the steps before, at the start.
+
+        `exact`: that of runs in which `remembered` is told of the linearization of each step.
+        """
+        return None
+
+    def remembered(
+        self, shared: Any, memory: Any, linearized: AbstractLinearizedStep, node: Node, stats: Stats
+    ) -> tuple[Any, Stats]:
+        """What is to be remembered of the linearization of the last step."""
+        return memory, stats
+
+    def kept(self, memory: Any) -> Any:
+        """What is kept of it where a run is to go on from."""
+        return memory
+
+    def restored(self, system: AbstractSystem, shared: Any, kept: Any, state: State, node: Node) -> Any:
+        """`memory`, from what was kept of it."""
+        return kept
+
+    def rejected(self, before: Any, after: Any) -> Any:
+        """The memory where a step has been tried and is not taken."""
+        return before
+
+    def take(
+        self, system: AbstractSystem, shared: Any, before: State, begun: State, memory: Any, node: Node, running
+    ) -> tuple[State, Any, Stats]:
+        """The state at the end of a step that begins with `begun` (`before`, resized), and what Newton did; NaN unless
+        `running` and converged. Here: full Newton with the matrix of the equations."""
+        scale = system.coordinate_scale()
+        tolerance = max(self.tolerance, 64 * float(jnp.finfo(scale.dtype).eps))
+        x = node.h * begun.v
+        guess = dataclasses.replace(begun, q=system.group.retract(begun.q, x), v=begun.v + node.h * begun.vdot)
+
+        def corrected(carry):
+            state, _, _, count, _ = carry
+            left, unravel = ravel_pytree(rows(self, system, node, begun, state))
+            step = unravel(jnp.linalg.solve(self._matrix(system, node, begun, state), left))
+            size = jnp.max(jnp.abs(step.w) / scale)
+            new = _moved(system, state, jax.tree.map(jnp.negative, step))
+            going = (size > tolerance) & (count + 1 < self.max_iterations)
+            return new, size, jnp.max(jnp.abs(left)), count + 1, going
+
+        none = jnp.zeros((), jnp.int32)
+        first = (guess, jnp.inf * node.h, jnp.inf * node.h, none, running)
+        state, size, left, count, _ = lax.while_loop(lambda carry: carry[-1], corrected, first)
+        finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state)]))
+        converged = running & finite & (size <= tolerance)
+        state = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), state)
+        return state, memory, Stats(jnp.where(running, count, 0), size, left, converged, jnp.nan * node.h)
+
+    # Sensitivities.
+
+    def for_autodiff(self) -> "AbstractScheme":
+        """The scheme whose own loops are differentiated, where they are."""
+        return self
+
+    def numbers(self, system: AbstractSystem) -> int:
+        """How many numbers one linearized step keeps."""
+        return 2 * (4 * system.group.dim + len(system.constraint_names)) ** 2
+
+    def loads(self, shared: Any, previous: State, state: State) -> Callable[[AbstractSystem, Node], Any]:
+        """(system, node) ↦ what E depends on them by, at a fixed converged step that begins with `previous`."""
+        return lambda system, node: rows(self, system, node, previous, state)
+
+    def linearized(
+        self, system: AbstractSystem, shared: Any, node: Node, previous: State, state: State
+    ) -> AbstractLinearizedStep:
+        """The exact linearization at a converged step that begins with `previous`."""
+
+        def of_previous(delta):
+            return ravel_pytree(rows(self, system, node, _moved(system, previous, delta), state))[0]
+
+        zero, unravel = ravel_pytree(_none(previous))
+        by_previous = jax.jacfwd(lambda delta: of_previous(unravel(delta)))(zero)
+        return DenseLinearizedStep(jsl.lu_factor(self._matrix(system, node, previous, state)), by_previous)
+
+    def _matrix(self, system, node: Node, previous: State, state: State):
+        """E_{y⁺}."""
+        zero, unravel = ravel_pytree(_none(state))
+
+        def of_state(delta):
+            return ravel_pytree(rows(self, system, node, previous, _moved(system, state, unravel(delta))))[0]
+
+        return jax.jacfwd(of_state)(zero)
 
 
-class Index3Step(AbstractStep):
-    """Eqs. (24)–(29) as above."""
+def _none(state: State) -> Variation:
+    zeros = lambda tree: jax.tree.map(jnp.zeros_like, tree)
+    return Variation(jnp.zeros_like(state.v), *zeros((state.v, state.vdot, state.lam, state.a, state.inner)))
 
-    scheme: GeneralizedAlpha
-    system: AbstractSystem
-    mass: Matrix
-    scale: Float[Array, " k"]
-    softness: Float[Array, " m"] | None
-    previous: State
-    h: Float[Array, ""]
 
-    def motion(self, u, lam):
-        return advance(self.scheme, self.system, self.previous, u, self.h)
+def _moved(system: AbstractSystem, state: State, delta: Variation) -> State:
+    """q exp(w̃), v + v', …"""
+    _, *rest = delta
+    parts = (state.v, state.vdot, state.lam, state.a, state.inner)
+    return State(system.group.retract(state.q, delta.w), *jax.tree.map(jnp.add, parts, tuple(rest)))
 
-    def defect(self, motion, lam, t):
-        residual = self.system.residual(motion.q, motion.v, motion.vdot, lam, t)
-        violation = self.system.constraint(motion.q) / (self.scheme.beta * self.h**2)
-        return residual, violation if self.softness is None else violation - self.softness * lam
 
-    def factors(self, motion, lam, t, kind=LU):
-        at_state = tangents(self.system, motion.q, motion.v, motion.vdot, lam, t)
-        factors = factorize_iteration_matrix(self.scheme, self.system, at_state, self.mass, motion.x, self.h, kind)
-        return factors, margin_of(factors, at_state.constraint_jacobian, self.scale)
-
-    def change(self, du, dlam):
-        return jnp.abs(du)
+def rows(scheme: AbstractScheme, system: AbstractSystem, node: Node, previous: State, state: State):
+    """E as a `Variation`: its w is log(q_n exp(x̃)⁻¹ q_{n+1}), whose derivative is w' of q_{n+1} less that predicted."""
+    left, group = scheme.equations(system, node, previous, state), system.group
+    w = group.log(group.compose(group.inverse(left.q), state.q))
+    return Variation(w, left.v, left.vdot, left.lam, left.a, left.inner)

@@ -5,9 +5,7 @@ from lgsens.sensitivity._criterion_terms import Functional as Functional
 from lgsens.sensitivity._direct import direct_sweep as direct_sweep
 from lgsens.sensitivity._linearization import (
     Parameters as Parameters,
-    Variation as Variation,
     configuration_cotangent as configuration_cotangent,
-    times as times,
 )
 from lgsens.sensitivity._methods import (
     AbstractSensitivity as AbstractSensitivity,

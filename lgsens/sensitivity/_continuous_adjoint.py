@@ -76,7 +76,7 @@ def continuous_adjoint_sweep(
     scheme: GeneralizedAlpha, path: Point, parameters: Parameters, functional: Functional, p, terms
 ) -> Cotangents:
     """The cotangents of c criteria, by the second-order adjoint equations; `terms` is one of `_criterion_terms`."""
-    system, h = parameters.system, parameters.h
+    system, h = parameters.system, parameters.grid.h
     group, mass = system.group, system.mass_matrix()
 
     def node(point: Point) -> tuple[Node, Any]:

@@ -21,26 +21,26 @@ import jax.numpy as jnp
 from jax import lax
 
 from lgsens.dynamics import State, kkt_solve, split_velocity
-from lgsens.integrate import GeneralizedAlpha
+from lgsens.integrate import GeneralizedAlpha, Variation
 from lgsens.sensitivity._linear_alpha import Motion, Node, advance, started
-from lgsens.sensitivity._linearization import Parameters, Variation, pseudo_load_function
+from lgsens.sensitivity._linearization import Parameters, pseudo_load_function
 
 
 def continuous_direct_sweep(
     scheme: GeneralizedAlpha, states: State, parameters: Parameters, first: Variation, d: Parameters
 ) -> Variation:
     """The sensitivities (w, v', v̇', λ', a' = v̇') of all states, stacked, given those of the first."""
-    system, h = parameters.system, parameters.h
+    system, t0, h = parameters.system, parameters.grid.t0, parameters.grid.h
     group, mass = system.group, system.mass_matrix()
     num_steps = states.v.shape[0] - 1
     count = jnp.arange(num_steps + 1, dtype=states.v.dtype)
 
     def node(state: State, n) -> Node:
-        t = parameters.t0 + n * h
+        t = t0 + n * h
         k_t, c_t, jacobian = system.tangents(state.q, state.v, state.vdot, state.lam, t)
         bracket = group.ad(state.v)
         loads = pseudo_load_function(state)
-        r_p, phi_p = jax.jvp(loads, (system, t), (d.system, d.t0 + n * d.h))[1]
+        r_p, phi_p = jax.jvp(loads, (system, t), (d.system, d.grid.t0 + n * d.grid.h))[1]
         return Node(
             damping=c_t + mass @ bracket,
             stiffness=k_t + c_t @ bracket + mass @ group.ad(state.vdot),

@@ -3,9 +3,8 @@
 from typing import ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 
-from lgsens.dynamics import State, require_independent
+from lgsens.dynamics import State
 from lgsens.integrate import GeneralizedAlpha
 from lgsens.sensitivity._continuous_adjoint import Cotangents, continuous_adjoint_sweep
 from lgsens.sensitivity._criterion_terms import (
@@ -17,6 +16,7 @@ from lgsens.sensitivity._criterion_terms import (
 )
 from lgsens.sensitivity._first_order_adjoint import first_order_adjoint_sweep
 from lgsens.sensitivity._linearization import Parameters
+from lgsens.sensitivity._methods import require_index_3
 
 TREATMENTS = ("state", "derivatives", "first_order", None)
 
@@ -59,9 +59,8 @@ class ContinuousAdjoint(eqx.Module):
         uses: tuple[bool, bool],
     ) -> Cotangents:
         """dΨ as it acts on the initial state, the system and p; `uses`: whether F and G use v̇ or λ."""
-        require_independent(parameters.system, "ContinuousAdjoint")
-        count = jnp.arange(states.v.shape[0], dtype=states.v.dtype)
-        t, h = parameters.t0 + count * parameters.h, parameters.h
+        require_index_3("ContinuousAdjoint", scheme, parameters)
+        t, h = parameters.grid.times(), parameters.grid.h
         derivatives = uses[0] and self.accelerations in ("derivatives", None)
         path = points(scheme, states, t, h, derivatives=derivatives)
         if self.accelerations == "first_order":

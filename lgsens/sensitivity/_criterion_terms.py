@@ -27,8 +27,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import AbstractSystem, State, accelerations, kkt_solve
-from lgsens.integrate import GeneralizedAlpha
-from lgsens.sensitivity._linearization import Variation, cotangent_to_algebra
+from lgsens.integrate import GeneralizedAlpha, Variation
+from lgsens.sensitivity._linearization import cotangent_to_algebra
 
 Pointwise = Callable[[Any, AbstractSystem, State, Float[Array, ""]], Float[Array, " c"]]
 

@@ -45,7 +45,7 @@ from lgsens.sensitivity._linearization import Parameters
 
 def first_order_adjoint_sweep(path: Point, parameters: Parameters, functional: Functional, p) -> Cotangents:
     """The cotangents of c criteria."""
-    system, h = parameters.system, parameters.h
+    system, h = parameters.system, parameters.grid.h
     group, mass = system.group, system.mass_matrix()
     k = mass.shape[0]
     s = 2.0 * h / 3.0

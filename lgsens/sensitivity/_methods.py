@@ -4,7 +4,6 @@ Both rules are module-level functions of explicit arguments, and keep states onl
 """
 
 import abc
-import dataclasses
 from functools import partial
 
 import equinox as eqx
@@ -14,31 +13,18 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from lgsens.dynamics import State, require_independent
-from lgsens.integrate import (
-    GeneralizedAlpha,
-    Stats,
-    integrate,
-    integrate_uneven,
-    with_corrections,
-    without_corrections,
-)
+from lgsens.integrate import AbstractScheme, EqualGrid, GeneralizedAlpha, Stats, earlier, states_of, with_first
 from lgsens.sensitivity._adjoint import adjoint_sweep
 from lgsens.sensitivity._continuous_direct import continuous_direct_sweep
 from lgsens.sensitivity._direct import direct_sweep
 from lgsens.sensitivity._linearization import (
     Parameters,
-    Variation,
     cotangent_to_algebra,
     cotangent_to_ambient,
     matvec,
     to_algebra,
     to_ambient,
-    zeros_like_trajectory,
-)
-from lgsens.sensitivity._stabilized import (
-    stabilized_adjoint_sweep,
-    stabilized_direct_sweep,
-    stabilized_matvec,
+    zeros_like,
 )
 
 
@@ -47,9 +33,12 @@ class AbstractSensitivity(eqx.Module):
 
     @abc.abstractmethod
     def trajectory(
-        self, scheme: GeneralizedAlpha, num_steps: int, state0: State, parameters: Parameters
+        self, scheme: AbstractScheme, state0: State, parameters: Parameters, found: tuple[State, Stats] | None = None
     ) -> tuple[State, Stats]:
-        """The states and statistics of all steps, with this method as their derivative."""
+        """The states and statistics of all steps, with this method as their derivative.
+
+        `found`: the states and statistics of this very run, if they are known already.
+        """
 
 
 class DirectDifferentiation(AbstractSensitivity):
@@ -72,9 +61,9 @@ class DirectDifferentiation(AbstractSensitivity):
     def __check_init__(self):
         _check_checkpoints(self)
 
-    def trajectory(self, scheme, num_steps, state0, parameters, found=None):
+    def trajectory(self, scheme, state0, parameters, found=None):
         _refuse_checkpoints(self)
-        return _trajectory(_direct_trajectory, scheme, num_steps, state0, parameters, found)
+        return _decoded(_direct_trajectory(scheme, state0, parameters, found))
 
 
 class AdjointVariable(AbstractSensitivity):
@@ -94,9 +83,9 @@ class AdjointVariable(AbstractSensitivity):
     def __check_init__(self):
         _check_checkpoints(self)
 
-    def trajectory(self, scheme, num_steps, state0, parameters, found=None):
+    def trajectory(self, scheme, state0, parameters, found=None):
         _refuse_checkpoints(self)
-        return _trajectory(_adjoint_trajectory, scheme, num_steps, state0, parameters, found)
+        return _decoded(_adjoint_trajectory(scheme, state0, parameters, found))
 
 
 def _check_checkpoints(method: DirectDifferentiation | AdjointVariable) -> None:
@@ -124,14 +113,9 @@ class ContinuousDirect(AbstractSensitivity):
     it is the transpose of the forward sweep.
     """
 
-    def trajectory(self, scheme, num_steps, state0, parameters):
-        require_independent(parameters.system, "ContinuousDirect")
-        if scheme.stabilized:
-            raise ValueError(
-                "ContinuousDirect integrates the differentiated equations at index 3, and `integrator` is stabilized; "
-                "leave `stabilized` out, or take DirectDifferentiation()."
-            )
-        return _trajectory(_continuous_trajectory, scheme, num_steps, state0, parameters)
+    def trajectory(self, scheme, state0, parameters, found=None):
+        require_index_3("ContinuousDirect", scheme, parameters)
+        return _decoded(_continuous_trajectory(scheme, state0, parameters))
 
 
 class Autodiff(AbstractSensitivity):
@@ -142,24 +126,27 @@ class Autodiff(AbstractSensitivity):
     derivative as in its value.
     """
 
-    def trajectory(self, scheme, num_steps, state0, parameters):
-        full = dataclasses.replace(scheme, factor_every=0)
-        return _trajectory(_run, full, num_steps, state0, parameters)
+    def trajectory(self, scheme, state0, parameters, found=None):
+        return _decoded(_run(scheme.for_autodiff(), state0, parameters))
+
+
+def require_index_3(method: str, scheme: AbstractScheme, parameters: Parameters) -> None:
+    """Raise `ValueError` where a continuous method, by generalized-α in a linear space, does not fit the motion."""
+    require_independent(parameters.system, method)
+    if not isinstance(scheme, GeneralizedAlpha) or scheme.stabilized or not isinstance(parameters.grid, EqualGrid):
+        raise ValueError(
+            f"{method} integrates the differentiated equations of motion by generalized-α of index 3 in equal steps, "
+            f"and the motion is by {scheme!r}; take `integrator=GeneralizedAlpha(…)` as it is, or "
+            "DirectDifferentiation() or AdjointVariable()."
+        )
 
 
 # The custom rules see statistics as floats: an integer output of a `custom_vjp` reaches operations that have no
 # derivative (`jnp.all`) with a tangent, and JAX refuses.
 
 
-def _run(scheme, num_steps, state0, parameters, found=None):
-    """`found`: the states and statistics of this very run, if they are known already."""
-    system, t0, h = parameters
-    if found is not None:
-        states, stats = found
-    elif h.ndim:
-        states, stats = integrate_uneven(scheme, system, state0, t0, h)
-    else:
-        states, stats = integrate(scheme, num_steps, system, state0, t0, h)
+def _run(scheme, state0, parameters, found=None):
+    states, stats = states_of(scheme, parameters.system, parameters.grid, state0) if found is None else found
     return states, encoded(stats, states.v.dtype)
 
 
@@ -172,10 +159,9 @@ def decoded(stats: Stats) -> Stats:
     return stats._replace(iterations=stats.iterations.astype(jnp.int32), converged=stats.converged.astype(bool))
 
 
-def _trajectory(rule, scheme, num_steps, state0, parameters, *found) -> tuple[State, Stats]:
-    """What a rule below gives, with the multipliers of the joints only."""
-    states, stats = rule(scheme, num_steps, with_corrections(scheme, state0), parameters, *found)
-    return without_corrections(scheme, states), decoded(stats)
+def _decoded(run: tuple[State, Stats]) -> tuple[State, Stats]:
+    states, stats = run
+    return states, decoded(stats)
 
 
 def _raveled(tree):
@@ -194,47 +180,38 @@ def _raveled(tree):
     return flat, cut
 
 
-def _sweeps(scheme):
-    """L, the solution with L, and that with Lᵀ."""
-    if scheme.stabilized:
-        return stabilized_matvec, stabilized_direct_sweep, stabilized_adjoint_sweep
-    return matvec, direct_sweep, adjoint_sweep
-
-
 # Direct differentiation. The tangent of the trajectory solves L (δ, p') = (b, p'), b = (δ_0, 0, …, 0).
 # `custom_linear_solve` carries the two sweeps side by side: JAX takes `solve` forwards, `transpose_solve` backwards,
 # and for second derivatives differentiates `matvec`, that is L itself, never the sweeps.
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _direct_trajectory(scheme, num_steps, state0, parameters, found):
-    return _run(scheme, num_steps, state0, parameters, found)
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _direct_trajectory(scheme, state0, parameters, found):
+    return _run(scheme, state0, parameters, found)
 
 
 @_direct_trajectory.defjvp
-def _direct_rule(scheme, num_steps, primals, tangents):
+def _direct_rule(scheme, primals, tangents):
     state0, parameters, _ = primals
     d_state0, d_parameters, _ = tangents
-    states, stats = _direct_trajectory(scheme, num_steps, *primals)
+    states, stats = _direct_trajectory(scheme, *primals)
     group = parameters.system.group
     # `custom_linear_solve` is transposed only where no part of b is a constant, and the tangent of a parameter that is
     # not differentiated is one: a zero. Cut from one vector, all depend on all.
     flat, unravel = _raveled((to_algebra(group, state0, d_state0), d_parameters))
     first, d_parameters = unravel(flat)
-    rows = jax.tree.map(lambda zeros: zeros[1:], zeros_like_trajectory(states))
-    b = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), first, rows)
-    product, forwards, backwards = _sweeps(scheme)
+    b = with_first(first, earlier(zeros_like(states)))
 
     def matrix(unknown):
         """L (δ, p'), of which every part seems to depend on the states: so none is constant in second derivatives."""
         nothing = 0.0 * states.v[0, 0]
-        return jax.tree.map(lambda leaf: leaf + nothing * leaf, product(scheme, states, parameters, *unknown))
+        return jax.tree.map(lambda leaf: leaf + nothing * leaf, matvec(scheme, states, parameters, *unknown))
 
     delta, _ = lax.custom_linear_solve(
         matrix,
         (b, d_parameters),
-        solve=lambda _, rhs: forwards(scheme, states, parameters, *rhs),
-        transpose_solve=lambda _, rhs: backwards(scheme, states, parameters, *rhs),
+        solve=lambda _, rhs: direct_sweep(scheme, states, parameters, *rhs),
+        transpose_solve=lambda _, rhs: adjoint_sweep(scheme, states, parameters, *rhs),
     )
     d_states = jax.vmap(partial(to_ambient, group))(states, delta)
     return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
@@ -243,16 +220,16 @@ def _direct_rule(scheme, num_steps, primals, tangents):
 # Direct differentiation of the equations of motion: a rule whose tangent is linear in the input tangents, as it is.
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _continuous_trajectory(scheme, num_steps, state0, parameters):
-    return _run(scheme, num_steps, state0, parameters)
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _continuous_trajectory(scheme, state0, parameters):
+    return _run(scheme, state0, parameters)
 
 
 @_continuous_trajectory.defjvp
-def _continuous_rule(scheme, num_steps, primals, tangents):
+def _continuous_rule(scheme, primals, tangents):
     state0, parameters = primals
     d_state0, d_parameters = tangents
-    states, stats = _continuous_trajectory(scheme, num_steps, state0, parameters)
+    states, stats = _continuous_trajectory(scheme, state0, parameters)
     group = parameters.system.group
     first = to_algebra(group, state0, d_state0)
     delta = continuous_direct_sweep(scheme, states, parameters, first, d_parameters)
@@ -263,24 +240,23 @@ def _continuous_rule(scheme, num_steps, primals, tangents):
 # Adjoint variable method.
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _adjoint_trajectory(scheme, num_steps, state0, parameters, found):
-    return _run(scheme, num_steps, state0, parameters, found)
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _adjoint_trajectory(scheme, state0, parameters, found):
+    return _run(scheme, state0, parameters, found)
 
 
-def _adjoint_forward(scheme, num_steps, state0, parameters, found):
-    states, stats = _run(scheme, num_steps, state0, parameters, found)
+def _adjoint_forward(scheme, state0, parameters, found):
+    states, stats = _run(scheme, state0, parameters, found)
     return (states, stats), (states, parameters)
 
 
-def _adjoint_backward(scheme, num_steps, kept, cotangents):
+def _adjoint_backward(scheme, kept, cotangents):
     states, parameters = kept
     group = parameters.system.group
     c = jax.vmap(partial(cotangent_to_algebra, group))(states, cotangents[0])
-    _, _, backwards = _sweeps(scheme)
-    mu, bar = backwards(scheme, states, parameters, c, jax.tree.map(jnp.zeros_like, parameters))
+    mu, bar = adjoint_sweep(scheme, states, parameters, c, jax.tree.map(jnp.zeros_like, parameters))
     state0 = jax.tree.map(lambda leaf: leaf[0], states)
-    first = Variation(*[leaf[0] for leaf in mu])
+    first = jax.tree.map(lambda leaf: leaf[0], mu)
     return cotangent_to_ambient(group, state0, first), bar, None
 
 

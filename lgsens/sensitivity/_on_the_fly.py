@@ -1,8 +1,7 @@
 """The direct differentiation method on the fly (§6.3): motion, sensitivities, criteria in one scan, nothing stored.
 
-After Newton's iteration has converged, the tangents and the factors of eq. (30) are formed once for all parameters,
-each of which costs its pseudo-loads and one solve; the same factors serve modified Newton in the next step. The
-criteria and their derivatives,
+After Newton's iteration has converged, the step is linearized once for all parameters, each of which costs its loads
+and one solve; the scheme may remember the factors for the next step. The criteria and their derivatives,
 
     F' = F_q w + F_v v' + F_v̇ v̇' + F_λ λ' + F_p         (33)
 
@@ -18,19 +17,15 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import State, unsteady_rate
-from lgsens.integrate import Chord, Constants, GeneralizedAlpha, Guess, Stats, margin_of, take_step
-from lgsens.linear import LU
+from lgsens.integrate import AbstractScheme, Stats, Variation, Walk
 from lgsens.sensitivity._criterion_terms import Functional
-from lgsens.sensitivity._direct import direct_step
 from lgsens.sensitivity._linearization import (
-    Linearized,
     Parameters,
-    Step,
-    Variation,
-    linearized,
-    pseudo_loads,
+    node_tangent,
+    place_tangents,
     to_algebra,
     to_ambient,
+    zeros_like,
 )
 
 
@@ -45,8 +40,7 @@ class OnTheFly(NamedTuple):
 
 
 def direct_on_the_fly(
-    scheme: GeneralizedAlpha,
-    num_steps: int,
+    scheme: AbstractScheme,
     begin: Callable[[Float[Array, " p"]], tuple[tuple[State, Parameters], Any]],
     functional: Functional,
     p: Float[Array, " p"],
@@ -56,53 +50,48 @@ def direct_on_the_fly(
     (state0, parameters), (d_state0, d), begun = jax.vmap(
         lambda e: jax.jvp(begin, (p,), (e,), has_aux=True), out_axes=(None, 0, None)
     )(directions)
-    system, h = parameters.system, parameters.h
-    group, constants = system.group, Constants.of(system)
-    none = jax.tree.map(jnp.zeros_like, Variation(state0.v, state0.v, state0.vdot, state0.lam, state0.a))
+    system, grid = parameters
+    group, walk = system.group, Walk.of(scheme, system)
+    none = zeros_like(state0)
 
     def with_derivative(function, state: State, t, delta: Variation):
         """f (c,) and f' (p, c)."""
 
         def along(e, d_system, delta):
-            tangents = (e, d_system, to_ambient(group, state, delta))
-            return jax.jvp(lambda p, system, state: function(p, system, state, t), (p, system, state), tangents)
+            state_, d_state = (scheme.physical(each) for each in (state, to_ambient(group, state, delta)))
+            tangents = (e, d_system, d_state)
+            return jax.jvp(lambda p, system, state: function(p, system, state, t), (p, system, state_), tangents)
 
         return jax.vmap(along, out_axes=(None, 0))(directions, d.system, delta)
 
-    def linearized_at(previous: State, state: State, t) -> tuple[Step, Linearized]:
-        step = Step(previous, state, t)
-        return step, linearized(scheme, parameters, constants.mass, step)
+    def step(carry, inputs):
+        progress, delta, before, total = carry
+        place, d_places = inputs
+        node = grid.node(place)
+        link, begun = grid.link(scheme, place, progress.state), grid.begun(scheme, place, progress.state)
+        progress, stats = walk.on(grid, progress, place)
+        linearized = scheme.linearized(system, walk.shared, node, begun, progress.state)
+        progress, stats = walk.remembering(progress, linearized, node, stats)
 
-    def step(carry, n):
-        previous, guess, factors, running, delta, total = carry
-        t = parameters.t0 + (n + 1) * h
-        chord = Chord(factors, n == 0) if scheme.factor_every else None
-        state, guess, stats, _ = take_step(scheme, system, constants, previous, guess, chord, running, t, h, LU)
-        converged, prepared = linearized_at(previous, state, t)
-        margin = margin_of(prepared.factors, prepared.tangents.constraint_jacobian, constants.scale)
-        stats = stats._replace(margin=margin)
+        def along(delta, d: Parameters, d_place):
+            d_node = node_tangent(grid, d.grid, place, d_place)
+            loads = scheme.loads(walk.shared, begun, progress.state)
+            _, of_parameters = jax.jvp(loads, (system, node), (d.system, d_node))
+            return link.unless_empty(linearized.forward(link.begun(delta, d_place), of_parameters, none), delta)
 
-        def along(delta, d: Parameters):
-            loads = pseudo_loads(converged, parameters, d)
-            return direct_step(scheme, parameters, constants.mass, prepared, loads, delta, none, d.h)
-
-        delta = jax.vmap(along)(delta, d)
-        rate = with_derivative(functional.rate, state, t, delta)
-        # the last point has the weight h/2
-        weight = jnp.where(n == num_steps - 1, h / 2, h)
-        total = jax.tree.map(lambda total, f: total + weight * f, total, rate)
-        return (state, guess, prepared.factors, stats.converged, delta, total), (
-            stats,
-            unsteady_rate(system, state.v, state.vdot),
-        )
+        delta = jax.vmap(along)(delta, d, d_places)
+        rate = with_derivative(functional.rate, progress.state, node.t, delta)
+        weight = link.unless_empty(node.h / 2, jnp.zeros_like(node.h))
+        total = jax.tree.map(lambda total, f, g: total + weight * (f + g), total, before, rate)
+        turning = unsteady_rate(system, progress.state.v, progress.state.vdot)
+        return (progress, delta, rate, total), (stats, turning)
 
     delta0 = jax.vmap(lambda tangent: to_algebra(group, state0, tangent))(d_state0)
-    first = with_derivative(functional.rate, state0, parameters.t0, delta0)
-    half = jax.tree.map(lambda f: h / 2 * f, first)
-    shapes = jax.eval_shape(lambda: linearized_at(state0, state0, parameters.t0)[1].factors)
-    factors = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)  # of no step yet
-    start = (state0, Guess.first(state0), factors, jnp.ones((), bool), delta0, half)
-    (state, *_, delta, integral), (stats, rates) = lax.scan(step, start, jnp.arange(num_steps, dtype=p.dtype))
-    final = with_derivative(functional.final, state, parameters.t0 + num_steps * h, delta)
+    first = with_derivative(functional.rate, state0, grid.t0, delta0)
+    start = (walk.begin(grid, state0, exact=True), delta0, first, jax.tree.map(jnp.zeros_like, first))
+    # places are numbered along the first axis, parameters along the second
+    d_places = jax.vmap(lambda d: place_tangents(grid, d), out_axes=1)(d.grid)
+    (end, delta, _, integral), (stats, rates) = lax.scan(step, start, (grid.places(), d_places))
+    final = with_derivative(functional.final, end.state, grid.times()[-1], delta)
     value, derivative = jax.tree.map(jnp.add, integral, final)
     return OnTheFly(value, derivative.T, stats, rates, begun)

@@ -16,8 +16,8 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from lgsens.dynamics import State
-from lgsens.integrate import GeneralizedAlpha, Stats, integrate_outputs, with_corrections, without_corrections
-from lgsens.sensitivity._linearization import Parameters, times
+from lgsens.integrate import AbstractScheme, Stats, march
+from lgsens.sensitivity._linearization import Parameters
 from lgsens.sensitivity._methods import AbstractSensitivity, AdjointVariable, DirectDifferentiation, decoded, encoded
 from lgsens.sensitivity._segments import (
     Output,
@@ -36,64 +36,53 @@ class SavedRun(NamedTuple):
     stats: Stats
 
 
+class _Shown(eqx.Module):
+    """An output of physical states as one of the scheme's; equal, for one compilation, where both are."""
+
+    output: Output = eqx.field(static=True)
+    scheme: AbstractScheme = eqx.field(static=True)
+
+    def __call__(self, system, state: State, t):
+        return self.output(system, self.scheme.physical(state), t)
+
+
 def saved_run(
-    method: AbstractSensitivity,
-    output: Output,
-    scheme: GeneralizedAlpha,
-    num_steps: int,
-    state0: State,
-    parameters: Parameters,
+    method: AbstractSensitivity, output: Output, scheme: AbstractScheme, state0: State, parameters: Parameters
 ) -> SavedRun:
-    """`output(system, state, t)` at t0 + n h, n = 0 … num_steps.
+    """`output(system, state, t)` at all times of the grid.
 
     The default method does without the states where nothing is differentiated, those with `checkpoints` always.
     """
+    shown = _Shown(output, scheme)
     if isinstance(method, DirectDifferentiation | AdjointVariable) and method.checkpoints is not None:
-        if scheme.stabilized:
-            raise ValueError(
-                f"{type(method).__name__}: `checkpoints` = {method.checkpoints!r} is for index 3, and `integrator` is "
-                "stabilized; leave one of them out."
-            )
-        segments = Segments.of(scheme, num_steps, method.checkpoints)
+        segments = Segments.of(parameters.grid.num_steps, method.checkpoints)
         rule = _direct_segments if isinstance(method, DirectDifferentiation) else _adjoint_segments
-        run, _ = cast(tuple[SavedRun, Any], rule(output, scheme, segments, state0, parameters))
-        return _decoded(run)
-    if method == DirectDifferentiation():
-        return _decoded(_saved(output, scheme, num_steps, state0, parameters))
-    return _from_states(method, output, scheme, num_steps, state0, parameters)
-
-
-def _from_states(method, output, scheme, num_steps, state0, parameters) -> SavedRun:
-    states, stats = method.trajectory(scheme, num_steps, state0, parameters)
-    outputs = jax.vmap(partial(output, parameters.system))(states, times(num_steps, parameters))
-    return SavedRun(outputs, jax.tree.map(lambda leaf: leaf[-1], states), stats)
-
-
-def _decoded(run: SavedRun) -> SavedRun:
+        run, _ = cast(tuple[SavedRun, Any], rule(shown, scheme, segments, state0, parameters))
+    elif method == DirectDifferentiation():
+        run = _saved(shown, scheme, state0, parameters)
+    else:
+        return _from_states(method, shown, scheme, state0, parameters)
     return run._replace(stats=decoded(run.stats))
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
-def _saved(output, scheme, num_steps, state0, parameters):
-    system, t0, h = parameters
-    physical = partial(without_corrections, scheme)
-    outputs, final, stats = integrate_outputs(
-        scheme,
-        num_steps,
-        system,
-        with_corrections(scheme, state0),
-        t0,
-        h,
-        lambda state, t: output(system, physical(state), t),
-    )
-    return SavedRun(outputs, physical(final), encoded(stats, h.dtype))
+def _from_states(method: AbstractSensitivity, output: Output, scheme, state0, parameters: Parameters) -> SavedRun:
+    states, stats = method.trajectory(scheme, state0, parameters)
+    outputs = jax.vmap(partial(output, parameters.system))(states, parameters.grid.times())
+    return SavedRun(outputs, jax.tree.map(lambda leaf: leaf[-1], states), stats)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _saved(output, scheme, state0, parameters) -> SavedRun:
+    system, grid = parameters
+    outputs, final, stats = march(scheme, system, grid, state0, lambda state, t: output(system, state, t))
+    return SavedRun(outputs, final, encoded(stats, final.v.dtype))
 
 
 @_saved.defjvp
-def _rule(output, scheme, num_steps, primals, tangents):
+def _rule(output, scheme, primals, tangents):
     def whole(state0, parameters):
-        run = _from_states(DirectDifferentiation(), output, scheme, num_steps, state0, parameters)
-        return run._replace(stats=encoded(run.stats, parameters.h.dtype))
+        run = _from_states(DirectDifferentiation(), output, scheme, state0, parameters)
+        return run._replace(stats=encoded(run.stats, run.final.v.dtype))
 
     return jax.jvp(whole, primals, tangents)
 
@@ -105,7 +94,7 @@ def _rule(output, scheme, num_steps, primals, tangents):
 
 def _segmented(output, scheme, segments: Segments, state0, parameters) -> tuple[SavedRun, Any]:
     outputs, final, stats, marks = run_in_segments(output, scheme, segments, state0, parameters)
-    return SavedRun(outputs, final, encoded(stats, parameters.h.dtype)), marks
+    return SavedRun(outputs, final, encoded(stats, final.v.dtype)), marks
 
 
 def _without_derivative(tree):
@@ -131,7 +120,7 @@ def _direct_segments_rule(output, scheme, segments, primals, tangents):
     flat, unravel = ravel_pytree((tangents, jax.tree.map(jnp.zeros_like, floats)))
 
     def whole(state0, parameters):
-        found = _saved(output, scheme, segments.num_steps, state0, parameters)
+        found = _saved(output, scheme, state0, parameters)
         return eqx.filter((found.outputs, found.final), eqx.is_inexact_array)
 
     def matvec(unknown):

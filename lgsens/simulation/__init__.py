@@ -23,7 +23,7 @@ from lgsens.simulation._simulate import (
     run as run,
     simulate as simulate,
 )
-from lgsens.simulation._start import begin as begin
+from lgsens.simulation._start import Begin as Begin, begin as begin
 from lgsens.simulation._trajectory import (
     AbstractMotion as AbstractMotion,
     BodyMotion as BodyMotion,
@@ -32,4 +32,3 @@ from lgsens.simulation._trajectory import (
     StateError as StateError,
     Trajectory as Trajectory,
 )
-from lgsens.simulation._uneven_runs import GivenSteps as GivenSteps

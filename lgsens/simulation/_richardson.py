@@ -26,7 +26,7 @@ Cardona, Numerische Mathematik 129 (2015), doi:10.1007/s00211-014-0633-1, for th
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -34,18 +34,20 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from lgsens._validate import as_count
-from lgsens.dynamics import RESULTS, State
-from lgsens.integrate import GeneralizedAlpha
-from lgsens.simulation._trajectory import StateError, Trajectory
+from lgsens.dynamics import RESULTS, AbstractSystem, State
+from lgsens.integrate import AbstractIntegrator, AbstractScheme, GeneralizedAlpha
+from lgsens.simulation._trajectory import Saved, StateError, Trajectory
+
+Run = TypeVar("Run", Trajectory, Saved)
 
 
-class Richardson(eqx.Module):
+class Richardson(AbstractIntegrator):
     """Two generalized-α runs, one step half the other, extrapolated: an integrator of `simulate`.
 
         x ≈ x_{h/2} + (x_{h/2} − x_h)/3   for v, v̇, λ,       q ≈ q_{h/2} exp(log(q_h⁻¹ q_{h/2})~/3)
 
     Arguments:
-        integrator: the scheme of both runs, a `GeneralizedAlpha`.
+        integrator: the scheme of both runs, `GeneralizedAlpha` or another one of second order.
 
     The trajectory has the n + 1 times of the coarser run; `Trajectory.error` is what was added to the finer run, an
     estimate of its error, and more than what is left. `Trajectory.order` is 4: criteria that are integrals need
@@ -59,14 +61,22 @@ class Richardson(eqx.Module):
     order of w². The cost is that of 3n steps. Start from the consistent initial state of the model, or from a `state0`
     at rest: that of another run brings the a of its own step size, and one order is lost.
 
-    Raises `ValueError` for anything but a `GeneralizedAlpha`.
+    Raises `ValueError` for anything but a scheme in equal steps.
     """
 
-    integrator: GeneralizedAlpha = GeneralizedAlpha()
+    integrator: AbstractScheme = eqx.field(static=True, default=GeneralizedAlpha())
 
     def __check_init__(self):
-        if not isinstance(self.integrator, GeneralizedAlpha):
+        if not isinstance(self.integrator, AbstractScheme):
             raise ValueError(f"Richardson: `integrator` must be a GeneralizedAlpha, got {self.integrator!r}.")
+
+    @property
+    def scheme(self):
+        return self.integrator
+
+    @property
+    def extrapolated(self):
+        return True
 
 
 class Extrapolated(NamedTuple):
@@ -120,25 +130,29 @@ def _missing(coarse, fine, power: int = 1):
     return (fine - coarse) / (4.0**power - 1.0)
 
 
-def extrapolate_runs(coarse: Trajectory, fine: Trajectory) -> Trajectory:
-    """The trajectory on the times of `coarse` from two runs of the same system, `fine` with half the step."""
-    group = coarse.system.group
+def extrapolate_runs(system: AbstractSystem, coarse: Run, fine: Run) -> Run:
+    """The run on the times of `coarse` from two of the same system, `fine` with half the step."""
+    result = jnp.where(coarse.result == RESULTS.successful, fine.result, coarse.result)
+    stats = jax.tree.map(lambda first, second: jnp.concatenate([first, second]), coarse.stats, fine.stats)
+    if isinstance(coarse, Saved):
+        missing = lambda rough, better: better + _missing(rough, better) if _is_float(better) else better
+        halved = jax.tree.map(lambda leaf: leaf[::2], fine.values)
+        values = jax.tree.map(missing, coarse.values, halved)
+        final, _ = _extrapolated(system, coarse.final, fine.final)
+        return Saved(coarse.t, values, final, result, stats)
     halved = jax.tree.map(lambda leaf: leaf[::2], fine.states)
+    states, error = jax.vmap(partial(_extrapolated, system))(coarse.states, halved)
+    return Trajectory(t=coarse.t, states=states, result=result, stats=stats, system=system, error=error, order=4)
 
-    def at(rough: State, better: State) -> tuple[State, StateError]:
-        w = group.log(group.compose(group.inverse(rough.q), better.q)) / 3.0
-        v, vdot, lam = (_missing(getattr(rough, name), getattr(better, name)) for name in ("v", "vdot", "lam"))
-        acceleration = better.vdot + vdot
-        state = State(group.retract(better.q, w), better.v + v, acceleration, better.lam + lam, acceleration)
-        return state, StateError(w, v, vdot, lam)
 
-    states, error = jax.vmap(at)(coarse.states, halved)
-    return Trajectory(
-        t=coarse.t,
-        states=states,
-        result=jnp.where(coarse.result == RESULTS.successful, fine.result, coarse.result),
-        stats=jax.tree.map(lambda first, second: jnp.concatenate([first, second]), coarse.stats, fine.stats),
-        system=coarse.system,
-        error=error,
-        order=4,
-    )
+def _extrapolated(system, rough: State, better: State) -> tuple[State, StateError]:
+    group = system.group
+    w = group.log(group.compose(group.inverse(rough.q), better.q)) / 3.0
+    v, vdot, lam = (_missing(getattr(rough, name), getattr(better, name)) for name in ("v", "vdot", "lam"))
+    acceleration = better.vdot + vdot
+    state = State(group.retract(better.q, w), better.v + v, acceleration, better.lam + lam, acceleration)
+    return state, StateError(w, v, vdot, lam)
+
+
+def _is_float(leaf) -> bool:
+    return jnp.issubdtype(leaf.dtype, jnp.floating)

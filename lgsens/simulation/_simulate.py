@@ -18,15 +18,22 @@ from lgsens.dynamics import (
     initial_state as _initial,
     unsteady_rate,
 )
-from lgsens.integrate import GeneralizedAlpha, Stats, singular_steps
+from lgsens.integrate import (
+    AbstractIntegrator,
+    AbstractScheme,
+    EqualGrid,
+    GeneralizedAlpha,
+    Laid,
+    Stats,
+    singular_steps,
+)
 from lgsens.model import Model
-from lgsens.sensitivity import AbstractSensitivity, DirectDifferentiation, Parameters, saved_run, times
+from lgsens.sensitivity import AbstractSensitivity, DirectDifferentiation, Parameters, saved_run
 from lgsens.simulation._errors import throw_if_failed
 from lgsens.simulation._index_reduced_ode import IndexReducedODE, integrate_ode, ode_failure
-from lgsens.simulation._richardson import Richardson, extrapolate_runs
+from lgsens.simulation._richardson import extrapolate_runs
 from lgsens.simulation._start import Begin, begin
 from lgsens.simulation._trajectory import Instant, Saved, Trajectory
-from lgsens.simulation._uneven_runs import UnevenIntegrator, check_uneven, run_uneven
 
 
 def as_system(model: Model | AbstractSystem) -> AbstractSystem:
@@ -103,7 +110,7 @@ def _checked(system: AbstractSystem, initial: Initial, throw: bool) -> State:
     return throw_if_failed(initial.state, initial.result, details, system.constraint_names)
 
 
-Integrator = GeneralizedAlpha | Richardson | IndexReducedODE | UnevenIntegrator
+Integrator = AbstractIntegrator | IndexReducedODE
 Save = Callable[[Instant], Any]
 
 
@@ -180,25 +187,20 @@ def simulate(
     """
     system = as_system(model)
     warn_of_single_precision(system)
-    if not isinstance(integrator, Richardson | IndexReducedODE | UnevenIntegrator):
-        check_integrator(integrator)
-    if isinstance(integrator, IndexReducedODE) and sensitivity != DirectDifferentiation():
-        raise ValueError(
-            f"`sensitivity` = {sensitivity!r} is for generalized-α; leave it out, IndexReducedODE has its own."
-        )
+    num_steps = as_count(num_steps, "num_steps", " (it is static)")
+    check_integrator(integrator, num_steps)
     if not isinstance(sensitivity, AbstractSensitivity):
         raise ValueError(
             "`sensitivity` must be DirectDifferentiation(), AdjointVariable(), ContinuousDirect() or Autodiff(), got "
             f"{sensitivity!r}; ContinuousAdjoint() needs a Criterion, see `differentiate`."
         )
-    num_steps = as_count(num_steps, "num_steps", " (it is static)")
-    if isinstance(integrator, UnevenIntegrator):
-        check_uneven(integrator, num_steps, sensitivity, save)
-    if save is not None and not (callable(save) and isinstance(integrator, GeneralizedAlpha)):
+    if isinstance(integrator, IndexReducedODE) and (sensitivity != DirectDifferentiation() or save is not None):
         raise ValueError(
-            f"`save` must be a function of an Instant, with a GeneralizedAlpha as `integrator`; got {save!r} and "
-            f"{integrator!r}. Leave `save` out to have the trajectory."
+            f"`sensitivity` = {sensitivity!r} and `save` are for schemes with a linearization of their own; leave them "
+            "out, IndexReducedODE has its own derivative."
         )
+    if save is not None and not callable(save):
+        raise ValueError(f"`save` must be a function of an Instant, got {save!r}. Leave it out to have the trajectory.")
     t0, t1 = interval(t0, t1)
     found, details = _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, save)
     if throw:
@@ -206,15 +208,13 @@ def simulate(
     return found
 
 
-def check_integrator(integrator: GeneralizedAlpha) -> None:
-    if isinstance(integrator, GeneralizedAlpha):
+def check_integrator(integrator: Any, num_steps: int) -> None:
+    """Raise `ValueError` for what is no integrator, or none of so many steps."""
+    if isinstance(integrator, IndexReducedODE):
         return
-    advice = ""
-    if isinstance(integrator, Richardson):
-        advice = " Extrapolate what it finds: `richardson(lambda n: differentiate(…, num_steps=n)[:2], num_steps)`."
-    elif isinstance(integrator, IndexReducedODE | UnevenIntegrator):
-        advice = " `jax.grad` and `jax.jacfwd` of a criterion of `simulate` differentiate this one."
-    raise ValueError(f"`integrator` must be a GeneralizedAlpha, got {integrator!r}.{advice}")
+    if not isinstance(integrator, AbstractIntegrator):
+        raise ValueError(f"`integrator` must be a GeneralizedAlpha or another integrator, got {integrator!r}.")
+    integrator.check(num_steps)
 
 
 def interval(t0, t1):
@@ -229,38 +229,29 @@ def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, sa
     initial = None if state0 is not None else _initial(system, t0)
     if isinstance(integrator, IndexReducedODE):
         return _run_ode(system, state0, initial, t0, (t1 - t0) / num_steps, num_steps, integrator)
-    if isinstance(integrator, UnevenIntegrator):
-        return _run_uneven(integrator, system, state0, initial, t0, t1, num_steps, sensitivity)
-
-    def started(scheme, num_steps):
-        return begin(scheme, system, t0, (t1 - t0) / num_steps, state0, initial)
-
-    def steps(scheme, num_steps):
-        return run(system, started(scheme, num_steps), t0, t1, num_steps, scheme, sensitivity)
-
-    if save is not None:
-        return _run_saved(system, started(integrator, num_steps), t0, t1, num_steps, integrator, sensitivity, save)
-    if not isinstance(integrator, Richardson):
-        return steps(integrator, num_steps)
-    (coarse, of_coarse), (fine, of_fine) = (steps(integrator.integrator, n) for n in (num_steps, 2 * num_steps))
+    start = begin(integrator.scheme, system, t0, state0, initial)
+    one = lambda num_steps: run(system, start, t0, t1, num_steps, integrator, sensitivity, save)
+    if not integrator.extrapolated:
+        return one(num_steps)
+    (coarse, of_coarse), (fine, of_fine) = (one(n) for n in (num_steps, 2 * num_steps))
     failed = coarse.result != RESULTS.successful
     details = jax.tree.map(lambda first, second: jnp.where(failed, first, second), of_coarse, of_fine)
-    return extrapolate_runs(coarse, fine), details | {"run": jnp.where(failed, 1, 2)}
+    return extrapolate_runs(system, coarse, fine), details | {"run": jnp.where(failed, 1, 2)}
 
 
 def _run_ode(system: AbstractSystem, state0, initial, t0, h, num_steps: int, integrator: IndexReducedODE):
     """`run` of the index-reduced equations, with nothing of generalized-α in the initial state."""
-    start = begin(GeneralizedAlpha(second_order_start=False), system, t0, h, state0, initial)
-    states, stats, stages = integrate_ode(integrator, num_steps, system, start.state, t0, h)
+    begun = begin(GeneralizedAlpha(second_order_start=False), system, t0, state0, initial)
+    states, stats, stages = integrate_ode(integrator, num_steps, system, begun.start.state, t0, h)
     result, details = ode_failure(stats, t0, h)
-    result = jnp.where(start.result == RESULTS.successful, result, start.result).astype(jnp.int32)
-    details = jax.lax.stop_gradient(details | {"violation": start.violation, "jacobian": start.jacobian})
-    t = times(num_steps, Parameters(system, t0, h))
+    result = jnp.where(begun.result == RESULTS.successful, result, begun.result).astype(jnp.int32)
+    details = jax.lax.stop_gradient(details | {"violation": begun.violation, "jacobian": begun.jacobian})
+    t = EqualGrid(t0, h, num_steps).times()
     found = Trajectory(t=t, states=states, result=result, stats=stats, system=system, order=4, stages=stages)
     return found, details
 
 
-def outcome(integrator: GeneralizedAlpha, start: Begin, stats: Stats, turns, t0, h):
+def outcome(scheme: AbstractScheme, begun: Begin, stats: Stats, turns, t, laid: Laid):
     """The result code of a simulation, and what its message needs; `turns`: h `unsteady_rate` of each step."""
     failed = jnp.argmin(stats.converged)  # the first step that did not converge, 0 if all did
     newton = jnp.where(jnp.all(stats.converged), RESULTS.successful, RESULTS.newton_failed)
@@ -270,57 +261,55 @@ def outcome(integrator: GeneralizedAlpha, start: Begin, stats: Stats, turns, t0,
     unresolved = jnp.any(turns > jnp.pi) & (newton != RESULTS.newton_failed)  # which may look singular later
     newton = jnp.where(unresolved, RESULTS.turn_not_resolved, newton)
     failed = jnp.where(unresolved, jnp.argmax(turns > jnp.pi), failed)
-    result = jnp.where(start.result == RESULTS.successful, newton, start.result).astype(jnp.int32)
+    result = jnp.where(begun.result == RESULTS.successful, newton, begun.result).astype(jnp.int32)
+    time = t[failed + 1]
+    if laid.reached is not None:
+        stopped = ~laid.reached & (result == RESULTS.successful)
+        result = jnp.where(stopped, RESULTS.steps_exhausted, result).astype(jnp.int32)
+        time = jnp.where(stopped, t[-1], time)
     details = {
-        "violation": start.violation,
-        "jacobian": start.jacobian,
+        "violation": begun.violation,
+        "jacobian": begun.jacobian,
         "step": failed + 1,
         "num_steps": jnp.asarray(stats.converged.shape[0]),
-        "time": t0 + (failed + 1).astype(h.dtype) * h,
+        "time": time,
         "iterations": stats.iterations[failed],
         "increment": stats.increment[failed],
         "residual": stats.residual[failed],
         "turn": turns[failed],
-        "tolerance": jnp.asarray(integrator.tolerance),
+        "tolerance": jnp.asarray(scheme.tolerance),
     }
     return result, jax.lax.stop_gradient(details)
 
 
-def run(system: AbstractSystem, start: Begin, t0, t1, num_steps: int, integrator, sensitivity: AbstractSensitivity):
-    """`simulate` without its checks: the trajectory, and what the message of a failure needs."""
-    parameters = Parameters(system, t0, (t1 - t0) / num_steps)
-    states, stats = sensitivity.trajectory(integrator, num_steps, start.state, parameters)
-    turns = parameters.h * _rates_after_steps(system, states)
-    result, details = outcome(integrator, start, stats, turns, t0, parameters.h)
-    t = times(num_steps, parameters)
-    return Trajectory(t=t, states=states, result=result, stats=stats, system=system), details
-
-
-def _rates_after_steps(system: AbstractSystem, states: State):
-    return unsteady_rate(system, states.v[1:], states.vdot[1:])
-
-
-def _run_uneven(integrator: UnevenIntegrator, system, state0, initial, t0, t1, num_steps: int, sensitivity):
-    """`run` with steps of different sizes."""
-    found = run_uneven(integrator, system, state0, initial, t0, t1, num_steps, sensitivity)
-    turns = jnp.diff(found.t) * _rates_after_steps(system, found.states)
-    result, details = outcome(integrator.integrator, found.start, found.newton, turns, t0, (t1 - t0) / num_steps)
-    stopped = ~found.reached & (result == RESULTS.successful)
-    result = jnp.where(stopped, RESULTS.steps_exhausted, result).astype(jnp.int32)
-    time = jnp.where(stopped, found.t[-1], found.t[details["step"]])
-    details |= jax.lax.stop_gradient({"time": time, "t1": t1})
-    trajectory = Trajectory(t=found.t, states=found.states, result=result, stats=found.stats, system=system)
-    return trajectory, details
-
-
-def _run_saved(system, start: Begin, t0, t1, num_steps: int, integrator, sensitivity, save: Save):
-    """`run` without a trajectory."""
-    parameters = Parameters(system, t0, (t1 - t0) / num_steps)
-    output = _Output(save)
-    run = saved_run(sensitivity, output, integrator, num_steps, start.state, parameters)
-    (values, rates), final, stats = run
-    result, details = outcome(integrator, start, stats, parameters.h * rates[1:], t0, parameters.h)
-    return Saved(times(num_steps, parameters), values, final, result, stats), details
+def run(
+    system: AbstractSystem,
+    begun: Begin,
+    t0,
+    t1,
+    num_steps: int,
+    integrator: AbstractIntegrator,
+    sensitivity: AbstractSensitivity,
+    save: Save | None = None,
+):
+    """`simulate` without its checks: the trajectory or what is saved of it, and what the message of a failure needs."""
+    scheme = integrator.scheme
+    laid = integrator.lay(system, begun.start, begun.jerk, t0, t1, num_steps)
+    grid, t = laid.grid, laid.grid.times()
+    state0, parameters = begun.start.at(system, grid.first_size), Parameters(system, grid)
+    if save is None:
+        states, newton = sensitivity.trajectory(scheme, state0, parameters, laid.found)
+        turns = jnp.diff(t) * unsteady_rate(system, states.v[1:], states.vdot[1:])
+    else:
+        (values, rates), final, newton = saved_run(sensitivity, _Output(save), scheme, state0, parameters)
+        turns = jnp.diff(t) * rates[1:]
+    result, details = outcome(scheme, begun, newton, turns, t, laid)
+    stats = newton if laid.stats is None else laid.stats
+    if save is None:
+        found = Trajectory(t=t, states=scheme.physical(states), result=result, stats=stats, system=system)
+    else:
+        found = Saved(t, values, scheme.physical(final), result, stats)
+    return found, details | jax.lax.stop_gradient({"t1": t1})
 
 
 class _Output(eqx.Module):

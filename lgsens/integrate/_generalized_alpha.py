@@ -1,0 +1,253 @@
+"""The Lie-group generalized-α scheme as a value, eqs. (24)–(30).
+
+With u = a_{n+1}, one step from (q, v, v̇, a) at t_n solves for u and λ
+
+    x   = h v + h² ((½ − β) a + β u)                      (27)
+    q⁺  = q exp(x̃)                                       (24)
+    v⁺  = v + h ((1 − γ) a + γ u)                         (28)
+    v̇⁺  = ((1 − α_m) u + α_m a − α_f v̇) / (1 − α_f)       (29)
+    r(q⁺, v⁺, v̇⁺, λ⁺, t⁺) = 0,   Φ(q⁺)/(βh²) = 0          (25), (26)
+
+The unknown is u and not x, and the constraint is divided by βh²: with ∂x/∂u = βh² the matrix of eq. (30)
+becomes
+
+    S = [[c M + γh C_t + βh² K_t T(x),  Bᵀ],
+         [B T(x),                       0 ]],      c = (1 − α_m)/(1 − α_f),
+
+which does not degenerate as h → 0 (Bottasso, Bauchau & Cardona 2007; its condition at h = 1e-3 would
+else be 1e18). Its constraint rows and multipliers are further scaled by the size of M. Where constraints may be
+redundant, Φ(q⁺)/(βh²) − c λ⁺ = 0, with −diag(c) in the corner of S (`dynamics/_redundant.py`).
+"""
+
+import dataclasses
+import math
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from lgsens.dynamics import given_way, split_velocity
+from lgsens.integrate._alpha import AbstractAlpha
+from lgsens.integrate._alpha_step import AbstractEquations, Matrix, Wear
+from lgsens.integrate._guess import Guess
+from lgsens.integrate._index3 import Index3
+from lgsens.integrate._newton import Chord, take_step
+from lgsens.integrate._pace import AbstractPace
+from lgsens.integrate._scheme import Start
+from lgsens.integrate._singular import Watch
+from lgsens.integrate._stabilized import Stabilized
+from lgsens.linear import LU, Inverse
+
+
+class Memory(eqx.Module):
+    """What the iteration of the next step knows of the steps before."""
+
+    guess: Guess
+    matrix: Matrix | None  # None: full Newton, or as kept in a mark
+    watch: Watch
+    watched: Float[Array, ""]  # when
+    pace: AbstractPace
+
+
+def _with_matrix(memory: Memory, matrix: Matrix | None) -> Memory:
+    return dataclasses.replace(memory, matrix=matrix)
+
+
+class GeneralizedAlpha(AbstractAlpha):
+    """The generalized-α integrator: numerical damping and the settings of its Newton iteration.
+
+        α_m = (2ρ − 1)/(ρ + 1),  α_f = ρ/(ρ + 1),  γ = ½ + α_f − α_m,  β = (γ + ½)²/4
+
+    Arguments:
+        rho_inf: spectral radius ρ∞ at infinite frequency, in [0, 1): 0 damps the fastest modes in one step,
+            values near 1 keep energy and let noise in the multipliers persist.
+        tolerance: the last Newton increment of a configuration, relative to 1 rad or the length of the
+            scene, at which a step has converged. The error left is its square; below 64 round-offs
+            it is raised to that (single precision).
+        max_iterations: full Newton iterations per step before the step has failed.
+        iterations: a fixed budget instead, so many iterations in every step and no test between them: of modified
+            Newton, with a matrix renewed every `factor_every` steps and at no other time, or of full Newton where that
+            is 0. Every step then costs the same, in each lane of a batch too. A step whose last increment is above
+            `tolerance` has failed all the same, and `Stats.increment` says what it was; with a larger tolerance the
+            motion is off by about the last increment times the contraction of one iteration, and so is its derivative,
+            which is that of converged steps. Too few feed their error to the steps that follow: at h = 1 ms a top
+            takes 2 full ones, or 4 with a matrix up to 20 steps old (with 3 it diverges). None: as many as it takes.
+        factor_every: the most steps that share one inverse of the iteration matrix (modified Newton); a new one is made
+            earlier where the iterations that it saves are worth it. Its iterations cost a tenth of a full one, and go
+            on until the error left is what full Newton would leave; a step that they do not bring there is finished by
+            full Newton. 0: full Newton always. The sensitivities do not depend on it: theirs is always the exact
+            matrix of the converged step.
+        second_order_start: start with a₀ = v̇₀ + (α_m − α_f) h v̈₀, because a_n stands for the acceleration at
+            t_n + (α_m − α_f) h, and with v₀ moved by O(h²) along the constraint directions, where the scheme keeps
+            it anyway: positions, velocities and multipliers are then second order from the first step.
+            False: a₀ = v̇₀ and v₀ as it is; multipliers are first order in the first steps (Arnold,
+            Brüls & Cardona, Numerische Mathematik 129, 2015, doi:10.1007/s00211-014-0633-1).
+        stabilized: satisfy B v = 0 in every step besides Φ = 0 (stabilized index 2, after Gear, Gupta & Leimkuhler),
+            at the price of m more unknowns in a step; see `_stabilized.py`. Dense. False: index 3, where B v is O(h²).
+
+    All static and hashable. Raises `ValueError` for ρ∞ outside [0, 1), a tolerance that is not positive, fewer than 1
+    iteration, a negative `factor_every`, or a `stabilized` that is not a bool. Source: Sonneville & Brüls (2014), §4;
+    Brüls, Cardona & Arnold (2012).
+    """
+
+    rho_inf: float = eqx.field(static=True, default=0.9)
+    tolerance: float = eqx.field(static=True, default=1e-10, kw_only=True)
+    max_iterations: int = eqx.field(static=True, default=10, kw_only=True)
+    factor_every: int = eqx.field(static=True, default=20, kw_only=True)
+    second_order_start: bool = eqx.field(static=True, default=True, kw_only=True)
+    iterations: int | None = eqx.field(static=True, default=None, kw_only=True)
+    stabilized: bool = eqx.field(static=True, default=False, kw_only=True)
+
+    def __check_init__(self):
+        if not isinstance(self.rho_inf, int | float) or not 0.0 <= self.rho_inf < 1.0:
+            raise ValueError(
+                f"GeneralizedAlpha: `rho_inf` must be a number in [0, 1), got {self.rho_inf!r}; 0.9 damps little, "
+                "0 most."
+            )
+        if not isinstance(self.tolerance, int | float) or not 0.0 < self.tolerance < math.inf:
+            raise ValueError(
+                f"GeneralizedAlpha: `tolerance` must be positive, got {self.tolerance!r}; 1e-10 is the default."
+            )
+        if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
+            raise ValueError(
+                f"GeneralizedAlpha: `max_iterations` must be an int, at least 1, got {self.max_iterations!r}."
+            )
+        if not isinstance(self.factor_every, int) or self.factor_every < 0:
+            raise ValueError(
+                "GeneralizedAlpha: `factor_every` must be an int, at least 0 (0: full Newton always), got "
+                f"{self.factor_every!r}."
+            )
+        if self.iterations is not None and (not isinstance(self.iterations, int) or self.iterations < 1):
+            raise ValueError(
+                "GeneralizedAlpha: `iterations` must be an int, at least 1, or None (until they converge), got "
+                f"{self.iterations!r}."
+            )
+        if not isinstance(self.stabilized, bool):
+            raise ValueError(
+                f"GeneralizedAlpha: `stabilized` must be True (index 2) or False (index 3), got {self.stabilized!r}."
+            )
+
+    # What the scheme is for the march and the sweeps.
+
+    def shared(self, system) -> AbstractEquations:
+        return self.shared_type.of(self, system)
+
+    def equations(self, system, node, previous, state):
+        return self.shared(system).step(previous, node.h).left(state, node.t)
+
+    def start(self, system, initial):
+        """The starting values of the scheme; see `second_order_start`.
+
+        With exact values, and a_n = v̇(t_n + Δ h), Δ = α_m − α_f, the increment (27) misses the true one by h³ c
+        (`missed_increment`). The constraint at t_{n+1} takes B c h³ out again, through the velocity once the scheme is
+        under way: B v_n = −h² B c there. Started with B v_0 = 0 it must do so through the first accelerations, and λ
+        is off by O(h) for some steps. So v_0 receives h² P c, P the M-orthogonal projection on the constraint
+        directions. Stabilized index 2 keeps B v = 0, and takes B c h³ out by its correction. Where constraints may be
+        redundant, the joints start with what they give way in a step, Φ = βh² c λ.
+        """
+        state = self.complete(system, initial.state)
+        if not self.second_order_start:
+            return Start(state)
+        a_1 = (self.alpha_m - self.alpha_f) * initial.jerk
+        if self.stabilized:
+            return Start(state, a_1=a_1)
+        missed = self.missed_increment(system, state.v, state.vdot, initial.jerk)
+        _, normal = split_velocity(system, state.q, missed, initial.factors)
+        return Start(state, q_2=given_way(system, state.q, self.beta * state.lam), v_2=normal, a_1=a_1)
+
+    def complete(self, system, state):
+        return self.shared_type.complete(state)
+
+    def physical(self, states):
+        return self.shared_type.physical(states)
+
+    def resized(self, vdot, a, ratio):
+        """Along the line through v̇_n at t_n and a_n at t_n + Δ h_n, (eq. 29 is of second order for that alone)
+
+            a_n* = v̇_n + r (a_n − v̇_n).
+
+        Sources: Brüls & Arnold, Journal of Computational and Nonlinear Dynamics 3 (2008), doi:10.1115/1.2960475; Jay &
+        Negrut, the same journal 2 (2007), doi:10.1115/1.2389231.
+        """
+        return vdot + ratio * (a - vdot)
+
+    def missed_increment(self, system, v, vdot, jerk):
+        """c: with exact values and a_n = v̇(t_n + Δ h), Δ = α_m − α_f, the increment (27) misses the true one by h³ c.
+
+        The true one is h v + h²/2 v̇ + h³ (v̈/6 + ad(v) v̇/12), from ẋ = T⁻¹(x) v and T⁻¹ = I + ½ ad(x) + …; hence
+        c = (1/6 − β − Δ/2) v̈ + ad(v) v̇/12.
+        """
+        delta = self.alpha_m - self.alpha_f
+        return (1.0 / 6.0 - self.beta - delta / 2.0) * jerk + system.group.ad_mv(v, vdot) / 12.0
+
+    def memory(self, system, shared, state, node, pace, *, exact=False):
+        matrix = shared.no_matrix(state, node, self.factor_every, LU if exact else Inverse)
+        return Memory(Guess.first(state), matrix, Watch.first(node.h.dtype), node.begin, pace)
+
+    def remembered(self, shared, memory, linearized, node, stats):
+        """Its exact matrix serves the next step, and is the first of which no other one is made."""
+        if memory.matrix is None:
+            return memory, stats
+        none = Wear.unused()
+        once = none._replace(steps=none.steps + 1)
+        matrix = Matrix(linearized.factors, node.h, once, LU)
+        margin = linearized.margin(shared.scale)
+        stats = stats if margin is None else stats._replace(margin=margin)
+        return _with_matrix(memory, matrix), stats
+
+    def kept(self, memory):
+        return _with_matrix(memory, None)
+
+    def restored(self, system, shared, kept, state, node):
+        return _with_matrix(kept, shared.no_matrix(state, node, self.factor_every))
+
+    def rejected(self, before, after):
+        """The matrix is the new one, which is large."""
+        return _with_matrix(before, after.matrix)
+
+    def take(self, system, shared, before, begun, memory, node, running):
+        matrix, pace, t, h = memory.matrix, memory.pace, node.t, node.h
+        weights = pace.weights(h, self.alpha_m - self.alpha_f), pace.weights(h, 0.0)
+        chord = None if matrix is None else Chord(matrix.solver, self._due(memory, shared, node), matrix.kind)
+        state, guess, stats, chord = take_step(
+            self, shared.step(begun, h), shared.scale, before, memory.guess, weights, chord, running, t, h
+        )
+        watch, watched = memory.watch, memory.watched
+        if chord is None:
+            stats = stats._replace(margin=pace.margin(True, stats.margin, lambda: shared.margin(state)))
+        else:
+            made = chord.due
+            stats = stats._replace(margin=pace.margin(made, stats.margin, lambda: shared.margin(state)))
+            watch = jax.tree.map(partial(jnp.where, made), watch.after(stats.margin, t - watched), watch)
+            watched = jnp.where(made, t, watched)
+            wear = matrix.wear.after(made, stats.iterations)
+            matrix = Matrix(chord.solver, jnp.where(made, h, matrix.h), wear, matrix.kind)
+        return state, Memory(guess, matrix, watch, watched, pace.after(h)), stats
+
+    def _due(self, memory: Memory, shared: AbstractEquations, node) -> Bool[Array, ""]:
+        """Whether a step wants a new matrix."""
+        matrix = memory.matrix
+        due = (matrix.wear.steps == 0) | (matrix.wear.steps >= self.factor_every)
+        ahead = (node.t - memory.watched) + (2.0 * self.factor_every) * node.h
+        due = due | memory.watch.ends_within(ahead) | memory.pace.changed(node.h, matrix.h)
+        return due if self.iterations is not None else due | matrix.wear.out(shared.unknowns)
+
+    def numbers(self, system):
+        return self.shared_type.numbers(system)
+
+    def loads(self, shared, previous, state):
+        return shared.loads(previous, state)
+
+    def linearized(self, system, shared, node, previous, state):
+        return shared.linearized(node, previous, state)
+
+    def for_autodiff(self):
+        """Full Newton, which alone converges as fast in its derivative as in its value."""
+        return dataclasses.replace(self, factor_every=0)
+
+    @property
+    def shared_type(self) -> type[AbstractEquations]:
+        """The equations of a step."""
+        return Stabilized if self.stabilized else Index3

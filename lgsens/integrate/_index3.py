@@ -1,0 +1,250 @@
+"""Index 3: a step satisfies Φ(q⁺) = 0, and B v is O(h²). Newton's equations, and their linearization.
+
+Iteration. With ∂x/∂u = βh², ∂v⁺/∂u = γh and ∂v̇⁺/∂u = c = (1 − α_m)/(1 − α_f) the matrix of eq. (30) is
+
+    S = [[c M + γh C_t + βh² K_t T(x),  Bᵀ],
+         [B T(x),                       0 ]]
+
+for the unknowns (u, λ) and the rows (r, Φ/(βh²)); with −diag(c) in the corner where constraints may be redundant, whose
+rows are Φ/(βh²) − c λ (`dynamics/_redundant.py`).
+
+Linearization. Let δ_n = (w, v', v̇', λ', a')_n, with q' = q w̃ (eq. 32). Differentiating the step (eqs. 24–29, §6.2),
+
+    x'  = h v'_n + h² ((½ − β) a'_n + β a'_{n+1}) + x_h h'            x_h = v_n + 2h ((½ − β) a_n + β a_{n+1})
+    (24)  w_{n+1}  − D(exp x̃) w_n − T(x) x'                                                  = b.w
+    (28)  v'_{n+1} − v'_n − h ((1 − γ) a'_n + γ a'_{n+1}) − v_h h'                              = b.v
+                                                                       v_h = (1 − γ) a_n + γ a_{n+1}
+    (29)  v̇'_{n+1} − ((1 − α_m) a'_{n+1} + α_m a'_n − α_f v̇'_n)/(1 − α_f)                      = b.vdot
+    (26)  (B w_{n+1} + Φ_p p')/(βh²)  [− c λ'_{n+1} − 2Φ h'/(βh³), redundant constraints]      = b.lam
+    (25)  M v̇'_{n+1} + C_t v'_{n+1} + K_t w_{n+1} + Bᵀλ'_{n+1} + r_p p' + r_t t'               = b.a
+
+The loads are r_p p' + r_t t', Φ_p p', x_h h' and v_h h'.
+
+Forwards (the direct differentiation method). Everything but u' = a'_{n+1} and λ'_{n+1} is known. Let (w, v', v̇')_0 be
+eqs. (24), (28), (29) at u' = 0 plus their right-hand sides. Then
+
+    S [u'; λ'] = [ b.a − r_p p' − (M v̇'_0 + C_t v'_0 + K_t w_0);  b.lam − (Φ_p p' + B w_0)/(βh²) ]
+
+with S at the converged state, exact.
+
+Backwards (the discrete adjoint variable method). The columns of L that belong to (w, v', v̇', λ', a')_{n+1} give for the
+multipliers μ of the rows (named like them)
+
+    μ.w    + K_tᵀ μ.a + Bᵀ μ.lam/(βh²) = c.w
+    μ.v    + C_tᵀ μ.a                  = c.v
+    μ.vdot + Mᵀ μ.a                    = c.vdot
+    B μ.a                              = c.lam
+    −βh² Tᵀ μ.w − γh μ.v − c μ.vdot    = c.a
+
+Elimination of the first three leaves the transpose of the iteration matrix, which the continuous method of §7 does not
+have (its remark after eq. 40):
+
+    Sᵀ [μ.a; μ.lam] = [ c.a + βh² Tᵀ c.w + γh c.v + c c.vdot;  c.lam ]
+
+The columns of step n then receive, from the same equations,
+
+    c_n.w += Dᵀ μ.w,    c_n.v += h Tᵀ μ.w + μ.v,    c_n.a += h² (½ − β) Tᵀ μ.w + h (1 − γ) μ.v + α_m/(1 − α_f) μ.vdot,
+    c_n.vdot += −α_f/(1 − α_f) μ.vdot,
+
+and the loads −μ.a, −μ.lam/(βh²), Tᵀ μ.w and μ.v. Nothing of the paper's Ḃ, Ḟ_λ or d²F_M/dt² is needed, because
+accelerations and multipliers are unknowns here like the others.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from lgsens.dynamics import (
+    AbstractSystem,
+    State,
+    Tangents,
+    constraint_jacobian,
+    factor_size,
+    factorized,
+    mass_matrix,
+    mass_scale,
+    softness,
+    tangents,
+    times_tangent_operator,
+)
+from lgsens.integrate._alpha import AbstractAlpha, advance, increment
+from lgsens.integrate._alpha_step import AbstractEquations, AbstractStep
+from lgsens.integrate._linearized import AbstractLinearizedStep, Variation
+from lgsens.integrate._singular import margin_by_mass, margin_of
+from lgsens.liegroups import AbstractLieGroup
+from lgsens.linear import LU, Factors, Matrix
+
+
+def factorize_iteration_matrix(
+    scheme: AbstractAlpha, system: AbstractSystem, tangents: Tangents, mass, x, h, kind: Any = LU
+) -> Factors:
+    """The factors of S above: one LU, which serves Newton, the DDM, and transposed, the AVM. Or its `Inverse`."""
+    jacobian = tangents.constraint_jacobian
+    stiffness, lower = times_tangent_operator(system, x, (tangents.stiffness, jacobian))
+    dynamic = scheme.inertia_factor * mass + (scheme.gamma * h) * tangents.damping + (scheme.beta * h**2) * stiffness
+    return factorized(system, dynamic, jacobian.T, lower, mass_scale(mass), kind, softness(system))
+
+
+class Index3Step(AbstractStep):
+    """Eqs. (24)–(29)."""
+
+    shared: "Index3"
+    previous: State
+    h: Float[Array, ""]
+
+    def motion(self, u, lam):
+        return advance(self.shared.scheme, self.shared.system, self.previous, u, self.h)
+
+    def defect(self, motion, lam, t):
+        system, softness, h = self.shared.system, self.shared.softness, self.h
+        residual = system.residual(motion.q, motion.v, motion.vdot, lam, t)
+        # Φ is zero at the solution, up to round-off that h' would multiply by 1/h³
+        h = lax.stop_gradient(h) if softness is None else h
+        violation = system.constraint(motion.q) / (self.shared.scheme.beta * h**2)
+        return residual, violation if softness is None else violation - softness * lam
+
+    def factors(self, motion, lam, t, kind=LU):
+        shared = self.shared
+        at_state = tangents(shared.system, motion.q, motion.v, motion.vdot, lam, t)
+        factors = factorize_iteration_matrix(
+            shared.scheme, shared.system, at_state, shared.mass, motion.x, self.h, kind
+        )
+        return factors, margin_of(factors, at_state.constraint_jacobian, shared.scale)
+
+    def change(self, du, dlam):
+        return jnp.abs(du)
+
+
+class Loads(NamedTuple):
+    """What the equations of a step depend on the parameters by."""
+
+    residual: Float[Array, " k"]
+    violation: Float[Array, " m"]  # Φ, times (h₀/h)² where it is not zero
+    x: Float[Array, " k"]
+    v: Float[Array, " k"]
+
+
+class Index3LinearizedStep(AbstractLinearizedStep):
+    """The equations above, and the factors of S at the converged state."""
+
+    scheme: AbstractAlpha = eqx.field(static=True)
+    group: AbstractLieGroup = eqx.field(static=True)
+    mass: Matrix
+    h: Float[Array, ""]
+    x: Float[Array, " k"]
+    tangents: Tangents
+    factors: Factors
+
+    def margin(self, scale):
+        """See `_singular`."""
+        return margin_of(self.factors, self.tangents.constraint_jacobian, scale)
+
+    def forward(self, previous, loads, row):
+        scheme, group, h, x = self.scheme, self.group, self.h, self.x
+        k_t, c_t, jacobian = self.tangents
+        dx = h * previous.v + (h**2 * (0.5 - scheme.beta)) * previous.a + loads.x
+        w = group.Ad_inv_mv(group.exp(x), previous.w) + group.tangent_mv(x, dx) + row.w
+        v = previous.v + (h * (1.0 - scheme.gamma)) * previous.a + loads.v + row.v
+        vdot = (scheme.alpha_m * previous.a - scheme.alpha_f * previous.vdot) / (1.0 - scheme.alpha_f) + row.vdot
+        u, lam = self.factors.solve(
+            row.a - loads.residual - (self.mass @ vdot + c_t @ v + k_t @ w),
+            row.lam - (loads.violation + jacobian @ w) / (scheme.beta * h**2),
+        )
+        return Variation(
+            w=w + group.tangent_mv(x, (scheme.beta * h**2) * u),
+            v=v + (scheme.gamma * h) * u,
+            vdot=vdot + scheme.inertia_factor * u,
+            lam=lam,
+            a=u,
+        )
+
+    def backward(self, c, loads):
+        scheme, group, h, x = self.scheme, self.group, self.h, self.x
+        alpha_m, alpha_f = scheme.alpha_m, scheme.alpha_f
+        k_t, c_t, jacobian = self.tangents
+        mu_a, mu_lam = self.factors.solve(
+            c.a
+            + (scheme.beta * h**2) * group.tangent_rmv(x, c.w)
+            + (scheme.gamma * h) * c.v
+            + scheme.inertia_factor * c.vdot,
+            c.lam,
+            transposed=True,
+        )
+        mu_phi = mu_lam / (scheme.beta * h**2)
+        mu_w = c.w - mu_a @ k_t - mu_phi @ jacobian
+        mu_v = c.v - mu_a @ c_t
+        mu_vdot = c.vdot - mu_a @ self.mass
+        mu_x = group.tangent_rmv(x, mu_w)
+        previous = Variation(
+            w=group.Ad_inv_rmv(group.exp(x), mu_w),
+            v=h * mu_x + mu_v,
+            vdot=-(alpha_f / (1.0 - alpha_f)) * mu_vdot,
+            lam=jnp.zeros_like(c.lam),
+            a=(h**2 * (0.5 - scheme.beta)) * mu_x
+            + (h * (1.0 - scheme.gamma)) * mu_v
+            + (alpha_m / (1.0 - alpha_f)) * mu_vdot,
+        )
+        return previous, Loads(-mu_a, -mu_phi, mu_x, mu_v), Variation(mu_w, mu_v, mu_vdot, mu_lam, mu_a)
+
+
+class Index3(AbstractEquations):
+    """The equations of index 3."""
+
+    scheme: AbstractAlpha = eqx.field(static=True)
+    system: AbstractSystem
+    mass: Matrix  # M, (k, k)
+    scale: Float[Array, " k"]
+    softness: Float[Array, " m"] | None  # c; None: no constraint may be redundant
+
+    @classmethod
+    def of(cls, scheme, system):
+        return cls(scheme, system, mass_matrix(system), system.coordinate_scale(), softness(system))
+
+    @staticmethod
+    def complete(state):
+        return state
+
+    @staticmethod
+    def physical(states):
+        return states
+
+    @staticmethod
+    def numbers(system):
+        return factor_size(system)
+
+    def loads(self, previous, state):
+        scheme = self.scheme
+
+        def function(system, node):
+            h = node.h
+            violation = system.constraint(state.q)
+            if self.softness is not None:
+                violation = violation * (lax.stop_gradient(h) / h) ** 2
+            return Loads(
+                system.residual(state.q, state.v, state.vdot, state.lam, node.t),
+                violation,
+                increment(scheme, previous, state.a, h),
+                h * ((1.0 - scheme.gamma) * previous.a + scheme.gamma * state.a),
+            )
+
+        return function
+
+    @property
+    def unknowns(self):
+        return self.system.group.dim + len(self.system.constraint_names)
+
+    def step(self, previous, h):
+        return Index3Step(self, previous, h)
+
+    def linearized(self, node, previous, state):
+        system, h = self.system, node.h
+        x = increment(self.scheme, previous, state.a, h)
+        at_state = tangents(system, state.q, state.v, state.vdot, state.lam, node.t)
+        factors = factorize_iteration_matrix(self.scheme, system, at_state, self.mass, x, h)
+        return Index3LinearizedStep(self.scheme, system.group, self.mass, h, x, at_state, factors)
+
+    def margin(self, state):
+        return margin_by_mass(self.system, self.mass, constraint_jacobian(self.system, state.q), self.scale)
