@@ -155,7 +155,7 @@ class Rod(AbstractConstraint):
     def num_rows(self):
         return 1
 
-    def value(self, a, b):
+    def value(self, a, b, t):
         return self.root(jnp.sum((b.position - a.position) ** 2))[None] - self.length
 
 
@@ -183,7 +183,7 @@ def test_number_of_rows():
         def num_rows(self):
             return 2
 
-        def value(self, a, b):
+        def value(self, a, b, t):
             return b.position - a.position
 
     with pytest.raises(ValueError, match=says("Wrong: `value` has shape (3,), `num_rows` is 2")):

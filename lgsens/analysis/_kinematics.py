@@ -130,9 +130,10 @@ def kinematics(
 
 @eqx.filter_jit
 def _kinematics_jit(drive: _Drive, values, rates, t0):
-    found = positions(drive, values)
     t = jnp.broadcast_to(t0, values.shape[:1])
-    states = jax.vmap(lambda *args: forces_of_motion(drive, *args))(found.q, values, rates, t)
+    found = positions(drive, values, t)
+    along = lambda q, *driven: forces_of_motion(drive, q, driven[:2], driven[2:])
+    states = jax.vmap(along)(found.q, values, t, rates, jnp.zeros_like(t))
     first = jnp.argmin(found.found)  # the first that was not found, 0 if all were
     result = jnp.where(jnp.all(found.found), RESULTS.successful, RESULTS.position_failed).astype(jnp.int32)
     details = {"violation": found.violation[first], "values": values[first], "position": first}

@@ -71,10 +71,10 @@ class Constants(NamedTuple):
             return cls(mass, scale, None, jnp.linalg.inv(mass))
         return cls(mass_matrix(system), scale, softness(system))
 
-    def step(self, scheme: GeneralizedAlpha, system: AbstractSystem, previous: State, h) -> AbstractStep:
+    def step(self, scheme: GeneralizedAlpha, system: AbstractSystem, previous: State, h, t) -> AbstractStep:
         """The equations of the step from `previous`."""
         if scheme.stabilized:
-            return StabilizedStep.of(scheme, system, self.mass, self.inverse_mass, previous, h)
+            return StabilizedStep.of(scheme, system, self.mass, self.inverse_mass, previous, h, t)
         return Index3Step(scheme, system, self.mass, self.scale, self.softness, previous, h)
 
 
@@ -150,7 +150,7 @@ def take_step(
     iterate where one is due, then iterations until the next is. What makes a matrix, nearly all that there is to
     compile, so is compiled once.
     """
-    scale, equations = constants.scale, constants.step(scheme, system, previous, h)
+    scale, equations = constants.scale, constants.step(scheme, system, previous, h, t)
     eps = float(jnp.finfo(scale.dtype).eps)
     tolerance = max(scheme.tolerance, 64 * eps)
     round_off = max(1.0, len(scale) / 12) * eps
@@ -262,5 +262,5 @@ def take_step(
 def no_solver(scheme: GeneralizedAlpha, system: AbstractSystem, constants: Constants, state: State, t, h) -> Solver:
     """Zeros in the shapes of the inverse of an iteration matrix, to begin with."""
     at_state = Motion(state.v, state.q, state.v, state.vdot)
-    inverse = lambda: constants.step(scheme, system, state, h).factors(at_state, state.lam, t, Inverse)[0]
+    inverse = lambda: constants.step(scheme, system, state, h, t).factors(at_state, state.lam, t, Inverse)[0]
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(inverse))

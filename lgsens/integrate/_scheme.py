@@ -218,7 +218,7 @@ class Index3Step(AbstractStep):
 
     def defect(self, motion, lam, t):
         residual = self.system.residual(motion.q, motion.v, motion.vdot, lam, t)
-        violation = self.system.constraint(motion.q) / (self.scheme.beta * self.h**2)
+        violation = self.system.constraint(motion.q, t) / (self.scheme.beta * self.h**2)
         return residual, violation if self.softness is None else violation - self.softness * lam
 
     def factors(self, motion, lam, t, kind=LU):

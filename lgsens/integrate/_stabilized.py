@@ -106,8 +106,8 @@ class StabilizedStep(AbstractStep):
     h: Float[Array, ""]
 
     @classmethod
-    def of(cls, scheme, system: AbstractSystem, mass, inverse_mass, previous: State, h) -> "StabilizedStep":
-        return cls(scheme, system, mass, previous, inverse_mass @ system.constraint_jacobian(previous.q).T, h)
+    def of(cls, scheme, system: AbstractSystem, mass, inverse_mass, previous: State, h, t) -> "StabilizedStep":
+        return cls(scheme, system, mass, previous, inverse_mass @ system.constraint_jacobian(previous.q, t).T, h)
 
     def correction(self, lam):
         """N ν."""
@@ -122,15 +122,15 @@ class StabilizedStep(AbstractStep):
     def defect(self, motion, lam, t):
         scheme, system, h = self.scheme, self.system, self.h
         residual = system.residual(motion.q, motion.v, motion.vdot, halves(lam)[0], t)
-        positions = system.constraint(motion.q) / (scheme.beta * h**2)
-        velocities = constraint_velocity(system, motion.q, motion.v) / (scheme.gamma * h)
+        positions = system.constraint(motion.q, t) / (scheme.beta * h**2)
+        velocities = constraint_velocity(system, motion.q, motion.v, t) / (scheme.gamma * h)
         return residual, jnp.concatenate([positions, velocities])
 
     def tangents(self, q, v, vdot, lam, t) -> StabilizedTangents:
         system = self.system
         k_t, c_t, jacobian = system.tangents(q, v, vdot, halves(lam)[0], t)
         return StabilizedTangents(
-            k_t, c_t, jacobian, by_configuration(system, lambda q: constraint_velocity(system, q, v), q)
+            k_t, c_t, jacobian, by_configuration(system, lambda q: constraint_velocity(system, q, v, t), q)
         )
 
     def factors(self, motion, lam, t, kind=LU):

@@ -90,9 +90,9 @@ class UnevenSteps(eqx.Module):
     def of(cls, scheme: GeneralizedAlpha, system: AbstractSystem) -> "UnevenSteps":
         return cls(scheme, system, Constants.of(system))
 
-    def _margin(self, state: State) -> Float[Array, ""]:
+    def _margin(self, state: State, t) -> Float[Array, ""]:
         """A margin (`_singular`) that can be compared with those of other step sizes."""
-        jacobian = constraint_jacobian(self.system, state.q)
+        jacobian = constraint_jacobian(self.system, state.q, t)
         return margin_by_mass(self.system, self.constants.mass, jacobian, self.constants.scale)
 
     def first(self, state0: State, t0, h) -> Progress:
@@ -134,10 +134,10 @@ class UnevenSteps(eqx.Module):
             self.scheme, self.system, self.constants, start, guess, chord, active, t, h
         )
         if shared is None or chord is None:
-            margin = self._margin(state)
+            margin = self._margin(state, t)
         else:
             made = chord.due
-            margin = renewed_where(made, lambda: self._margin(state), jnp.full_like(h, jnp.nan))
+            margin = renewed_where(made, lambda: self._margin(state, t), jnp.full_like(h, jnp.nan))
             shared = _Shared(chord.solver, jnp.where(made, h, shared.h), shared.wear.after(made, stats.iterations))
         return Attempt(state, guess.contraction, stats._replace(margin=margin), shared)
 

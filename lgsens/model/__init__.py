@@ -4,6 +4,8 @@ from lgsens.model._body import RigidBody as RigidBody
 from lgsens.model._constraints import (
     AbstractClosedFormConstraint as AbstractClosedFormConstraint,
     AbstractConstraint as AbstractConstraint,
+    AbstractRows as AbstractRows,
+    AbstractVelocityConstraint as AbstractVelocityConstraint,
     Coincidence as Coincidence,
     Distance as Distance,
     InPlane as InPlane,

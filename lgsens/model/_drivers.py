@@ -23,17 +23,17 @@ class Displacement(AbstractClosedFormConstraint):
     def num_rows(self):
         return 1
 
-    def value(self, a, b):
-        return self.line.value(a, b) - self.prescribed
+    def value(self, a, b, t):
+        return self.line.value(a, b, t) - self.prescribed
 
-    def jacobian(self, a, b):
-        return self.line.jacobian(a, b)
+    def jacobian(self, a, b, t):
+        return self.line.jacobian(a, b, t)
 
-    def force(self, a, b, lam):
-        return self.line.force(a, b, lam)
+    def force(self, a, b, lam, t):
+        return self.line.force(a, b, lam, t)
 
-    def geometric_stiffness(self, a, b, lam):
-        return self.line.geometric_stiffness(a, b, lam)
+    def geometric_stiffness(self, a, b, lam, t):
+        return self.line.geometric_stiffness(a, b, lam, t)
 
 
 class Angle(AbstractConstraint):
@@ -56,7 +56,7 @@ class Angle(AbstractConstraint):
     def num_rows(self):
         return 1
 
-    def value(self, a, b):
+    def value(self, a, b, t):
         beta = a.local_axis(b.axis(self.first_b))
         x, y = jnp.sum(beta * self.first_a), jnp.sum(beta * self.second_a)
         sine, cosine = jnp.sin(self.prescribed), jnp.cos(self.prescribed)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from lgsens._validate import axis_field, number_field, point_field, require
 from lgsens.liegroups import cross
 from lgsens.model._constraints import (
-    AbstractConstraint,
+    AbstractRows,
     Coincidence,
     Distance,
     InPlane,
@@ -65,7 +65,7 @@ class AbstractJoint(eqx.Module):
         """Whether the reference configuration satisfies the joint by construction."""
 
     @abc.abstractmethod
-    def constraints(self, a: Frame, b: Frame) -> tuple[AbstractConstraint, ...]:
+    def constraints(self, a: Frame, b: Frame) -> tuple[AbstractRows, ...]:
         """The basic constraints of the joint, given the reference frames of its two bodies."""
 
 

@@ -194,7 +194,7 @@ def pseudo_load_function(state: State):
     """p ↦ (r, Φ) at the fixed converged state: its JVP is (r_p p', Φ_p p'), its VJP their transposes."""
 
     def loads(system: AbstractSystem, t):
-        return system.residual(state.q, state.v, state.vdot, state.lam, t), system.constraint(state.q)
+        return system.residual(state.q, state.v, state.vdot, state.lam, t), system.constraint(state.q, t)
 
     return loads
 
@@ -205,7 +205,7 @@ def pseudo_loads(step: Step, parameters: Parameters, d: Parameters):
     loads = pseudo_load_function(step.state)
     r_p, phi_p = jax.jvp(loads, (parameters.system, step.t), (d.system, d.t0 + n * d.h))[1]
     if softness(parameters.system) is not None:
-        phi_p = phi_p - (2.0 * d.h / parameters.h) * parameters.system.constraint(step.state.q)
+        phi_p = phi_p - (2.0 * d.h / parameters.h) * parameters.system.constraint(step.state.q, step.t)
     return r_p, phi_p
 
 

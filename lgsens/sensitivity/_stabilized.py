@@ -73,7 +73,7 @@ def _corrected_increment(scheme: GeneralizedAlpha, step: Step, h, y) -> tuple[Fl
 def _linearized(scheme, parameters: Parameters, constants: Constants, step: Step) -> Linearized:
     system, h = parameters.system, parameters.h
     state, q = step.state, step.previous.q
-    equations = StabilizedStep.of(scheme, system, constants.mass, constants.inverse_mass, step.previous, h)
+    equations = StabilizedStep.of(scheme, system, constants.mass, constants.inverse_mass, step.previous, h, step.t)
     y, nu = equations.correction(state.lam), halves(state.lam)[1]
     x, rates = _corrected_increment(scheme, step, h, y)
     at_state = equations.tangents(state.q, state.v, state.vdot, state.lam, step.t)
@@ -83,7 +83,7 @@ def _linearized(scheme, parameters: Parameters, constants: Constants, step: Step
         y=y,
         tangents=at_state,
         normal=equations.normal,
-        curvature=by_configuration(system, lambda q: nu @ system.constraint_jacobian(q), q),
+        curvature=by_configuration(system, lambda q: nu @ system.constraint_jacobian(q, step.t), q),
         factors=equations.factorized(at_state, x),
     )
 
@@ -95,9 +95,9 @@ def _load_function(step: Step, y):
         state, (lam, nu) = step.state, halves(step.state.lam)
         return (
             system.residual(state.q, state.v, state.vdot, lam, t),
-            system.constraint(state.q),
-            constraint_velocity(system, state.q, state.v),
-            nu @ system.constraint_jacobian(step.previous.q) - system.mass_matrix() @ y,
+            system.constraint(state.q, t),
+            constraint_velocity(system, state.q, state.v, t),
+            nu @ system.constraint_jacobian(step.previous.q, t) - system.mass_matrix() @ y,
         )
 
     return loads
@@ -225,17 +225,18 @@ def stabilized_matvec(scheme, states: State, parameters: Parameters, delta: Vari
     def rows(step: Step, previous: Variation, current: Variation) -> Variation:
         state, (lam, nu), (d_lam, d_nu) = step.state, halves(step.state.lam), halves(current.lam)
         before, t_dot = step.previous.q, d.t0 + (step.t - parameters.t0) / h * d.h
-        y = constants.inverse_mass @ (nu @ system.constraint_jacobian(before))
+        y = constants.inverse_mass @ (nu @ system.constraint_jacobian(before, step.t))
         at = lambda q, w: group.to_ambient(q, w)
 
-        def correction(system, q, nu):
-            return nu @ system.constraint_jacobian(q) - system.mass_matrix() @ y
+        def correction(system, q, nu, t):
+            return nu @ system.constraint_jacobian(q, t) - system.mass_matrix() @ y
 
-        _, load = jax.jvp(correction, (system, before, nu), (d.system, at(before, previous.w), d_nu))
+        _, load = jax.jvp(correction, (system, before, nu, step.t), (d.system, at(before, previous.w), d_nu, t_dot))
         dy = constants.inverse_mass @ load
 
         def equations(system, q, v, vdot, lam, t):
-            return system.residual(q, v, vdot, lam, t), system.constraint(q), constraint_velocity(system, q, v)
+            rate = constraint_velocity(system, q, v, t)
+            return system.residual(q, v, vdot, lam, t), system.constraint(q, t), rate
 
         _, (r, phi, rate) = jax.jvp(
             equations,

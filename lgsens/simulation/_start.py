@@ -36,16 +36,16 @@ def begin(
 ) -> Begin:
     """The state at t0: `state0` as it is, or the consistent one of the reference configuration, `initial` if known."""
     if state0 is not None:
-        jacobian = constraint_jacobian(system, state0.q)
-        return Begin(state0, state0.v, jnp.zeros((), jnp.int32), system.constraint(state0.q), jacobian)
+        jacobian = constraint_jacobian(system, state0.q, t0)
+        return Begin(state0, state0.v, jnp.zeros((), jnp.int32), system.constraint(state0.q, t0), jacobian)
     initial = initial_state(system, t0) if initial is None else initial
     usable = initial.result == RESULTS.successful
-    state = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), _started(integrator, system, initial, h))
-    jacobian = constraint_jacobian(system, initial.state.q)
+    state = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), _started(integrator, system, initial, t0, h))
+    jacobian = constraint_jacobian(system, initial.state.q, t0)
     return Begin(state, initial.state.v, initial.result, initial.violation, jacobian)
 
 
-def _started(integrator: GeneralizedAlpha, system: AbstractSystem, initial: Initial, h) -> State:
+def _started(integrator: GeneralizedAlpha, system: AbstractSystem, initial: Initial, t0, h) -> State:
     """The starting values of the scheme; see `GeneralizedAlpha.second_order_start`.
 
     With exact values, and a_n = v̇(t_n + Δ h), Δ = α_m − α_f, the increment (27) misses the true one by h³ c
@@ -63,9 +63,9 @@ def _started(integrator: GeneralizedAlpha, system: AbstractSystem, initial: Init
     if integrator.stabilized:
         return dataclasses.replace(state, a=a)
     missed = missed_increment(integrator, system, state.v, state.vdot, initial.jerk)
-    _, normal = split_velocity(system, state.q, missed, initial.factors)
+    _, normal = split_velocity(system, state.q, missed, t0, initial.factors)
     return State(
-        q=given_way(system, state.q, state.lam, integrator.beta * h**2),
+        q=given_way(system, state.q, state.lam, integrator.beta * h**2, t0),
         v=state.v + h**2 * normal,
         vdot=state.vdot,
         lam=state.lam,
