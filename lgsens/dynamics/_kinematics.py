@@ -14,8 +14,8 @@ One factorization of A at the solution gives w for every δs and δp: in forward
 parameter, in reverse mode, by the transposed factors, μ = A⁻ᵀ q̄ and p̄ = −Φ_pᵀ μ, one per output. Φ_s δs + Φ_p δp is the
 tangent of Φ at fixed q: nothing is differentiated along the iteration, nor by where it started.
 
-Velocity and acceleration. With s moving at constant rates ṡ (1 of t, or 0 where signals are held), two derivatives of Φ(q(s), s) = 0 along the motion
-(q ṽ, ṡ) are
+Velocity and acceleration. With s moving at constant rates ṡ (of t 1, or 0 where signals are held), two derivatives of
+Φ(q(s), s) = 0 along the motion (q ṽ, ṡ) are
 
     A v + Φ_s ṡ = 0,     A v̇ + Γ = 0,     Γ = d/dt (DΦ·(q ṽ) + Φ_s ṡ) at fixed v.
 
