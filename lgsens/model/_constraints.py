@@ -27,6 +27,7 @@ from lgsens.model._frames import (
     separation_force,
     separation_stiffness,
 )
+from lgsens.model._signals import Prescribed, at_time
 
 
 class AbstractRows(eqx.Module):
@@ -220,14 +221,14 @@ class InPlane(AbstractClosedFormConstraint):
 
 
 class Distance(AbstractClosedFormConstraint):
-    """Two body-fixed points keep their distance: Φ = |d| − L; λ is the tension of the rod [N].
+    """Two body-fixed points keep their distance: Φ = |d| − L(t); λ is the tension of the rod [N].
 
     With n = d/|d|: B = nᵀD and D_q(Bᵀλ) = λ (Dᵀ (I − n nᵀ)/|d| D + D_q(Dᵀn)|_n).
     """
 
     point_a: Float[Array, "3"]
     point_b: Float[Array, "3"]
-    length: Float[Array, ""]
+    length: Prescribed
 
     @property
     def num_rows(self):
@@ -239,7 +240,7 @@ class Distance(AbstractClosedFormConstraint):
 
     def value(self, a, b, t):
         d = b.point(self.point_b) - a.point(self.point_a)
-        return (jnp.linalg.norm(d) - self.length)[None]
+        return (jnp.linalg.norm(d) - at_time(self.length, t))[None]
 
     def jacobian(self, a, b, t):
         d, gradient = separation(a, b, self.point_a, self.point_b)
