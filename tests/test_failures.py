@@ -245,14 +245,16 @@ class Oscillator(AbstractSystem):
     def residual(self, q, v, vdot, lam, t):
         return vdot + self.square * q
 
-    def constraint(self, q):
+    def constraint(self, q, t):
         return q[:0]
 
-    def constraint_jacobian(self, q):
+    def constraint_jacobian(self, q, t):
         return q[:0, None]
 
     def tangents(self, q, v, vdot, lam, t):
-        return Tangents(self.square[None, None], jnp.zeros_like(self.square)[None, None], self.constraint_jacobian(q))
+        return Tangents(
+            self.square[None, None], jnp.zeros_like(self.square)[None, None], self.constraint_jacobian(q, t)
+        )
 
 
 def test_trajectory_without_bodies():

@@ -161,10 +161,10 @@ class Sledge(lg.AbstractSystem):
     def residual(self, q, v, vdot, lam, t):
         return self.mass * vdot - jnp.where(t > JUMP, self.push, 0.0) + jnp.sum(lam)
 
-    def constraint(self, q):
+    def constraint(self, q, t):
         return jnp.tile(q - self.place, self.rows)
 
-    def constraint_jacobian(self, q):
+    def constraint_jacobian(self, q, t):
         return jnp.ones((self.rows, 1))
 
     def tangents(self, q, v, vdot, lam, t):

@@ -88,12 +88,12 @@ class Pendulum(lg.AbstractSystem):
 
     def residual(self, q, v, vdot, lam, t):
         force = jnp.stack([-self.stiffness * q[0], -self.mass * self.gravity])
-        return self.mass * vdot - force + lam @ self.constraint_jacobian(q)
+        return self.mass * vdot - force + lam @ self.constraint_jacobian(q, t)
 
-    def constraint(self, q):
+    def constraint(self, q, t):
         return jnp.stack([(q @ q - 1.0) / 2.0] * self.held) if self.held else q[:0]
 
-    def constraint_jacobian(self, q):
+    def constraint_jacobian(self, q, t):
         return q[None] if self.held else jnp.zeros((0, 2))
 
     def tangents(self, q, v, vdot, lam, t):
@@ -230,9 +230,9 @@ def test_top():
     np.testing.assert_allclose(slope, last["dx_dalpha0"], rtol=0, atol=1e-5)
     np.testing.assert_allclose(trajectory.multiplier("pivot")[-1], last["lam"], rtol=0, atol=1e-6 * 150.0)
     system, states = trajectory.system, trajectory.states
-    violation, rate = jax.jit(jax.vmap(lambda q, v: (system.constraint(q), constraint_velocity(system, q, v))))(
-        states.q, states.v
-    )
+    violation, rate = jax.jit(
+        jax.vmap(lambda q, v: (system.constraint(q, 0.0), constraint_velocity(system, q, v, 0.0)))
+    )(states.q, states.v)
     assert np.abs(violation).max() < 1e2 * EPS
     assert np.abs(rate).max() < 1e-10  # drift times correction
     orientation = trajectory.body("top").orientation
@@ -249,7 +249,7 @@ def test_four_bar():
     for integrand, name in zip(psi, ("Psi1", "Psi2")):
         # what Gregory's rule leaves at h = 5 ms: (ω h)⁴ with ω up to 15 rad/s
         np.testing.assert_allclose(lg.time_integral(trajectory.t, integrand, order=4), reference[name], rtol=3e-5)
-    assert np.abs(trajectory.system.constraint(trajectory.state(-1).q)).max() < 1e3 * EPS
+    assert np.abs(trajectory.system.constraint(trajectory.state(-1).q, 0.0)).max() < 1e3 * EPS
     assert np.all(trajectory.stats.converged)
 
 

@@ -175,7 +175,7 @@ def test_one_factorization_for_all_parameters():
     system = driven_four_bar().system()
     values = jnp.asarray(ANGLES[:5, None])
     where = (_place(system, "motor"),)
-    place = lambda system: positions(_Drive(system, where), values).q.position[:, 1]
+    place = lambda system: positions(_Drive(system, where), values, jnp.zeros(5)).q.position[:, 1]
     forward = jax.make_jaxpr(place)(system).jaxpr
     backward = jax.make_jaxpr(lambda s: jax.vjp(place, s)[1](jnp.ones((5, 3))))(system).jaxpr
     assert factorizations(backward) == factorizations(forward) + 1

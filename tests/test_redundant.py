@@ -93,7 +93,7 @@ def least_norm(trajectory, n):
     """λ at step n by NumPy's pseudo-inverse, with moments divided by the radius of gyration."""
     system = trajectory.system
     q = jax.tree.map(lambda leaf: leaf[n], trajectory.states.q)
-    jacobian = np.asarray(system.constraint_jacobian(q))
+    jacobian = np.asarray(system.constraint_jacobian(q, 0.0))
     gyration = np.sqrt(np.mean(np.trace(system.inertia, axis1=1, axis2=2)) / 3.0 / np.mean(system.mass))
     # rows of points move with translations, rows of axes do not
     columns = system.index[:, :3].ravel()

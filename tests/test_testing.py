@@ -52,17 +52,17 @@ def wrong(kind, **methods):
     )
 
 
-def wrong_sign(self, a, b):
+def wrong_sign(self, a, b, t):
     """B of `Coincidence`, but for the sign of one entry."""
-    return Coincidence.jacobian(self, a, b).at[1, 4].multiply(-1.0)
+    return Coincidence.jacobian(self, a, b, t).at[1, 4].multiply(-1.0)
 
 
-def wrong_force(self, a, b, lam):
-    return Orthogonality.force(self, a, b, lam).at[10].set(0.0)
+def wrong_force(self, a, b, lam, t):
+    return Orthogonality.force(self, a, b, lam, t).at[10].set(0.0)
 
 
-def unsymmetric(self, a, b, lam):
-    return Coincidence.geometric_stiffness(self, a, b, lam).T
+def unsymmetric(self, a, b, lam, t):
+    return Coincidence.geometric_stiffness(self, a, b, lam, t).T
 
 
 NUMBERS = {
@@ -155,7 +155,7 @@ class Rod(AbstractConstraint):
     def num_rows(self):
         return 1
 
-    def value(self, a, b):
+    def value(self, a, b, t):
         return self.root(jnp.sum((b.position - a.position) ** 2))[None] - self.length
 
 
@@ -183,7 +183,7 @@ def test_number_of_rows():
         def num_rows(self):
             return 2
 
-        def value(self, a, b):
+        def value(self, a, b, t):
             return b.position - a.position
 
     with pytest.raises(ValueError, match=says("Wrong: `value` has shape (3,), `num_rows` is 2")):

@@ -54,10 +54,10 @@ class Pendulum(lg.AbstractSystem):
         away = q - jnp.stack([jnp.cos(3.0 * t), jnp.exp(-((5.0 * (t - 0.6)) ** 2))])
         return self.mass * vdot + self.damping * v + self.stiffness * away + lam @ q[None]
 
-    def constraint(self, q):
+    def constraint(self, q, t):
         return (q @ q - self.length**2)[None] / 2.0
 
-    def constraint_jacobian(self, q):
+    def constraint_jacobian(self, q, t):
         return q[None]
 
     def tangents(self, q, v, vdot, lam, t):

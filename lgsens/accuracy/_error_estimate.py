@@ -44,7 +44,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lgsens._validate import require
-from lgsens.dynamics import AbstractSystem, State, kkt_solve, split_velocity
+from lgsens.dynamics import AbstractSystem, State, full_jacobian, kkt_solve, split_velocity
 from lgsens.integrate import EqualGrid, GeneralizedAlpha, Variation
 from lgsens.sensitivity import Parameters, direct_sweep
 from lgsens.simulation import StateError, Trajectory
@@ -134,9 +134,10 @@ def _estimated(scheme: GeneralizedAlpha, trajectory: Trajectory) -> StateError:
 def _start(system: AbstractSystem, first: State, t0, c, rate):
     """ν_0 and ω_0 for c and l + ċ at t0."""
     q = first.q
-    allowed, nu = split_velocity(system, q, c)
-    jacobian = system.constraint_jacobian(q)
-    _, change = jax.jvp(lambda q: system.constraint_jacobian(q) @ allowed, (q,), (system.group.to_ambient(q, first.v),))
+    allowed, nu = split_velocity(system, q, c, t0)
+    jacobian = full_jacobian(system, q, t0)
+    motion = system.group.to_ambient(q, first.v), jnp.ones_like(t0)
+    _, change = jax.jvp(lambda q, t: full_jacobian(system, q, t) @ allowed, (q, t0), motion)
     damping = system.tangents(q, first.v, first.vdot, first.lam, t0).damping
     omega, _ = kkt_solve(system.mass_matrix(), jacobian, -damping @ nu, jacobian @ rate + change)
     return nu, omega

@@ -16,7 +16,14 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from lgsens._validate import as_count
-from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk, initial_state, split_velocity
+from lgsens.dynamics import (
+    AbstractSystem,
+    State,
+    acceleration_and_jerk,
+    consistent_velocity,
+    initial_state,
+    split_velocity,
+)
 from lgsens.integrate import AbstractIntegrator, GeneralizedAlpha
 from lgsens.model import Model
 from lgsens.sensitivity import DirectDifferentiation
@@ -87,7 +94,7 @@ def _growth_jit(system: AbstractSystem, t0, t1, num_steps: int, integrator: Abst
 
     def motion(x, y):
         q = group.retract(q0, x)
-        v, _ = split_velocity(system, q, v0 + y)
+        v = consistent_velocity(system, q, v0 + y, t0)
         vdot, lam, jerk = acceleration_and_jerk(system, q, v, t0)
         moved = initial._replace(state=State(q=q, v=v, vdot=vdot, lam=lam, a=vdot), jerk=jerk)
         start = begin(integrator.scheme, system, t0, None, moved)
@@ -95,7 +102,7 @@ def _growth_jit(system: AbstractSystem, t0, t1, num_steps: int, integrator: Abst
         return trajectory.states.q, (trajectory.t, trajectory.result, details)
 
     def followed(random):
-        x, _ = split_velocity(system, q0, scale * random[0])
+        x, _ = split_velocity(system, q0, scale * random[0], t0)
         size = jnp.max(jnp.abs(x) / scale)
         x = x / jnp.where(size > 0.0, size, 1.0)
         y = scale * random[1] / jnp.max(jnp.abs(random[1])) / (t1 - t0)

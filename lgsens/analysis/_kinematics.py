@@ -1,5 +1,6 @@
 """`kinematics`: the motion that joints and prescribed coordinates alone determine."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +11,15 @@ from jaxtyping import Array, Float, Int
 
 from lgsens._validate import as_float, suggestion
 from lgsens.dynamics import RESULTS, AbstractDrive, State, forces_of_motion, positions
-from lgsens.model import Distance, DistanceJoint, Model, MultibodySystem, RotationDriver, TranslationDriver
+from lgsens.model import (
+    AbstractSignal,
+    Distance,
+    DistanceJoint,
+    Model,
+    MultibodySystem,
+    RotationDriver,
+    TranslationDriver,
+)
 from lgsens.simulation import AbstractMotion, throw_if_failed
 
 _DRIVERS = (TranslationDriver, RotationDriver, DistanceJoint)
@@ -21,7 +30,7 @@ class Kinematics(AbstractMotion):
 
     Attributes:
         values: the driven values by joint, shape (n,) each: [m], of a `RotationDriver` [rad].
-        t: the time at which time-dependent forces are taken [s], shape (n,).
+        t: the times at which forces and signals are taken [s], shape (n,).
         states: q; v and v̇ with respect to the rates; λ of that motion. Stacked along a leading axis n.
         result: a value of `RESULTS`, shape (), int32; 0 is success.
         system: the equations of motion, the driven values those of the reference.
@@ -57,61 +66,77 @@ def _driven_leaf(element) -> Any:
 
 def kinematics(
     model: Model,
-    driven: Mapping[str, Any],
+    driven: Mapping[str, Any] | None = None,
     *,
     rates: Mapping[str, Any] | None = None,
+    t=None,
     t0=0.0,
     throw: bool = True,
 ) -> Kinematics:
     """The positions of a mechanism whose joints and driven coordinates leave it no freedom, velocities, forces.
 
-        Φ(q, s) = 0,     B v + Φ_s ṡ = 0,     B v̇ = −Γ,     Bᵀλ = −r(q, v, v̇, 0, t0)
+        Φ(q, s, t) = 0,     B v + Φ_s ṡ + Φ_t = 0,     B v̇ = −Γ,     Bᵀλ = −r(q, v, v̇, 0, t)
 
-    for each set of driven values s, ṡ constant: a test rig of a suspension, the coupler curve of a linkage, inverse
-    dynamics. Accelerations are those at constant rates; the multiplier of a driver is what it takes to drive.
+    for each set of driven values s, ṡ constant, and the time of drivers with a signal: a test rig of a suspension, the
+    coupler curve of a linkage, inverse dynamics. Accelerations are those at constant ṡ; the multiplier of a driver is
+    what it takes to drive.
 
     Arguments:
         model: the scene. `RigidBody(free=…)` and joints leave as many degrees of freedom as are driven.
         driven: values by name of a `TranslationDriver` (displacement [m]), a `RotationDriver` (angle [rad]) or a
-            `DistanceJoint` (length [m]), shape (n,) each. The first position is found from the reference
-            configuration, each other one from that before: begin near it, and take steps that cannot be mistaken for
-            another way to assemble the mechanism.
+            `DistanceJoint` (length [m]), in place of its own number or signal, shape (n,) each. The first position is
+            found from the reference configuration, each other one from that before: begin near it, and take steps
+            that cannot be mistaken for another way to assemble the mechanism. None or {}: signals drive it.
         rates: rates of the driven values [m/s], [rad/s], shape () or (n,), by name; those left out are 0. None: 1 for
             all of them. With the one rate 1, velocities are derivatives by the driven value (a motion ratio); with 0,
             forces are those at rest.
-        t0: the time at which time-dependent forces are taken [s], shape ().
+        t: times [s], shape (n,): signals run, and velocities and accelerations are the derivatives of the motion by
+            time. None: signals are held at t0.
+        t0: the time at which signals and time-dependent forces are taken where `t` is None [s], shape ().
         throw: raise if there is no such position. With False `result` says so, and its numbers are NaN.
 
     Differentiable by every number of the model and by the driven values, by the implicit function theorem: one
     factorization per position for all of them. Raises `ValueError` for names that are not drivers, values of different
-    lengths, a mechanism with other degrees of freedom than the driven ones, and positions that do not exist; inside
-    `jit`, JAX's runtime error with the same message. Source: Haug (1989), chapter 3.
+    lengths, joints that only constrain velocities, a mechanism with other degrees of freedom than the driven ones, and
+    positions that do not exist; inside `jit`, JAX's runtime error with that message. Source: Haug (1989), chapter 3.
     """
     if not isinstance(model, Model):
         raise ValueError(f"`model` must be a Model, got {type(model).__name__}.")
-    known = [name for name, joint in model.joints.items() if isinstance(joint, _DRIVERS)]
-    if not driven:
-        raise ValueError(f"`driven` is empty; give values for drivers of the model, some of {sorted(known)}.")
+    driven, known = dict(driven or {}), [name for name, joint in model.joints.items() if isinstance(joint, _DRIVERS)]
+    if not driven and t is None:
+        raise ValueError(
+            f"`driven` is empty; give values for drivers of the model, some of {sorted(known)}, or the times `t` at "
+            "which their signals are taken."
+        )
     for name in (*driven, *(rates or ())):
         if name not in known:
             raise ValueError(f"`driven`: {suggestion(name, known)}, the drivers and distance joints of the model.")
     names = sorted(driven)
     columns = [as_float(driven[name], None, f"`driven[{name!r}]`") for name in names]
-    if any(column.ndim != 1 or column.shape != columns[0].shape or column.size == 0 for column in columns):
-        shapes = {name: column.shape for name, column in zip(names, columns)}
-        raise ValueError(f"`driven` must hold vectors of one length ≥ 1, got shapes {shapes}.")
+    times = [] if t is None else [as_float(t, None, "`t`")]
+    (shape, *_), given = [of.shape for of in (*times, *columns)], zip((*names, "t"), (*columns, *times))
+    if len(shape) != 1 or not shape[0] or any(of.shape != shape for of in (*times, *columns)):
+        shapes = {name: of.shape for name, of in given}
+        raise ValueError(f"`driven` must hold vectors of one length ≥ 1, and `t` be one, got shapes {shapes}.")
     given = dict.fromkeys(names, 1.0) if rates is None else {name: rates.get(name, 0.0) for name in names}
     speeds = [as_float(given[name], None, f"`rates[{name!r}]`") for name in names]
-    if any(speed.shape not in ((), columns[0].shape) for speed in speeds):
-        raise ValueError(f"`rates` must have shape () or {columns[0].shape}, got {[speed.shape for speed in speeds]}.")
+    if any(speed.shape not in ((), shape) for speed in speeds):
+        raise ValueError(f"`rates` must have shape () or {shape}, got {[speed.shape for speed in speeds]}.")
     if set(rates or ()) - set(names):
         raise ValueError(f"`rates`: {sorted(set(rates or ()) - set(names))} are not among the driven joints {names}.")
-    system = model.system()
+    start = as_float(t0, (), "`t0`")
+    system = _with_numbers(model, names, start).system()
+    if system.num_velocity_rows:
+        rolling = sorted(set(system.constraint_names[-system.num_velocity_rows :]))
+        raise ValueError(
+            f"`model`: {rolling} constrain velocities, so the positions depend on the way to them and not on driven "
+            "values alone; use `simulate`."
+        )
     unknowns, equations = system.group.dim, len(system.constraint_names)
     if unknowns != equations:
         raise ValueError(
             f"`driven`: the mechanism has {unknowns} coordinates and {equations} equations, those of the drivers "
-            f"{names} included; kinematics needs as many. "
+            f"{names or sorted(known)} included; kinematics needs as many. "
             + (
                 "Drive more coordinates, hold bodies by `free`, or lock joints."
                 if unknowns > equations
@@ -119,24 +144,37 @@ def kinematics(
             )
         )
     drive = _Drive(system, tuple(_place(system, name) for name in names))
-    values = jnp.stack(columns, axis=1)
-    speed = jnp.stack([jnp.broadcast_to(speed, columns[0].shape) for speed in speeds], axis=1)
-    (t, states, result), details = _kinematics_jit(drive, values, speed, as_float(t0, (), "`t0`"))
-    found = Kinematics(values=dict(zip(names, columns)), t=t, states=states, result=result, system=system)
+    table = lambda rows: jnp.stack([jnp.zeros(shape, start.dtype), *rows], axis=1)[:, 1:]
+    values, speed = table(columns), table([jnp.broadcast_to(speed, shape) for speed in speeds])
+    time = jnp.broadcast_to(start, shape) if t is None else times[0]
+    clock = jnp.zeros_like(time) if t is None else jnp.ones_like(time)
+    (states, result), details = _kinematics_jit(drive, (values, time), (speed, clock))
+    found = Kinematics(values=dict(zip(names, columns)), t=time, states=states, result=result, system=system)
     if throw:
         found = throw_if_failed(found, found.result, details, system.constraint_names)
     return found
 
 
 @eqx.filter_jit
-def _kinematics_jit(drive: _Drive, values, rates, t0):
-    found = positions(drive, values)
-    t = jnp.broadcast_to(t0, values.shape[:1])
-    states = jax.vmap(lambda *args: forces_of_motion(drive, *args))(found.q, values, rates, t)
+def _kinematics_jit(drive: _Drive, driven, rates):
+    found = positions(drive, *driven)
+    states = jax.vmap(lambda *args: forces_of_motion(drive, *args))(found.q, driven, rates)
     first = jnp.argmin(found.found)  # the first that was not found, 0 if all were
     result = jnp.where(jnp.all(found.found), RESULTS.successful, RESULTS.position_failed).astype(jnp.int32)
-    details = {"violation": found.violation[first], "values": values[first], "position": first}
-    return (t, states, result), jax.lax.stop_gradient(details)
+    values = jnp.concatenate([driven[0][first], driven[1][first, None]])
+    details = {"violation": found.violation[first], "values": values, "position": first}
+    return (states, result), jax.lax.stop_gradient(details)
+
+
+def _with_numbers(model: Model, names: list[str], t) -> Model:
+    """The model with a number in place of the signal of each joint that is driven."""
+    joints = dict(model.joints)
+    for name in names:
+        field = "length" if isinstance(joints[name], DistanceJoint) else "value"
+        signal = getattr(joints[name], field)
+        if isinstance(signal, AbstractSignal):
+            joints[name] = dataclasses.replace(joints[name], **{field: signal(t)})
+    return eqx.tree_at(lambda model: model.joints, model, joints)
 
 
 def _place(system: MultibodySystem, name: str) -> tuple[int, int]:

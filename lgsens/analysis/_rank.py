@@ -6,7 +6,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from lgsens.dynamics import AbstractSystem, assemble
+from lgsens._validate import as_float
+from lgsens.dynamics import AbstractSystem, assemble, full_jacobian
 from lgsens.model import Model, MultibodySystem
 from lgsens.simulation import as_system, left_null_space, redundant_names
 
@@ -64,13 +65,16 @@ class ConstraintRank:
         return "\n".join(lines)
 
 
-def constraint_rank(model: Model | AbstractSystem) -> ConstraintRank:
+def constraint_rank(model: Model | AbstractSystem, *, t0=0.0) -> ConstraintRank:
     """How many constraint equations of a model are independent, and which joints share the others.
 
-        rank B(q) near the reference configuration,     n ≠ 0 with Bᵀn = 0: redundant, with weight in the joints of n
+        rank J(q) near the reference configuration,     n ≠ 0 with Jᵀn = 0: redundant, with weight in the joints of n
+
+    J is B, with the rows of velocity level below it where there are any.
 
     Arguments:
         model: the scene, or an `AbstractSystem`; its numbers known, not traced.
+        t0: the time at which drivers are taken [s].
 
     The rank is the largest found in the reference configuration and in four that the mechanism reaches by moving from
     it by 0.01 rad or lengths of the scene: in a singular reference configuration alone it would be too small, and
@@ -79,12 +83,13 @@ def constraint_rank(model: Model | AbstractSystem) -> ConstraintRank:
     system = as_system(model)
     if isinstance(system, MultibodySystem):
         system = dataclasses.replace(system, minimum_norm=True)  # which can be assembled whatever its rank
-    q, _ = _assembled(system)
-    _, jacobian = _evaluated(system, q)
+    t = as_float(t0, (), "`t0`")
+    q, _ = _assembled(system, t)
+    _, jacobian = _evaluated(system, q, t)
     first = jacobian
     reference_rank = rank = left_null_space(jacobian)[1]
     for direction in np.random.default_rng(0).normal(size=(_DIRECTIONS, jacobian.shape[1])):
-        moved = _moved(system, q, direction)
+        moved = _moved(system, q, t, direction)
         if moved is not None and left_null_space(moved)[1] > rank:
             jacobian, rank = moved, left_null_space(moved)[1]
     m, k = first.shape
@@ -92,10 +97,10 @@ def constraint_rank(model: Model | AbstractSystem) -> ConstraintRank:
     return ConstraintRank(k, m, rank, reference_rank, names)
 
 
-def _moved(system: AbstractSystem, q, direction):
-    """B in a configuration near q along a direction, if there is one."""
+def _moved(system: AbstractSystem, q, t, direction):
+    """J in a configuration near q along a direction, if there is one."""
     scale = np.asarray(system.coordinate_scale())
-    violation, jacobian = _evaluated(system, q)
+    violation, jacobian = _evaluated(system, q, t)
     # the part of the direction that the constraints allow, in comparable coordinates
     rows = jacobian * scale
     x = direction - np.linalg.lstsq(rows, rows @ direction, rcond=None)[0]
@@ -105,28 +110,28 @@ def _moved(system: AbstractSystem, q, direction):
     q = _retracted(system, q, _DISTANCE * scale * x / size)
     tolerance = 1e3 * np.finfo(scale.dtype).eps * max(scale.max(), 1.0)
     for _ in range(_ITERATIONS):
-        violation, jacobian = _evaluated(system, q)
+        violation, jacobian = _evaluated(system, q, t)
         if np.abs(violation).max(initial=0.0) <= tolerance:
             return jacobian
         # singular values that the distance does not explain belong to redundant equations
-        step = np.linalg.lstsq(jacobian * scale, violation, rcond=1e-2 * _DISTANCE)[0]
+        step = np.linalg.lstsq(jacobian[: len(violation)] * scale, violation, rcond=1e-2 * _DISTANCE)[0]
         q = _retracted(system, q, -scale * step)
     return None
 
 
 @eqx.filter_jit
-def _assembled(system):
-    return assemble(system)
+def _assembled(system, t):
+    return assemble(system, t)
 
 
 @eqx.filter_jit
-def _value_and_jacobian(system, q):
-    return system.constraint(q), system.constraint_jacobian(q)
+def _value_and_jacobian(system, q, t):
+    return system.constraint(q, t), full_jacobian(system, q, t)
 
 
-def _evaluated(system, q) -> tuple[np.ndarray, np.ndarray]:
-    """Φ and B."""
-    violation, jacobian = _value_and_jacobian(system, q)
+def _evaluated(system, q, t) -> tuple[np.ndarray, np.ndarray]:
+    """Φ and J."""
+    violation, jacobian = _value_and_jacobian(system, q, t)
     return np.asarray(violation), np.asarray(jacobian)
 
 

@@ -148,7 +148,7 @@ def _run(rate, final, build, p, t0, t1, tolerances, max_steps, jumps):
 
     def criteria(y, p, numbers, t):
         system, state, psi = at(numbers, y, t)
-        return psi + final(p, system, state, t), system.constraint(state.q)
+        return psi + final(p, system, state, t), system.constraint(state.q, t)
 
     def with_variations(function, rows, t) -> Any:
         """`function` and its derivatives, of y and η_j, the rows."""
@@ -185,7 +185,7 @@ def _run(rate, final, build, p, t0, t1, tolerances, max_steps, jumps):
     _, (reached, finished, steps) = lax.scan(integrate, (jnp.ones_like(rows), end), runs)
     (value, violation), (varied_value, _) = with_variations(criteria, reached[-1], t1)
     run = IndexReducedRun(value, (varied_value / scale[:, None]).T, steps[-1], jnp.max(jnp.abs(violation), initial=0.0))
-    details = {"violation": initial.violation, "jacobian": system.constraint_jacobian(initial.state.q)}
+    details = {"violation": initial.violation, "jacobian": system.constraint_jacobian(initial.state.q, t0)}
     return run, jnp.all(finished), initial.result, details, system.constraint_names
 
 

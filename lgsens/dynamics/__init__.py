@@ -3,9 +3,15 @@
 from lgsens.dynamics._accelerations import (
     ConstrainedInertia as ConstrainedInertia,
     Inertia as Inertia,
-    constraint_velocity as constraint_velocity,
     equations_of_motion as equations_of_motion,
     factorized_accelerations as factorized_accelerations,
+)
+from lgsens.dynamics._constraints import (
+    constraint_acceleration as constraint_acceleration,
+    constraint_velocity as constraint_velocity,
+    fixed_velocity_rate as fixed_velocity_rate,
+    full_jacobian as full_jacobian,
+    prescribed_velocity as prescribed_velocity,
 )
 from lgsens.dynamics._equilibrium import equilibrium as equilibrium
 from lgsens.dynamics._initial import (
@@ -13,6 +19,7 @@ from lgsens.dynamics._initial import (
     acceleration_and_jerk as acceleration_and_jerk,
     accelerations as accelerations,
     assemble as assemble,
+    consistent_velocity as consistent_velocity,
     given_way as given_way,
     initial_state as initial_state,
     is_redundant as is_redundant,

@@ -1,22 +1,22 @@
 """Accelerations and multipliers with a hand-derived derivative: one factorization for value, tangent and transpose.
 
-The equations of the motion through (q, v) at t, eq. (41),
+The equations of the motion through (q, v) at t, eq. (41), with J and γ of `_constraints`,
 
-    E(v̇, λ; z) = [ r(q, v, v̇, λ, t);  D²Φ(q)·(q ṽ, q ṽ) + DΦ(q)·(q v̇~) ] = 0,      z = (numbers of the system, q, v, t),
+    E(v̇, λ; z) = [ r(q, v, v̇, λ, t);  J v̇ + γ(q, v, t) ] = 0,      z = (numbers of the system, q, v, t),
 
-are linear in (v̇, λ) with the matrix A = [[M, Bᵀ], [B, 0]]. Differentiated at the solution,
+are linear in (v̇, λ) with the matrix A = [[M, Jᵀ], [J, 0]]. Differentiated at the solution,
 
     A [v̇'; λ'] = −E_z z',
 
 the right-hand side being the derivative of r and of the constraint at acceleration level for fixed v̇ and λ: vectors
-only, no derivative of M, B or Ḃ as a matrix. A is symmetric, so the transpose of the rule solves with A as well.
+only, no derivative of M, J or J̇ as a matrix. A is symmetric, so the transpose of the rule solves with A as well.
 
-M is constant. With N = M⁻¹, made once outside the time loop, and the Cholesky factors of the complement S = B N Bᵀ,
+M is constant. With N = M⁻¹, made once outside the time loop, and the Cholesky factors of the complement S = J N Jᵀ,
 
-    A [x; μ] = [f; c]:     S μ = B N f − c,     x = N (f − Bᵀ μ),
+    A [x; μ] = [f; c]:     S μ = J N f − c,     x = N (f − Jᵀ μ),
 
 m³/3 instead of 2 (k + m)³/3 operations: an eighteenth on the quarter-car (k = 48, m = 45). S is scaled to a unit
-diagonal, since the rows of B have different units. Where constraints may be redundant, ε is added to it, and the
+diagonal, since the rows of J have different units. Where constraints may be redundant, ε is added to it, and the
 solution refined (`_redundant`).
 """
 
@@ -30,6 +30,7 @@ import jax.scipy.linalg as jsl
 from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens.dynamics._constraints import constraint_acceleration, fixed_velocity_rate, full_jacobian
 from lgsens.dynamics._matrices import kkt_product
 from lgsens.dynamics._redundant import SOFTNESS, refined, softness
 from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem
@@ -54,7 +55,7 @@ class Inertia(eqx.Module):
 
 
 class ConstrainedInertia(eqx.Module):
-    """A = [[M, Bᵀ], [B, 0]] at one configuration, factorized."""
+    """A = [[M, Jᵀ], [J, 0]] at one configuration, factorized."""
 
     inertia: Inertia
     jacobian: Float[Array, "m k"]
@@ -62,15 +63,15 @@ class ConstrainedInertia(eqx.Module):
     scale: Float[Array, " m"]  # D
 
     @classmethod
-    def of(cls, inertia: Inertia, system: AbstractSystem, q) -> "ConstrainedInertia":
+    def of(cls, inertia: Inertia, system: AbstractSystem, q, t) -> "ConstrainedInertia":
         if inertia.blocks is None:
-            jacobian = system.constraint_jacobian(q)
+            jacobian = full_jacobian(system, q, t)
             fixed = lax.stop_gradient(jacobian)
             complement = fixed @ inertia.inverse @ fixed.T
         else:
             # S by bodies: a gradient of the reduced quarter-car in 40 steps takes 44 ms, with products of arrays 52
             assert isinstance(system, AbstractSparseSystem)
-            sparse = system.sparse_constraint_jacobian(q)
+            sparse = system.sparse_constraint_jacobian(q, t)
             jacobian, complement = sparse.dense(), lax.stop_gradient(sparse).congruence(inertia.blocks)
         scale = lax.rsqrt(jnp.diagonal(complement))
         unit = complement * scale[:, None] * scale[None, :]
@@ -89,7 +90,7 @@ class ConstrainedInertia(eqx.Module):
         return jnp.concatenate([free - inverse @ (mu @ jacobian), mu])
 
     def solve(self, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
-        """x and μ of A [x; μ] = [force; rate]; its own transpose, and differentiable through M and B."""
+        """x and μ of A [x; μ] = [force; rate]; its own transpose, and differentiable through M and J."""
         rhs = jnp.concatenate([force, rate])
         product = partial(kkt_product, self.inertia.mass, self.jacobian)
 
@@ -100,28 +101,15 @@ class ConstrainedInertia(eqx.Module):
         return solution[: force.shape[0]], solution[force.shape[0] :]
 
 
-def constraint_velocity(system: AbstractSystem, q, v) -> Float[Array, " m"]:
-    """dΦ/dt = DΦ·(q ṽ) = B v, without B."""
-    return jax.jvp(system.constraint, (q,), (system.group.to_ambient(q, v),))[1]
-
-
-def constraint_acceleration(system: AbstractSystem, q, v, vdot) -> Float[Array, " m"]:
-    """d²Φ/dt² = D²Φ·(q ṽ, q ṽ) + DΦ·(q v̇~) of the motion through (q, v) with the acceleration v̇."""
-    velocity = lambda q: constraint_velocity(system, q, v)
-    _, rate = jax.jvp(velocity, (q,), (system.group.to_ambient(q, v),))
-    return rate + constraint_velocity(system, q, vdot)
-
-
 def equations_of_motion(system: AbstractSystem, q, v, vdot, lam, t):
     """E, two vectors of shape (k,) and (m,): eq. (25), and the constraint at acceleration level."""
-    return system.residual(q, v, vdot, lam, t), constraint_acceleration(system, q, v, vdot)
+    return system.residual(q, v, vdot, lam, t), constraint_acceleration(system, q, v, vdot, t)
 
 
 def _solved(inertia: Inertia, system: AbstractSystem, q, v, t):
-    kkt = ConstrainedInertia.of(inertia, system, q)
-    free = jnp.zeros_like(v), jnp.zeros(kkt.jacobian.shape[0], v.dtype)
-    left = equations_of_motion(system, q, v, *free, t)
-    return kkt.solve(*jax.tree.map(jnp.negative, left)), kkt
+    kkt = ConstrainedInertia.of(inertia, system, q, t)
+    force = system.residual(q, v, jnp.zeros_like(v), jnp.zeros(kkt.jacobian.shape[0], v.dtype), t)
+    return kkt.solve(-force, -fixed_velocity_rate(system, q, v, t)), kkt
 
 
 @jax.custom_jvp

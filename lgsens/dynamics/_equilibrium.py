@@ -1,4 +1,9 @@
-"""Static equilibrium: r(q, 0, 0, λ, t) = 0 and Φ(q) = 0."""
+"""Static equilibrium: r(q, 0, 0, λ, t) = 0, Φ(q, t) = 0 and b(q, t) = 0, drivers held where they are at t.
+
+Rows of velocity level hold at rest wherever the mechanism is, if b = 0; their λ_v may carry load. So there are m_v
+equations less than unknowns (a wheel on springs may rest wherever it was rolled to), and in place of each the equation
+0 = 0, which leaves the shortest solution. b ≠ 0 forbids rest.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +21,7 @@ _MAX_ITERATIONS = 60
 def equilibrium(system: AbstractSystem, t) -> Initial:
     """The static equilibrium near the reference configuration, as an initial state at rest.
 
-    Newton's iteration on x and λ in q = q_ref exp(x̃), with the matrix [[K_t T, Bᵀ], [B T, 0]] at v = 0. A mechanism
+    Newton's iteration on x and λ in q = q_ref exp(x̃), with the matrix [[K_t T, Jᵀ], [B T, 0]] at v = 0. A mechanism
     may turn freely about some axis (a wheel on its hinge): the step and the derivative are the shortest
     that solve the equations, found through the pseudo-inverse. The derivative is that of the implicit
     function theorem; it does not pass through the iteration.
@@ -24,7 +29,7 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
     group = system.group
     q_ref, v_ref = system.reference()
     k, m, dtype = v_ref.shape[0], len(system.constraint_names), v_ref.dtype
-    zero = jnp.zeros_like(v_ref)
+    zero, unsaid = jnp.zeros_like(v_ref), jnp.zeros(system.num_velocity_rows, dtype)
     scale = lax.stop_gradient(system.coordinate_scale())
     weight = mass_scale(system.mass_matrix())
     eps = float(jnp.finfo(dtype).eps)
@@ -37,7 +42,7 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
         x, lam = split(z)
         q = group.retract(q_ref, x)
         force = system.residual(q, zero, zero, lam, t)
-        return jnp.concatenate([force * scale / weight, system.constraint(q)])
+        return jnp.concatenate([force * scale / weight, system.constraint(q, t), unsaid])
 
     def matrix(z):
         x, lam = split(z)
@@ -45,7 +50,10 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
         by_x = jax.vmap(lambda row: group.tangent_rmv(x, row))
         jacobian = tangents.constraint_jacobian
         upper = jnp.concatenate([by_x(tangents.stiffness) * scale[None, :], jacobian.T * weight], axis=1)
-        lower = jnp.concatenate([by_x(jacobian) * scale[None, :], jnp.zeros((m, m), dtype)], axis=1)
+        positions = by_x(jacobian) * scale[None, :]
+        if unsaid.size:
+            positions = positions.at[-unsaid.size :].set(0.0)
+        lower = jnp.concatenate([positions, jnp.zeros((m, m), dtype)], axis=1)
         return jnp.concatenate([upper * (scale / weight)[:, None], lower], axis=0)
 
     def newton(equation, z):
@@ -73,7 +81,7 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
     x, lam = split(z)
     state = State(q=group.retract(q_ref, x), v=zero, vdot=zero, lam=lam, a=zero)
     # Forces balance to √eps of the largest joint force or moment, taken as mass scale × 1 m/s² at least.
-    left = jnp.max(jnp.abs(equation(z)))
+    left = jnp.max(jnp.abs(jnp.concatenate([equation(z), system.velocity_constraint(state.q, zero, t)])))
     balanced = left <= jnp.sqrt(eps) * (1.0 + jnp.max(jnp.abs(z[k:]), initial=0.0))
     result = jnp.where(balanced, RESULTS.successful, RESULTS.equilibrium_failed).astype(jnp.int32)
-    return Initial(state, zero, result, system.constraint(state.q))
+    return Initial(state, zero, result, system.constraint(state.q, t))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from lgsens.dynamics._constraints import fixed_velocity_rate, prescribed_velocity
 from lgsens.dynamics._matrices import ConstrainedMass, constraint_jacobian, factorized, for_once
 from lgsens.dynamics._redundant import softness
 from lgsens.dynamics._results import RESULTS
@@ -24,42 +25,48 @@ class Initial(NamedTuple):
     state: State
     jerk: Float[Array, " k"]  # v̈ at the initial time
     result: Int[Array, ""]  # a value of RESULTS
-    violation: Float[Array, " m"]  # Φ after assembly
+    violation: Float[Array, " m_p"]  # Φ after assembly
     factors: Factors | None = None  # of `ConstrainedMass` there
 
 
 def split_velocity(
-    system: AbstractSystem, q, v, factors: Factors | None = None
+    system: AbstractSystem, q, v, t, factors: Factors | None = None
 ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-    """v as the sum of what the constraints allow and what they do not, M-orthogonal to each other.
+    """A change of velocity as the sum of what the constraints allow and what they do not, M-orthogonal to each other.
 
-    [[M, Bᵀ], [B, 0]] [v_tangential; μ] = [M v; 0]
+    [[M, Jᵀ], [J, 0]] [v_tangential; μ] = [M v; 0]
     """
-    kkt = ConstrainedMass.of(system, q, factors)
+    kkt = ConstrainedMass.of(system, q, t, factors)
     tangential, _ = kkt.solve(kkt.mass @ v, jnp.zeros(kkt.jacobian.shape[0], v.dtype))
     return tangential, v - tangential
 
 
-def given_way(system: AbstractSystem, q, lam) -> Float[Array, " k"] | None:
+def consistent_velocity(system: AbstractSystem, q, v, t, factors: Factors | None = None) -> Float[Array, " k"]:
+    """What an impulse through the joints and drivers makes of v: M (x − v) + Jᵀμ = 0, J x + c(q, 0, t) = 0."""
+    kkt = ConstrainedMass.of(system, q, t, factors)
+    return kkt.solve(kkt.mass @ v, -prescribed_velocity(system, q, t))[0]
+
+
+def given_way(system: AbstractSystem, q, lam, t) -> Float[Array, " k"] | None:
     """The least displacement, in the metric of M, with Φ = c λ: what joints of a `softness` c give way under λ."""
     soft = softness(system)
     if soft is None:
         return None
-    return ConstrainedMass.of(system, q).solve(jnp.zeros(system.group.dim, lam.dtype), soft * lam)[0]
+    gap = soft * lam
+    if system.num_velocity_rows:  # which say nothing of positions
+        gap = gap.at[-system.num_velocity_rows :].set(0.0)
+    return ConstrainedMass.of(system, q, t).solve(jnp.zeros(system.group.dim, lam.dtype), gap)[0]
 
 
 def accelerations(system: AbstractSystem, q, v, t, factors: Factors | None = None):
     """v̇ and λ of the motion through (q, v) at time t, eq. (41).
 
-    M v̇ + Bᵀλ = ad(v)ᵀ M v − f(q, v, t),     B v̇ = −Ḃ v = −D(B v)·(q ṽ)|_v
+    M v̇ + Jᵀλ = ad(v)ᵀ M v − f(q, v, t),     J v̇ = −γ(q, v, t)
     """
-    kkt = ConstrainedMass.of(system, q, factors)
+    kkt = ConstrainedMass.of(system, q, t, factors)
     zero, lam_zero = jnp.zeros_like(v), jnp.zeros(kkt.jacobian.shape[0], v.dtype)
-    # The derivative along q ṽ is taken in the arrays of q: differentiating retract(q, s v) at s = 0 gives the same
-    # numbers, and compiles the derivatives of exp, which took half of the compile time.
-    _, rate = jax.jvp(lambda q: constraint_jacobian(system, q) @ v, (q,), (system.group.to_ambient(q, v),))
     force = -system.residual(q, v, zero, lam_zero, t)
-    return kkt.solve(force, -rate)
+    return kkt.solve(force, -fixed_velocity_rate(system, q, v, t))
 
 
 def acceleration_and_jerk(system: AbstractSystem, q, v, t, factors: Factors | None = None):
@@ -69,17 +76,17 @@ def acceleration_and_jerk(system: AbstractSystem, q, v, t, factors: Factors | No
     return vdot, lam, derivative(system.group.to_ambient(q, v), vdot, jnp.ones_like(t))[0]
 
 
-def assemble(system: AbstractSystem):
-    """The configuration closest to the reference that satisfies Φ(q) = 0, and its last violation.
+def assemble(system: AbstractSystem, t):
+    """The configuration closest to the reference that satisfies Φ(q, t) = 0, and its last violation.
 
     q = q_ref exp((N μ)~) with N = M⁻¹B(q_ref)ᵀ: the motion that an impulse along the constraint directions
-    would give. The m equations Φ(q) = 0 determine μ; the implicit function theorem, its derivative.
+    would give. The m_p equations Φ = 0 determine μ; the implicit function theorem, its derivative.
     """
     q_ref, v_ref = system.reference()
-    if system.assembled or not system.constraint_names:
-        return q_ref, system.constraint(q_ref)
+    if system.assembled or len(system.constraint_names) == system.num_velocity_rows:
+        return q_ref, system.constraint(q_ref, t)
     group, mass = system.group, system.mass_matrix()
-    jacobian = system.constraint_jacobian(q_ref)
+    jacobian = system.constraint_jacobian(q_ref, t)
     normal = jnp.linalg.solve(mass, jacobian.T)
     scale = system.coordinate_scale()
     tolerance = 16 * jnp.finfo(v_ref.dtype).eps
@@ -94,7 +101,7 @@ def assemble(system: AbstractSystem):
             mu, _, iteration = carry
             x = normal @ mu
             q = group.retract(q_ref, x)
-            slope = jax.vmap(lambda row: group.tangent_rmv(x, row))(system.constraint_jacobian(q)) @ normal
+            slope = jax.vmap(lambda row: group.tangent_rmv(x, row))(system.constraint_jacobian(q, t)) @ normal
             step = solve(slope, equation(mu))
             # Far from assembly a full step may leave the branch: at most a fifth of the scene at a time.
             size = jnp.max(jnp.abs(normal @ step) / scale)
@@ -112,13 +119,13 @@ def assemble(system: AbstractSystem):
         return solve(jax.jacfwd(linear)(jnp.zeros_like(rhs)), rhs)
 
     mu = lax.custom_root(
-        lambda mu: system.constraint(place(mu)),
+        lambda mu: system.constraint(place(mu), t),
         jnp.zeros(jacobian.shape[0], v_ref.dtype),
         newton,
         tangent_solve,
     )
     q = place(mu)
-    return q, system.constraint(q)
+    return q, system.constraint(q, t)
 
 
 def _shortest(matrix, rhs):
@@ -156,17 +163,17 @@ def is_redundant(system: AbstractSystem, jacobian: Matrix) -> Bool[Array, ""]:
 def initial_state(system: AbstractSystem, t) -> Initial:
     """q, v, v̇, λ consistent with the constraints at position, velocity and acceleration level; a = v̇.
 
-    Velocities are projected with the metric of kinetic energy, M (v − v_ref) + Bᵀμ = 0 and B v = 0: what an
-    impulse through the joints leaves of v_ref.
+    Velocities are projected with the metric of kinetic energy (`consistent_velocity`): what an impulse through the
+    joints leaves of v_ref, and what the rates of drivers add.
     """
-    q, violation = assemble(system)
+    q, violation = assemble(system, t)
     _, v_ref = system.reference()
-    factors = ConstrainedMass.of(system, q).factors
-    v, _ = split_velocity(system, q, v_ref, factors)
+    factors = ConstrainedMass.of(system, q, t).factors
+    v = consistent_velocity(system, q, v_ref, t, factors)
     vdot, lam, vddot = acceleration_and_jerk(system, q, v, t, factors)
     state = State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
     dtype = v.dtype
-    redundant = softness(system) is None and is_redundant(system, constraint_jacobian(system, q))
+    redundant = softness(system) is None and is_redundant(system, constraint_jacobian(system, q, t))
     length = jnp.max(system.coordinate_scale())
     largest = jnp.max(jnp.abs(violation), initial=0.0)
     assembled = largest <= 1e3 * jnp.finfo(dtype).eps * jnp.maximum(length, 1.0)  # NaN is not assembled

@@ -1,9 +1,10 @@
 """Kinematic analysis: the positions, velocities and accelerations that constraints alone determine, and their forces.
 
-A driven mechanism has as many equations as coordinates, Φ(q, s; p) = 0 with the driven values s and the numbers p of
-the system. Where A = B(q) is regular, it has one solution q(s; p) nearby (Haug 1989, §3.6).
+A driven mechanism has as many equations as coordinates, Φ(q, s, t; p) = 0 with the driven values s, the time t and the
+numbers p of the system. Where A = B(q, t) is regular, it has one solution q(s, t; p) nearby (Haug 1989, §3.6). What is
+said of s below includes t.
 
-Position. Newton's iteration on the group, q ← q exp(−(A⁻¹Φ)~), from one value of s to the next.
+Position. Newton's iteration on the group, q ← q exp(−(A⁻¹Φ)~), from one s to the next.
 
 Derivatives of the position. Let δq = q w̃. By the chain rule, with DΦ·(q w̃) = A w,
 
@@ -13,8 +14,8 @@ One factorization of A at the solution gives w for every δs and δp: in forward
 parameter, in reverse mode, by the transposed factors, μ = A⁻ᵀ q̄ and p̄ = −Φ_pᵀ μ, one per output. Φ_s δs + Φ_p δp is the
 tangent of Φ at fixed q: nothing is differentiated along the iteration, nor by where it started.
 
-Velocity and acceleration. With s moving at constant rates ṡ, two derivatives of Φ(q(s), s) = 0 along the motion
-(q ṽ, ṡ) are
+Velocity and acceleration. With s moving at constant rates ṡ (of t 1, or 0 where signals are held), two derivatives of
+Φ(q(s), s) = 0 along the motion (q ṽ, ṡ) are
 
     A v + Φ_s ṡ = 0,     A v̇ + Γ = 0,     Γ = d/dt (DΦ·(q ṽ) + Φ_s ṡ) at fixed v.
 
@@ -54,13 +55,13 @@ class Positions(NamedTuple):
     violation: Float[Array, "n k"]  # Φ there
 
 
-def _newton(drive: AbstractDrive, q, values):
-    """The configuration for some values, from another one, and the size of the step before the last."""
+def _newton(drive: AbstractDrive, q, values, t):
+    """The configuration for some values and t, from another one, and the size of the step before the last."""
     system = drive.at(values)
     scale = drive.system.coordinate_scale()
 
     def step(q):
-        return jnp.linalg.solve(system.constraint_jacobian(q), system.constraint(q))
+        return jnp.linalg.solve(system.constraint_jacobian(q, t), system.constraint(q, t))
 
     def body(carry):
         q, _, iteration = carry
@@ -83,33 +84,35 @@ def _small(size):
 
 
 @jax.custom_jvp
-def _configurations(drive: AbstractDrive, values: Float[Array, "n d"]):
-    """q(s) for each row of `values`, found one from the other, the first from the reference; and Newton's step."""
+def _configurations(drive: AbstractDrive, values: Float[Array, "n d"], t: Float[Array, " n"]):
+    """q(s, t) for each row of `values`, found one from the other, the first from the reference; and Newton's step."""
 
     def follow(start, row):
-        q, size = _newton(drive, start, row)
+        q, size = _newton(drive, start, *row)
         return jax.tree.map(lambda new, old: jnp.where(_small(size), new, old), q, start), (q, size)
 
-    return lax.scan(follow, drive.system.reference()[0], values)[1]
+    return lax.scan(follow, drive.system.reference()[0], (values, t))[1]
 
 
 @_configurations.defjvp
 def _configurations_jvp(primals, tangents):
-    (drive, values), (drive_dot, values_dot) = primals, tangents
-    q, size = _configurations(drive, values)
+    drive, *given = primals
+    q, size = _configurations(drive, *given)
 
     def tangent(q, row, row_dot):
-        _, violation_dot = jax.jvp(lambda d, s: d.at(s).constraint(q), (drive, row), (drive_dot, row_dot))
-        w = -jnp.linalg.solve(drive.at(row).constraint_jacobian(q), violation_dot)
+        violation = lambda drive, s, t: drive.at(s).constraint(q, t)
+        _, violation_dot = jax.jvp(violation, (drive, *row), (tangents[0], *row_dot))
+        w = -jnp.linalg.solve(drive.at(row[0]).constraint_jacobian(q, row[1]), violation_dot)
         return drive.system.group.to_ambient(q, w)
 
-    return (q, size), (jax.vmap(tangent)(q, values, values_dot), jnp.zeros_like(size))
+    return (q, size), (jax.vmap(tangent)(q, given, list(tangents[1:])), jnp.zeros_like(size))
 
 
-def positions(drive: AbstractDrive, values: Float[Array, "n d"]) -> Positions:
-    """The configurations for each row of driven values, differentiable by the rule above; NaN where none was found."""
-    q, size = _configurations(drive, values)
-    violation = jax.vmap(lambda q, s: drive.at(s).constraint(q))(q, values)
+def positions(drive: AbstractDrive, values: Float[Array, "n d"], t: Float[Array, " n"]) -> Positions:
+    """The configurations for each row of driven values and times, differentiable by the rule above; NaN where none was
+    found."""
+    q, size = _configurations(drive, values, t)
+    violation = jax.vmap(lambda q, s, t: drive.at(s).constraint(q, t))(q, values, t)
     length = jnp.maximum(jnp.max(drive.system.coordinate_scale()), 1.0)
     satisfied = jnp.max(jnp.abs(violation), axis=1) <= 1e3 * jnp.finfo(size.dtype).eps * length  # NaN is not
     found = _small(size) & satisfied
@@ -117,20 +120,21 @@ def positions(drive: AbstractDrive, values: Float[Array, "n d"]) -> Positions:
     return Positions(jax.tree.map(poison, q), found, violation)
 
 
-def forces_of_motion(drive: AbstractDrive, q, values: Float[Array, " d"], rates: Float[Array, " d"], t) -> State:
-    """v, v̇ and λ of the motion through q with constant rates of the driven values; a = v̇."""
-    system, group = drive.at(values), drive.system.group
-    jacobian = system.constraint_jacobian(q)
-    at = lambda q, s: drive.at(s).constraint(q)
-    _, along = jax.jvp(lambda s: at(q, s), (values,), (rates,))
+def forces_of_motion(
+    drive: AbstractDrive, q, driven: tuple[Float[Array, " d"], Float[Array, ""]], rates: tuple[Array, Array]
+) -> State:
+    """v, v̇ and λ of the motion through q with constant rates of `driven`, values and time; a = v̇."""
+    (values, t), group = driven, drive.system.group
+    system = drive.at(values)
+    jacobian = system.constraint_jacobian(q, t)
+    at = lambda q, driven: drive.at(driven[0]).constraint(q, driven[1])
+    _, along = jax.jvp(lambda driven: at(q, driven), (driven,), (rates,))
     v = -jnp.linalg.solve(jacobian, along)
 
-    direction = (group.to_ambient(q, v), rates)
+    def rate(q, driven):
+        return jax.jvp(at, (q, driven), (group.to_ambient(q, v), rates))[1]
 
-    def rate(q, s):
-        return jax.jvp(at, (q, s), (group.to_ambient(q, v), rates))[1]
-
-    _, change = jax.jvp(rate, (q, values), direction)
+    _, change = jax.jvp(rate, (q, driven), (group.to_ambient(q, v), rates))
     vdot = -jnp.linalg.solve(jacobian, change)
     lam = -jnp.linalg.solve(jacobian.T, system.residual(q, v, vdot, jnp.zeros_like(v), t))
     return State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)

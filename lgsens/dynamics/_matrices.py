@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens.dynamics._constraints import full_jacobian
 from lgsens.dynamics._redundant import refined, softness
 from lgsens.dynamics._state import Tangents
 from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem
@@ -28,14 +29,14 @@ def mass_matrix(system: AbstractSystem) -> Matrix:
     return system.mass_matrix() if sparse is None else sparse.sparse_mass_matrix()
 
 
-def constraint_jacobian(system: AbstractSystem, q) -> Matrix:
-    """B."""
+def constraint_jacobian(system: AbstractSystem, q, t) -> Matrix:
+    """J = [B; A]."""
     sparse = _sparse(system)
-    return system.constraint_jacobian(q) if sparse is None else sparse.sparse_constraint_jacobian(q)
+    return full_jacobian(system, q, t) if sparse is None else sparse.sparse_constraint_jacobian(q, t)
 
 
 def tangents(system: AbstractSystem, q, v, vdot, lam, t) -> Tangents:
-    """K_t, C_t and B."""
+    """K_t, C_t and J."""
     sparse = _sparse(system)
     return (system.tangents if sparse is None else sparse.sparse_tangents)(q, v, vdot, lam, t)
 
@@ -110,7 +111,7 @@ def kkt_product(mass: Matrix, jacobian: Matrix, unknown) -> Float[Array, " k+m"]
 
 
 class ConstrainedMass(eqx.Module):
-    """[[M, Bᵀ], [B, 0]]."""
+    """[[M, Jᵀ], [J, 0]]."""
 
     mass: Matrix
     jacobian: Matrix
@@ -118,9 +119,9 @@ class ConstrainedMass(eqx.Module):
     soft: bool = eqx.field(static=True)  # whether they are those of K_c (`_redundant`)
 
     @classmethod
-    def of(cls, system: AbstractSystem, q, factors: Factors | None = None) -> "ConstrainedMass":
+    def of(cls, system: AbstractSystem, q, t, factors: Factors | None = None) -> "ConstrainedMass":
         """`factors`: those at q, if they are known: to compile them is most of what this costs."""
-        mass, jacobian = mass_matrix(system), constraint_jacobian(system, q)
+        mass, jacobian = mass_matrix(system), constraint_jacobian(system, q, t)
         soft = softness(system)
         if factors is not None or (_sparse(system) is None and soft is None):
             return cls(mass, jacobian, factors, soft is not None)
@@ -129,7 +130,7 @@ class ConstrainedMass(eqx.Module):
         return cls(mass, jacobian, factors, soft is not None)
 
     def solve(self, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
-        """x and μ of M x + Bᵀμ = force, B x = rate; differentiable through M and B, by one more solve."""
+        """x and μ of M x + Jᵀμ = force, J x = rate; differentiable through M and J, by one more solve."""
         factors, k = self.factors, force.shape[0]
         if factors is None:
             return kkt_solve(self.mass, self.jacobian, force, rate)

@@ -43,6 +43,7 @@ import jax.scipy.linalg as jsl
 from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens.dynamics._constraints import full_jacobian
 from lgsens.dynamics._system import AbstractSystem
 
 SOFTNESS = 1e-7  # ε
@@ -84,14 +85,14 @@ def refined(product: Callable, solve: Callable, rhs):
 
 
 @partial(jax.jit, inline=True)  # one program where it is not called inside another
-def least_norm(system: AbstractSystem, q, lam: Float[Array, " m"]) -> Float[Array, " m"]:
+def least_norm(system: AbstractSystem, q, lam: Float[Array, " m"], t) -> Float[Array, " m"]:
     """The multipliers of least Σ d_i λ_i² with the same Bᵀλ, at one instant; λ itself if none may be redundant."""
     compliance = system.compliance if isinstance(system, AbstractRedundantSystem) else None
     if compliance is None:
         return lam
     root = jnp.sqrt(compliance)
     # Any metric of the coordinates gives the same projection; this one makes them comparable.
-    rows = system.constraint_jacobian(q) * lax.stop_gradient(system.coordinate_scale())[None, :] / root[:, None]
+    rows = full_jacobian(system, q, t) * lax.stop_gradient(system.coordinate_scale())[None, :] / root[:, None]
     normal = rows @ rows.T
     shift = _REGULARIZATION * lax.stop_gradient(jnp.trace(normal) / len(root))
     factor = jnp.linalg.cholesky(normal + shift * jnp.eye(len(root), dtype=lam.dtype), symmetrize_input=False)

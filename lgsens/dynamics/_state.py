@@ -40,4 +40,4 @@ class Tangents(NamedTuple):
 
     stiffness: Matrix  # K_t, (k, k)
     damping: Matrix  # C_t, (k, k)
-    constraint_jacobian: Matrix  # B, (m, k)
+    constraint_jacobian: Matrix  # B, (m, k); with rows of velocity level [B; A]

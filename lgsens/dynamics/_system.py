@@ -17,10 +17,11 @@ class AbstractSystem(eqx.Module):
     """A constrained mechanical system on a matrix Lie group G.
 
         q̇ = q ṽ
-        r(q, v, v̇, λ, t) = M v̇ − ad(v)ᵀ M v + f(q, v, t) + B(q)ᵀ λ = 0
-        Φ(q) = 0
+        r(q, v, v̇, λ, t) = M v̇ − ad(v)ᵀ M v + f(q, v, t) + Bᵀλ = 0
+        Φ(q, t) = 0,     A(q, t) v + b(q, t) = 0
 
-    The integrator, the sensitivities and the initial state know this interface only, so a
+    with B(q, t) the gradient of Φ, λ = [λ_p; λ_v] and Bᵀλ_p + Aᵀλ_v for Bᵀλ where rows of velocity level are given
+    (`num_velocity_rows`). The integrator, the sensitivities and the initial state know this interface only, so a
     subclass on any group has all of them. Every number that the motion depends on is a float
     leaf of the module; everything else is static.
 
@@ -40,7 +41,7 @@ class AbstractSystem(eqx.Module):
     @property
     @abc.abstractmethod
     def constraint_names(self) -> tuple[str, ...]:
-        """A name for each of the m constraint equations, used in messages."""
+        """A name for each of the m constraint equations, used in messages; position level first."""
 
     @abc.abstractmethod
     def reference(self) -> tuple[Any, Float[Array, " k"]]:
@@ -59,16 +60,29 @@ class AbstractSystem(eqx.Module):
         """The residual r of the dynamic equilibrium, eq. (16)."""
 
     @abc.abstractmethod
-    def constraint(self, q) -> Float[Array, " m"]:
-        """The constraint Φ(q), eq. (17)."""
+    def constraint(self, q, t) -> Float[Array, " m_p"]:
+        """The constraint Φ(q, t), eq. (17)."""
 
     @abc.abstractmethod
-    def constraint_jacobian(self, q) -> Float[Array, "m k"]:
+    def constraint_jacobian(self, q, t) -> Float[Array, "m_p k"]:
         """The constraint gradient B with DΦ·(q w̃) = B w."""
 
     @abc.abstractmethod
     def tangents(self, q, v, vdot, lam, t) -> Tangents:
-        """The exact tangents K_t, C_t and B. `autodiff_tangents` is a ready implementation."""
+        """The exact tangents K_t, C_t and J = [B; A]. `autodiff_tangents` is a ready implementation."""
+
+    @property
+    def num_velocity_rows(self) -> int:
+        """m_v: how many rows A v + b = 0 have velocity level only (nonholonomic constraints)."""
+        return 0
+
+    def velocity_constraint(self, q, v, t) -> Float[Array, " m_v"]:
+        """A(q, t) v + b(q, t)."""
+        return jnp.zeros_like(v, shape=0)
+
+    def velocity_jacobian(self, q, t) -> Float[Array, "m_v k"]:
+        """A(q, t)."""
+        return jnp.zeros_like(self.reference()[1], shape=(0, self.group.dim))
 
 
 class AbstractSparseSystem(AbstractSystem):
@@ -93,12 +107,12 @@ class AbstractSparseSystem(AbstractSystem):
         """M, shape (k, k)."""
 
     @abc.abstractmethod
-    def sparse_constraint_jacobian(self, q) -> SparseMatrix:
-        """B, shape (m, k), columns by bodies."""
+    def sparse_constraint_jacobian(self, q, t) -> SparseMatrix:
+        """J = [B; A], shape (m, k), columns by bodies."""
 
     @abc.abstractmethod
     def sparse_tangents(self, q, v, vdot, lam, t) -> Tangents:
-        """K_t, C_t and B; the columns of K_t and B by bodies."""
+        """K_t, C_t and J; the columns of K_t and J by bodies."""
 
     @abc.abstractmethod
     def body_blocks(self, matrix: Float[Array, "k k"]) -> Float[Array, "N 6 6"]:
@@ -115,7 +129,7 @@ class AbstractSparseSystem(AbstractSystem):
 
 
 def autodiff_tangents(system: AbstractSystem, q, v, vdot, lam, t) -> Tangents:
-    """K_t, C_t and B of a system by forward-mode autodiff of its residual and constraint.
+    """K_t, C_t and J of a system by forward-mode autodiff of its residual and constraint.
 
     K_t w = D_q r · (q w̃), the derivative of r(q exp(w̃ s)) at s = 0; C_t = ∂r/∂v.
     For systems without hand-derived tangents, and the reference for those that have them.
@@ -123,10 +137,13 @@ def autodiff_tangents(system: AbstractSystem, q, v, vdot, lam, t) -> Tangents:
     zero = jnp.zeros_like(v)
     k = jax.jacfwd(lambda w: system.residual(system.group.retract(q, w), v, vdot, lam, t))(zero)
     c = jax.jacfwd(lambda v: system.residual(q, v, vdot, lam, t))(v)
-    return Tangents(k, c, autodiff_constraint_jacobian(system, q))
+    jacobian = autodiff_constraint_jacobian(system, q, t)
+    if system.num_velocity_rows:
+        jacobian = jnp.concatenate([jacobian, system.velocity_jacobian(q, t)])
+    return Tangents(k, c, jacobian)
 
 
-def autodiff_constraint_jacobian(system: AbstractSystem, q) -> Float[Array, "m k"]:
+def autodiff_constraint_jacobian(system: AbstractSystem, q, t) -> Float[Array, "m_p k"]:
     """B of a system by forward-mode autodiff of its constraint, B w = DΦ·(q w̃)."""
     _, v = system.reference()
-    return jax.jacfwd(lambda w: system.constraint(system.group.retract(q, w)))(jnp.zeros_like(v))
+    return jax.jacfwd(lambda w: system.constraint(system.group.retract(q, w), t))(jnp.zeros_like(v))

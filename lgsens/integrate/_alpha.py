@@ -16,6 +16,7 @@ class AbstractAlpha(AbstractScheme):
     """
 
     rho_inf: eqx.AbstractVar[float]
+    stabilized: eqx.AbstractVar[bool]
     factor_every: eqx.AbstractVar[int]
     iterations: eqx.AbstractVar[int | None]
 

@@ -95,17 +95,7 @@ class AbstractEquations(eqx.Module):
 
     @staticmethod
     @abc.abstractmethod
-    def complete(state: State) -> State:
-        """A state with the multipliers of these equations."""
-
-    @staticmethod
-    @abc.abstractmethod
-    def physical(states: State) -> State:
-        """A state, or stacked ones, with the multipliers of the constraints only."""
-
-    @staticmethod
-    @abc.abstractmethod
-    def numbers(system: AbstractSystem) -> int:
+    def numbers(scheme: AbstractAlpha, system: AbstractSystem) -> int:
         """How many numbers the factors of a step are."""
 
     @abc.abstractmethod
@@ -118,7 +108,7 @@ class AbstractEquations(eqx.Module):
         """Of a step."""
 
     @abc.abstractmethod
-    def step(self, previous: State, h) -> AbstractStep:
+    def step(self, previous: State, node: Node) -> AbstractStep:
         """The equations of the step from `previous`."""
 
     @abc.abstractmethod
@@ -126,7 +116,7 @@ class AbstractEquations(eqx.Module):
         """Their exact linearization at a converged step."""
 
     @abc.abstractmethod
-    def margin(self, state: State) -> Float[Array, ""]:
+    def margin(self, state: State, t) -> Float[Array, ""]:
         """A margin (`_singular`) that can be compared with those of other step sizes."""
 
     def no_matrix(self, state: State, node: Node, factor_every: int, kind: Any = Inverse) -> Matrix | None:
@@ -134,6 +124,6 @@ class AbstractEquations(eqx.Module):
         if not factor_every:
             return None
         at_state = Motion(state.v, state.q, state.v, state.vdot)
-        factors = lambda: self.step(state, node.h).factors(at_state, state.lam, node.begin, kind)[0]
+        factors = lambda: self.step(state, node).factors(at_state, state.lam, node.begin, kind)[0]
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(factors))
         return Matrix(zeros, node.h, Wear.unused(), kind)

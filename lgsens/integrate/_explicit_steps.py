@@ -39,6 +39,7 @@ from lgsens.dynamics import (
     constraint_velocity,
     equations_of_motion,
     factorized_accelerations,
+    full_jacobian,
 )
 
 
@@ -120,16 +121,16 @@ def _with(first, rest):
     return jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), first, rest)
 
 
-def projection(inertia: Inertia, system: AbstractSystem, x, q, v) -> Projection:
+def projection(inertia: Inertia, system: AbstractSystem, x, q, v, t) -> Projection:
     """One step of Newton's iteration for q, then v, with one factorization."""
     if not system.constraint_names:
         none = jnp.zeros(0, v.dtype)
         return Projection(x, q, v, jnp.zeros_like(v), none, jnp.zeros_like(v), none, q)
-    kkt = ConstrainedInertia.of(inertia, system, q)
+    kkt = ConstrainedInertia.of(inertia, system, q, t)
     still = jnp.zeros_like(v)
-    y, mu = kkt.solve(still, -system.constraint(q))
+    y, mu = kkt.solve(still, -system.constraint(q, t))
     projected = system.group.retract(q, y)
-    d, nu = kkt.solve(still, -constraint_velocity(system, projected, v))
+    d, nu = kkt.solve(still, -constraint_velocity(system, projected, v, t))
     return Projection(x, q, v, y, mu, d, nu, projected)
 
 
@@ -150,7 +151,9 @@ def _step(scheme: Coefficients, numbers: Numbers, begin: State, n) -> Step:
     slopes = _slopes(count, (begin.v, begin.vdot))  # T(0) is the unit matrix
     slopes, stages = lax.scan(stage, slopes, _rows(scheme, h.dtype))
     x, dv = _weighted(h, jnp.asarray(scheme.b, h.dtype), slopes)
-    done = projection(numbers.inertia, system, x, system.group.retract(begin.q, x), begin.v + dv)
+    done = projection(
+        numbers.inertia, system, x, system.group.retract(begin.q, x), begin.v + dv, numbers.t0 + (n + 1) * h
+    )
     q, v = done.projected, done.v + done.d
     vdot, lam = factorized_accelerations(numbers.inertia, system, q, v, numbers.t0 + (n + 1) * h)
     return Step(_with(first, stages), done, State(q=q, v=v, vdot=vdot, lam=lam, a=vdot))
@@ -177,18 +180,18 @@ def _motion(system: AbstractSystem, q, v, vdot, lam, t):
     return jnp.concatenate(equations_of_motion(system, q, v, vdot, lam, t))
 
 
-def _product(mass, system: AbstractSystem, q, x, mu):
+def _product(mass, system: AbstractSystem, q, t, x, mu):
     """A [x; μ] at q."""
-    jacobian = system.constraint_jacobian(q)
+    jacobian = full_jacobian(system, q, t)
     return jnp.concatenate([mass @ x + mu @ jacobian, jacobian @ x])
 
 
-def _corrections(mass, system: AbstractSystem, q, projected, at: Projection):
+def _corrections(mass, system: AbstractSystem, q, t, projected, at: Projection):
     """P and R as functions of the numbers, of q* and of q⁺."""
     still = jnp.zeros_like(at.y)
-    p = _product(mass, system, q, at.y, at.mu) + jnp.concatenate([still, system.constraint(q)])
-    velocity = constraint_velocity(system, projected, at.v)
-    return p, _product(mass, system, q, at.d, at.nu) + jnp.concatenate([still, velocity])
+    p = _product(mass, system, q, t, at.y, at.mu) + jnp.concatenate([still, system.constraint(q, t)])
+    velocity = constraint_velocity(system, projected, at.v, t)
+    return p, _product(mass, system, q, t, at.d, at.nu) + jnp.concatenate([still, velocity])
 
 
 class _Linear(NamedTuple):
@@ -224,7 +227,7 @@ def _varied_step(scheme: Coefficients, numbers: Numbers, dnumbers: Numbers, begi
         _, equations = jax.linearize(lambda q, v: _motion(system, q, v, vdot, lam, t), q, v)
         of_numbers = lambda system, t: _motion(system, q, v, vdot, lam, t)
         _, load = jax.jvp(of_numbers, (system, t), (dnumbers.system, dt))
-        return _Linear(equations, ConstrainedInertia.of(inertia, system, q), load)
+        return _Linear(equations, ConstrainedInertia.of(inertia, system, q, t), load)
 
     def kinematics(x, v):
         return jax.linearize(partial(_kinematics, group), begin.q, x, v)[1]
@@ -255,13 +258,15 @@ def _varied_step(scheme: Coefficients, numbers: Numbers, dnumbers: Numbers, begi
     dx, dv = advanced(p.x, p.v, jnp.asarray(scheme.b, h.dtype), slopes)
     _, dq = jax.jvp(group.retract, (begin.q, p.x), (dbegin.q, dx))
     if system.constraint_names:
-        kkt = ConstrainedInertia.of(inertia, system, p.q)
-        of_first = lambda mass, system, q: _corrections(mass, system, q, p.projected, p)
-        variations = dnumbers.inertia.mass, dnumbers.system, dq
-        _, (change_p, change_r) = jax.jvp(of_first, (inertia.mass, system, p.q), variations)
+        t, dt = (z.t0 + (n + 1) * z.h for z in (numbers, dnumbers))
+        kkt = ConstrainedInertia.of(inertia, system, p.q, t)
+        of_first = lambda mass, system, q, t: _corrections(mass, system, q, t, p.projected, p)
+        variations = dnumbers.inertia.mass, dnumbers.system, dq, dt
+        _, (change_p, change_r) = jax.jvp(of_first, (inertia.mass, system, p.q, t), variations)
         dy, dmu = _solve(kkt, change_p)
         _, dprojected = jax.jvp(group.retract, (p.q, p.y), (dq, dy))
-        _, change = jax.jvp(partial(constraint_velocity, system), (p.projected, p.v), (dprojected, dv))
+        at_end = lambda q, v: constraint_velocity(system, q, v, t)
+        _, change = jax.jvp(at_end, (p.projected, p.v), (dprojected, dv))
         dd, dnu = _solve(kkt, change_r + jnp.concatenate([jnp.zeros_like(dv), change]))
     else:
         dy, dmu, dprojected, dd, dnu = jnp.zeros_like(p.y), p.mu, dq, jnp.zeros_like(p.d), p.nu

@@ -33,11 +33,11 @@ from lgsens.integrate._alpha import AbstractAlpha
 from lgsens.integrate._alpha_step import AbstractEquations, Matrix, Wear
 from lgsens.integrate._guess import Guess
 from lgsens.integrate._index3 import Index3
+from lgsens.integrate._levels import Levels
 from lgsens.integrate._newton import Chord, take_step
 from lgsens.integrate._pace import AbstractPace
 from lgsens.integrate._scheme import Start
 from lgsens.integrate._singular import Watch
-from lgsens.integrate._stabilized import Stabilized
 from lgsens.linear import LU, Inverse
 
 
@@ -132,12 +132,12 @@ class GeneralizedAlpha(AbstractAlpha):
     # What the scheme is for the march and the sweeps.
 
     def shared(self, system) -> AbstractEquations:
-        return self.shared_type.of(self, system)
+        return self._kind(system).of(self, system)
 
     def equations(self, system, node, previous, state):
-        return self.shared(system).step(previous, node.h).left(state, node.t)
+        return self.shared(system).step(previous, node).left(state, node.t)
 
-    def start(self, system, initial):
+    def start(self, system, initial, t0):
         """The starting values of the scheme; see `second_order_start`.
 
         With exact values, and a_n = v̇(t_n + Δ h), Δ = α_m − α_f, the increment (27) misses the true one by h³ c
@@ -154,14 +154,19 @@ class GeneralizedAlpha(AbstractAlpha):
         if self.stabilized:
             return Start(state, a_1=a_1)
         missed = self.missed_increment(system, state.v, state.vdot, initial.jerk)
-        _, normal = split_velocity(system, state.q, missed, initial.factors)
-        return Start(state, q_2=given_way(system, state.q, self.beta * state.lam), v_2=normal, a_1=a_1)
+        _, normal = split_velocity(system, state.q, missed, t0, initial.factors)
+        return Start(state, q_2=given_way(system, state.q, self.beta * state.lam, t0), v_2=normal, a_1=a_1)
 
     def complete(self, system, state):
-        return self.shared_type.complete(state)
+        if not self.stabilized:
+            return state
+        rows = len(system.constraint_names) - system.num_velocity_rows
+        return dataclasses.replace(state, lam=jnp.concatenate([state.lam, jnp.zeros_like(state.lam[:rows])]))
 
-    def physical(self, states):
-        return self.shared_type.physical(states)
+    def physical(self, system, states):
+        if not self.stabilized:
+            return states
+        return dataclasses.replace(states, lam=states.lam[..., : len(system.constraint_names)])
 
     def resized(self, vdot, a, ratio):
         """Along the line through v̇_n at t_n and a_n at t_n + Δ h_n, (eq. 29 is of second order for that alone)
@@ -212,14 +217,14 @@ class GeneralizedAlpha(AbstractAlpha):
         weights = pace.weights(h, self.alpha_m - self.alpha_f), pace.weights(h, 0.0)
         chord = None if matrix is None else Chord(matrix.solver, self._due(memory, shared, node), matrix.kind)
         state, guess, stats, chord = take_step(
-            self, shared.step(begun, h), shared.scale, before, memory.guess, weights, chord, running, t, h
+            self, shared.step(begun, node), shared.scale, before, memory.guess, weights, chord, running, t, h
         )
         watch, watched = memory.watch, memory.watched
         if chord is None:
-            stats = stats._replace(margin=pace.margin(True, stats.margin, lambda: shared.margin(state)))
+            stats = stats._replace(margin=pace.margin(True, stats.margin, lambda: shared.margin(state, t)))
         else:
             made = chord.due
-            stats = stats._replace(margin=pace.margin(made, stats.margin, lambda: shared.margin(state)))
+            stats = stats._replace(margin=pace.margin(made, stats.margin, lambda: shared.margin(state, t)))
             watch = jax.tree.map(partial(jnp.where, made), watch.after(stats.margin, t - watched), watch)
             watched = jnp.where(made, t, watched)
             wear = matrix.wear.after(made, stats.iterations)
@@ -235,7 +240,7 @@ class GeneralizedAlpha(AbstractAlpha):
         return due if self.iterations is not None else due | matrix.wear.out(shared.unknowns)
 
     def numbers(self, system):
-        return self.shared_type.numbers(system)
+        return self._kind(system).numbers(self, system)
 
     def loads(self, shared, previous, state):
         return shared.loads(previous, state)
@@ -247,7 +252,6 @@ class GeneralizedAlpha(AbstractAlpha):
         """Full Newton, which alone converges as fast in its derivative as in its value."""
         return dataclasses.replace(self, factor_every=0)
 
-    @property
-    def shared_type(self) -> type[AbstractEquations]:
-        """The equations of a step."""
-        return Stabilized if self.stabilized else Index3
+    def _kind(self, system) -> type[AbstractEquations]:
+        """The equations of a step: those of index 3, or those with rows of velocity level."""
+        return Levels if self.stabilized or system.num_velocity_rows else Index3

@@ -103,7 +103,7 @@ class Index3Step(AbstractStep):
         residual = system.residual(motion.q, motion.v, motion.vdot, lam, t)
         # Φ is zero at the solution, up to round-off that h' would multiply by 1/h³
         h = lax.stop_gradient(h) if softness is None else h
-        violation = system.constraint(motion.q) / (self.shared.scheme.beta * h**2)
+        violation = system.constraint(motion.q, t) / (self.shared.scheme.beta * h**2)
         return residual, violation if softness is None else violation - softness * lam
 
     def factors(self, motion, lam, t, kind=LU):
@@ -204,15 +204,7 @@ class Index3(AbstractEquations):
         return cls(scheme, system, mass_matrix(system), system.coordinate_scale(), softness(system))
 
     @staticmethod
-    def complete(state):
-        return state
-
-    @staticmethod
-    def physical(states):
-        return states
-
-    @staticmethod
-    def numbers(system):
+    def numbers(scheme, system):
         return factor_size(system)
 
     def loads(self, previous, state):
@@ -220,7 +212,7 @@ class Index3(AbstractEquations):
 
         def function(system, node):
             h = node.h
-            violation = system.constraint(state.q)
+            violation = system.constraint(state.q, node.t)
             if self.softness is not None:
                 violation = violation * (lax.stop_gradient(h) / h) ** 2
             return Loads(
@@ -236,8 +228,8 @@ class Index3(AbstractEquations):
     def unknowns(self):
         return self.system.group.dim + len(self.system.constraint_names)
 
-    def step(self, previous, h):
-        return Index3Step(self, previous, h)
+    def step(self, previous, node):
+        return Index3Step(self, previous, node.h)
 
     def linearized(self, node, previous, state):
         system, h = self.system, node.h
@@ -246,5 +238,5 @@ class Index3(AbstractEquations):
         factors = factorize_iteration_matrix(self.scheme, system, at_state, self.mass, x, h)
         return Index3LinearizedStep(self.scheme, system.group, self.mass, h, x, at_state, factors)
 
-    def margin(self, state):
-        return margin_by_mass(self.system, self.mass, constraint_jacobian(self.system, state.q), self.scale)
+    def margin(self, state, t):
+        return margin_by_mass(self.system, self.mass, constraint_jacobian(self.system, state.q, t), self.scale)

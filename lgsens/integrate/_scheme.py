@@ -87,7 +87,7 @@ class AbstractScheme(AbstractIntegrator):
 
     # How a motion begins, and what is seen of it.
 
-    def start(self, system: AbstractSystem, initial: Initial) -> Start:
+    def start(self, system: AbstractSystem, initial: Initial, t0) -> Start:
         """What the scheme starts from, given consistent values."""
         return Start(initial.state)
 
@@ -95,7 +95,7 @@ class AbstractScheme(AbstractIntegrator):
         """A state with what else the scheme carries."""
         return state
 
-    def physical(self, states: State) -> State:
+    def physical(self, system: AbstractSystem, states: State) -> State:
         """A state, or stacked ones, without what else the scheme carries."""
         return states
 

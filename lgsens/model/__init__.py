@@ -4,6 +4,8 @@ from lgsens.model._body import RigidBody as RigidBody
 from lgsens.model._constraints import (
     AbstractClosedFormConstraint as AbstractClosedFormConstraint,
     AbstractConstraint as AbstractConstraint,
+    AbstractRows as AbstractRows,
+    AbstractVelocityConstraint as AbstractVelocityConstraint,
     Coincidence as Coincidence,
     Distance as Distance,
     InPlane as InPlane,
@@ -46,11 +48,14 @@ from lgsens.model._loads import (
     TyreLoad as TyreLoad,
 )
 from lgsens.model._model import Model as Model
-from lgsens.model._roads import (
+from lgsens.model._roads import BumpRoad as BumpRoad, FlatRoad as FlatRoad, SampledRoad as SampledRoad
+from lgsens.model._signals import (
     AbstractSignal as AbstractSignal,
-    BumpRoad as BumpRoad,
-    FlatRoad as FlatRoad,
-    SampledRoad as SampledRoad,
+    Constant as Constant,
+    Harmonic as Harmonic,
+    Polynomial as Polynomial,
+    Ramp as Ramp,
+    Sampled as Sampled,
 )
 from lgsens.model._stack import (
     constraint_force as constraint_force,

@@ -13,19 +13,31 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from lgsens.liegroups import cross, turn, turn_back
-from lgsens.model._constraints import AbstractConstraint, Coincidence, Distance, InPlane, Orthogonality
+from lgsens.model._constraints import (
+    AbstractConstraint,
+    AbstractRows,
+    AbstractVelocityConstraint,
+    Coincidence,
+    Distance,
+    InPlane,
+    Orthogonality,
+)
 from lgsens.model._frames import BODY_A, BODY_B, ROTATION, Frame
 from lgsens.model._loads import AbstractLoad, PointForce, SpringDamperLoad, TyreLoad
 
-Element = TypeVar("Element", AbstractConstraint, AbstractLoad)
+Element = TypeVar("Element", AbstractRows, AbstractLoad)
 
 
-def carried_constraint(element: AbstractConstraint, a: Frame | None, b: Frame | None) -> AbstractConstraint:
+def carried_constraint(element: AbstractRows, a: Frame | None, b: Frame | None) -> AbstractRows:
     """A constraint between two parts as one between their bodies; `a`, `b`: the poses of the parts there."""
     if a is None and b is None:
         return element
-    made_of_points = isinstance(element, Coincidence | Distance | InPlane | Orthogonality)
-    return _rewritten(element, a, b) if made_of_points else _CarriedConstraint(element, a, b)
+    if isinstance(element, AbstractVelocityConstraint):
+        return _CarriedVelocityConstraint(element, a, b)
+    if isinstance(element, Coincidence | Distance | InPlane | Orthogonality):
+        return _rewritten(element, a, b)
+    assert isinstance(element, AbstractConstraint)
+    return _CarriedConstraint(element, a, b)
 
 
 def carried_load(element: AbstractLoad, a: Frame | None, b: Frame | None) -> AbstractLoad:
@@ -86,8 +98,22 @@ class _CarriedConstraint(AbstractConstraint):
     def acts_on(self):
         return self.element.acts_on
 
-    def value(self, a, b):
-        return self.element.value(_frame(a, self.a), _frame(b, self.b))
+    def value(self, a, b, t):
+        return self.element.value(_frame(a, self.a), _frame(b, self.b), t)
+
+
+class _CarriedVelocityConstraint(AbstractVelocityConstraint):
+    element: AbstractVelocityConstraint
+    a: Frame | None
+    b: Frame | None
+
+    @property
+    def num_rows(self):
+        return self.element.num_rows
+
+    def rate(self, a, b, va, vb, t):
+        frames = _frame(a, self.a), _frame(b, self.b)
+        return self.element.rate(*frames, _velocity(a, va, self.a), _velocity(b, vb, self.b), t)
 
 
 class _CarriedLoad(AbstractLoad):

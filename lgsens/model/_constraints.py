@@ -27,10 +27,11 @@ from lgsens.model._frames import (
     separation_force,
     separation_stiffness,
 )
+from lgsens.model._signals import Prescribed, at_time
 
 
-class AbstractConstraint(eqx.Module):
-    """A constraint between the frames of two bodies; its tangents come from autodiff."""
+class AbstractRows(eqx.Module):
+    """Equations between the frames of two bodies, of one level."""
 
     @property
     @abc.abstractmethod
@@ -39,8 +40,8 @@ class AbstractConstraint(eqx.Module):
 
     @property
     def relative(self) -> bool:
-        """Whether Φ depends on nothing but the pose of one body as seen from the other, as in a joint: it then takes as
-        many directions from either body while the other one is held, which the linear solver makes use of."""
+        """Whether Φ depends on nothing but t and the pose of one body as seen from the other, as in a joint: it then
+        takes as many directions from either body while the other one is held, which the linear solver makes use of."""
         return False
 
     @property
@@ -54,24 +55,36 @@ class AbstractConstraint(eqx.Module):
         """The coordinates 0 … 11 that Φ depends on, all of them or the six rotations: B has no other columns."""
         return ALL
 
+
+class AbstractConstraint(AbstractRows):
+    """A constraint on the frames of two bodies; its tangents come from autodiff."""
+
     @abc.abstractmethod
-    def value(self, a: Frame, b: Frame) -> Float[Array, " rows"]:
-        """Φ at the given poses, zero when satisfied."""
+    def value(self, a: Frame, b: Frame, t) -> Float[Array, " rows"]:
+        """Φ at the given poses and time [s], zero when satisfied."""
+
+
+class AbstractVelocityConstraint(AbstractRows):
+    """A constraint on the velocities of two bodies that no constraint on their frames says (nonholonomic)."""
+
+    @abc.abstractmethod
+    def rate(self, a: Frame, b: Frame, va, vb, t) -> Float[Array, " rows"]:
+        """A v + b at the given poses, velocities [ẋ, Ω] of shape (6,) each, and time [s]: affine in the velocities."""
 
 
 class AbstractClosedFormConstraint(AbstractConstraint):
     """A constraint that brings its own tangents."""
 
     @abc.abstractmethod
-    def jacobian(self, a: Frame, b: Frame) -> Float[Array, "rows 12"]:
+    def jacobian(self, a: Frame, b: Frame, t) -> Float[Array, "rows 12"]:
         """B with δΦ = B [δx_a, δθ_a, δx_b, δθ_b]."""
 
     @abc.abstractmethod
-    def force(self, a: Frame, b: Frame, lam) -> Float[Array, "12"]:
+    def force(self, a: Frame, b: Frame, lam, t) -> Float[Array, "12"]:
         """Bᵀ λ, without B."""
 
     @abc.abstractmethod
-    def geometric_stiffness(self, a: Frame, b: Frame, lam) -> Float[Array, "12 12"]:
+    def geometric_stiffness(self, a: Frame, b: Frame, lam, t) -> Float[Array, "12 12"]:
         """D_q(Bᵀ λ) at fixed λ: what the constraint adds to K_t."""
 
 
@@ -93,16 +106,16 @@ class Coincidence(AbstractClosedFormConstraint):
     def coupled(self):
         return (TURNING_A, TURNING_B)
 
-    def value(self, a, b):
+    def value(self, a, b, t):
         return b.point(self.point_b) - a.point(self.point_a)
 
-    def jacobian(self, a, b):
+    def jacobian(self, a, b, t):
         return separation(a, b, self.point_a, self.point_b)[1]
 
-    def force(self, a, b, lam):
+    def force(self, a, b, lam, t):
         return separation_force(a, b, self.point_a, self.point_b, lam)
 
-    def geometric_stiffness(self, a, b, lam):
+    def geometric_stiffness(self, a, b, lam, t):
         return separation_stiffness(a, b, self.point_a, self.point_b, lam)
 
 
@@ -133,7 +146,7 @@ class Orthogonality(AbstractClosedFormConstraint):
     def coupled(self):
         return (self.acts_on,)
 
-    def value(self, a, b):
+    def value(self, a, b, t):
         return jnp.sum(a.axis(self.axis_a) * b.axis(self.axis_b))[None]
 
     def _row(self, a, b):
@@ -142,13 +155,13 @@ class Orthogonality(AbstractClosedFormConstraint):
         row_b = cross(self.axis_b, b.local_axis(a.axis(self.axis_a)))
         return jnp.concatenate([zero, row_a, zero, row_b])
 
-    def jacobian(self, a, b):
+    def jacobian(self, a, b, t):
         return self._row(a, b)[None, :]
 
-    def force(self, a, b, lam):
+    def force(self, a, b, lam, t):
         return self._row(a, b) * lam[0]
 
-    def geometric_stiffness(self, a, b, lam):
+    def geometric_stiffness(self, a, b, lam, t):
         e_a, e_b = skew(self.axis_a), skew(self.axis_b)
         coupling = e_a @ (a.orientation.T @ b.orientation) @ e_b
         own_a, own_b = e_a @ skew(a.local_axis(b.axis(self.axis_b))), e_b @ skew(b.local_axis(a.axis(self.axis_a)))
@@ -181,24 +194,24 @@ class InPlane(AbstractClosedFormConstraint):
     def relative(self):
         return True
 
-    def value(self, a, b):
+    def value(self, a, b, t):
         return jnp.sum(a.axis(self.axis_a) * (b.point(self.point_b) - a.point(self.point_a)))[None]
 
     def _axis_gradient(self, a):
         return embedded(-a.orientation @ skew(self.axis_a), None, ROTATION_A)
 
-    def jacobian(self, a, b):
+    def jacobian(self, a, b, t):
         d, gradient = separation(a, b, self.point_a, self.point_b)
         return (d @ self._axis_gradient(a) + a.axis(self.axis_a) @ gradient)[None, :]
 
-    def force(self, a, b, lam):
+    def force(self, a, b, lam, t):
         d = b.point(self.point_b) - a.point(self.point_a)
         along = separation_force(a, b, self.point_a, self.point_b, a.axis(self.axis_a))
         zero = jnp.zeros(3, d.dtype)
         turning = jnp.concatenate([zero, cross(self.axis_a, a.local_axis(d)), zero, zero])
         return (along + turning) * lam[0]
 
-    def geometric_stiffness(self, a, b, lam):
+    def geometric_stiffness(self, a, b, lam, t):
         d, gradient = separation(a, b, self.point_a, self.point_b)
         cross = self._axis_gradient(a).T @ gradient
         stiffness = cross + cross.T
@@ -208,14 +221,14 @@ class InPlane(AbstractClosedFormConstraint):
 
 
 class Distance(AbstractClosedFormConstraint):
-    """Two body-fixed points keep their distance: Φ = |d| − L; λ is the tension of the rod [N].
+    """Two body-fixed points keep their distance: Φ = |d| − L(t); λ is the tension of the rod [N].
 
     With n = d/|d|: B = nᵀD and D_q(Bᵀλ) = λ (Dᵀ (I − n nᵀ)/|d| D + D_q(Dᵀn)|_n).
     """
 
     point_a: Float[Array, "3"]
     point_b: Float[Array, "3"]
-    length: Float[Array, ""]
+    length: Prescribed
 
     @property
     def num_rows(self):
@@ -225,19 +238,19 @@ class Distance(AbstractClosedFormConstraint):
     def relative(self):
         return True
 
-    def value(self, a, b):
+    def value(self, a, b, t):
         d = b.point(self.point_b) - a.point(self.point_a)
-        return (jnp.linalg.norm(d) - self.length)[None]
+        return (jnp.linalg.norm(d) - at_time(self.length, t))[None]
 
-    def jacobian(self, a, b):
+    def jacobian(self, a, b, t):
         d, gradient = separation(a, b, self.point_a, self.point_b)
         return (d / jnp.linalg.norm(d) @ gradient)[None, :]
 
-    def force(self, a, b, lam):
+    def force(self, a, b, lam, t):
         d = b.point(self.point_b) - a.point(self.point_a)
         return separation_force(a, b, self.point_a, self.point_b, d / jnp.linalg.norm(d) * lam[0])
 
-    def geometric_stiffness(self, a, b, lam):
+    def geometric_stiffness(self, a, b, lam, t):
         d, gradient = separation(a, b, self.point_a, self.point_b)
         length = jnp.linalg.norm(d)
         n = d / length

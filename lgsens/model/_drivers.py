@@ -4,40 +4,41 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._validate import axis_field, number_field, point_field
+from lgsens._validate import axis_field, point_field
 from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint, InPlane
 from lgsens.model._frames import Frame
 from lgsens.model._joints import AbstractJoint, _normals
+from lgsens.model._signals import Prescribed, at_time, prepared, prescribed_field
 
 
 class Displacement(AbstractClosedFormConstraint):
-    """The line between two points has a prescribed component along an axis of a: Φ = α·d − s; λ is a force [N].
+    """The line between two points has a prescribed component along an axis of a: Φ = α·d − s(t); λ is a force [N].
 
-    But for the constant s it is `InPlane`, and so are its tangents.
+    But for s it is `InPlane`, and so are its tangents.
     """
 
     line: InPlane
-    prescribed: Float[Array, ""]
+    prescribed: Prescribed
 
     @property
     def num_rows(self):
         return 1
 
-    def value(self, a, b):
-        return self.line.value(a, b) - self.prescribed
+    def value(self, a, b, t):
+        return self.line.value(a, b, t) - at_time(self.prescribed, t)
 
-    def jacobian(self, a, b):
-        return self.line.jacobian(a, b)
+    def jacobian(self, a, b, t):
+        return self.line.jacobian(a, b, t)
 
-    def force(self, a, b, lam):
-        return self.line.force(a, b, lam)
+    def force(self, a, b, lam, t):
+        return self.line.force(a, b, lam, t)
 
-    def geometric_stiffness(self, a, b, lam):
-        return self.line.geometric_stiffness(a, b, lam)
+    def geometric_stiffness(self, a, b, lam, t):
+        return self.line.geometric_stiffness(a, b, lam, t)
 
 
 class Angle(AbstractConstraint):
-    """b has turned by a prescribed angle s about an axis of a; λ is a moment [N m].
+    """b has turned by a prescribed angle s(t) about an axis of a; λ is a moment [N m].
 
     With x, y fixed in a, normal to the axis, and β in b, which coincided with x before the turn:
 
@@ -50,28 +51,30 @@ class Angle(AbstractConstraint):
     first_a: Float[Array, "3"]
     second_a: Float[Array, "3"]
     first_b: Float[Array, "3"]
-    prescribed: Float[Array, ""]
+    prescribed: Prescribed
 
     @property
     def num_rows(self):
         return 1
 
-    def value(self, a, b):
+    def value(self, a, b, t):
         beta = a.local_axis(b.axis(self.first_b))
         x, y = jnp.sum(beta * self.first_a), jnp.sum(beta * self.second_a)
-        sine, cosine = jnp.sin(self.prescribed), jnp.cos(self.prescribed)
+        angle = at_time(self.prescribed, t)
+        sine, cosine = jnp.sin(angle), jnp.cos(angle)
         return jnp.arctan2(y * cosine - x * sine, x * cosine + y * sine)[None]
 
 
 class TranslationDriver(AbstractJoint):
-    """A prescribed displacement of a point of `b` along an axis of `a`; 1 equation.
+    """A prescribed displacement, a number or a function of time, of a point of `b` along an axis of `a`; 1 equation.
 
     Arguments:
         a, b: names of the two bodies; None is the ground.
         at: the point in the reference configuration [m], inertial frame, shape (3,).
         axis: direction of the displacement, fixed in `a`, inertial frame, shape (3,), any length > 0.
-        value: the displacement from the reference configuration [m], shape (); None: 0. With a value the mechanism
-            is assembled before it moves. `lgsens.kinematics` prescribes many.
+        value: the displacement from the reference configuration [m], shape (), or a signal of it; None: 0. With a
+            value the mechanism is assembled before it moves, with a signal it starts with its rate.
+            `lgsens.kinematics` prescribes many.
 
     The multiplier is the force of `b` on `a` along the axis [N]: its negative drives `b`. Raises `ValueError` for a
     wrong shape or a zero axis. Source: Haug (1989), §9.6.
@@ -81,7 +84,7 @@ class TranslationDriver(AbstractJoint):
     b: str | None = eqx.field(static=True)
     at: Float[Array, "3"] = point_field("at")
     axis: Float[Array, "3"] = axis_field("axis")
-    value: Float[Array, ""] | None = number_field("value", default=None)
+    value: Prescribed | None = prescribed_field("value")
 
     @property
     def assembled(self):
@@ -94,13 +97,14 @@ class TranslationDriver(AbstractJoint):
 
 
 class RotationDriver(AbstractJoint):
-    """A prescribed angle by which `b` has turned about an axis of `a`, as a motor on a hinge; 1 equation.
+    """A prescribed angle, a number or a function of time, by which `b` has turned about an axis of `a`; 1 equation.
 
     Arguments:
         a, b: names of the two bodies; None is the ground. Another joint keeps their axes aligned.
         axis: direction of the axis, fixed in `a`, inertial frame, shape (3,), any length > 0.
-        value: the angle from the reference configuration [rad], right-handed, any number of turns, shape (); None: 0.
-            With a value the mechanism is assembled before it moves. `lgsens.kinematics` prescribes many.
+        value: the angle from the reference configuration [rad], right-handed, any number of turns, shape (), or a
+            signal of it; None: 0. With a value the mechanism is assembled before it moves, with a signal it starts
+            with its rate. `lgsens.kinematics` prescribes many.
 
     The multiplier is the moment of `b` on `a` about the axis [N m]: its negative drives `b`. Raises `ValueError` for a
     wrong shape or a zero axis. Source: Haug (1989), §9.6.
@@ -109,7 +113,7 @@ class RotationDriver(AbstractJoint):
     a: str | None = eqx.field(static=True)
     b: str | None = eqx.field(static=True)
     axis: Float[Array, "3"] = axis_field("axis")
-    value: Float[Array, ""] | None = number_field("value", default=None)
+    value: Prescribed | None = prescribed_field("value")
 
     @property
     def assembled(self):
@@ -121,5 +125,5 @@ class RotationDriver(AbstractJoint):
         return (Angle(*axes, _or_zero(self.value, first.dtype)),)
 
 
-def _or_zero(value, dtype) -> Float[Array, ""]:
-    return jnp.zeros((), dtype) if value is None else value
+def _or_zero(value, dtype) -> Prescribed:
+    return jnp.zeros((), dtype) if value is None else prepared(value)

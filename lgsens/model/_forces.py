@@ -19,7 +19,8 @@ from lgsens.model._loads import (
     TyreLoad,
     Weight,
 )
-from lgsens.model._roads import AbstractSignal, FlatRoad
+from lgsens.model._roads import FlatRoad
+from lgsens.model._signals import AbstractSignal, prepared
 
 
 class Attached(NamedTuple):
@@ -216,7 +217,7 @@ class TyreSpring(AbstractForce):
             stiffness=self.stiffness,
             free_radius=self.at[2] if self.free_radius is None else self.free_radius,
             preload=jnp.zeros((), self.at.dtype) if self.preload is None else self.preload,
-            road=self.road,
+            road=prepared(self.road),
         )
         return (Attached(load, None, self.body),)
 
@@ -252,4 +253,8 @@ class AppliedForce(AbstractForce):
     def loads(self, bodies):
         frame = bodies[self.body].frame
         at = bodies[self.body].position if self.at is None else self.at
-        return (Attached(PointForce(frame.local_point(at), self.force, self.moment, self.signal), None, self.body),)
+        return (
+            Attached(
+                PointForce(frame.local_point(at), self.force, self.moment, prepared(self.signal)), None, self.body
+            ),
+        )

@@ -13,16 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import axis_field, number_field, point_field, require
+from lgsens._validate import axis_field, point_field, require
 from lgsens.liegroups import cross
 from lgsens.model._constraints import (
-    AbstractConstraint,
+    AbstractRows,
     Coincidence,
     Distance,
     InPlane,
     Orthogonality,
 )
 from lgsens.model._frames import Frame
+from lgsens.model._signals import Prescribed, prepared, prescribed_field
 
 
 def _normals(axis: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
@@ -65,7 +66,7 @@ class AbstractJoint(eqx.Module):
         """Whether the reference configuration satisfies the joint by construction."""
 
     @abc.abstractmethod
-    def constraints(self, a: Frame, b: Frame) -> tuple[AbstractConstraint, ...]:
+    def constraints(self, a: Frame, b: Frame) -> tuple[AbstractRows, ...]:
         """The basic constraints of the joint, given the reference frames of its two bodies."""
 
 
@@ -244,13 +245,13 @@ class FixedJoint(AbstractJoint):
 
 
 class DistanceJoint(AbstractJoint):
-    """A massless rod: a point of `a` and a point of `b` keep their distance; 1 equation.
+    """A massless rod: a point of `a` and a point of `b` have a given distance; 1 equation.
 
     Arguments:
         a, b: names of the two bodies; None is the ground.
         at_a, at_b: the two ends in the reference configuration [m], inertial frame, shape (3,).
-        length: length of the rod [m], shape (); None: the distance of the two points in the reference
-            configuration. With another length the mechanism is assembled before it moves.
+        length: length of the rod [m], shape (), or a signal of it, positive; None: the distance of the two points in
+            the reference configuration. With another length the mechanism is assembled before it moves.
 
     The multiplier is the tension of the rod [N]. Raises `ValueError` for a wrong shape, a length
     ≤ 0, or coinciding ends. Source: Haug (1989), §9.4.
@@ -260,7 +261,7 @@ class DistanceJoint(AbstractJoint):
     b: str | None = eqx.field(static=True)
     at_a: Float[Array, "3"] = point_field("at_a")
     at_b: Float[Array, "3"] = point_field("at_b")
-    length: Float[Array, ""] | None = number_field("length", default=None)
+    length: Prescribed | None = prescribed_field("length")
 
     def __check_init__(self):
         require(
@@ -270,7 +271,7 @@ class DistanceJoint(AbstractJoint):
             self.at_a,
             self.at_b,
         )
-        if self.length is not None:
+        if eqx.is_array(self.length):
             require(
                 lambda length: length > 0,
                 f"DistanceJoint: `length` must be positive, got {self.length} m.",
@@ -282,7 +283,7 @@ class DistanceJoint(AbstractJoint):
         return self.length is None
 
     def constraints(self, a, b):
-        length = jnp.linalg.norm(self.at_b - self.at_a) if self.length is None else self.length
+        length = jnp.linalg.norm(self.at_b - self.at_a) if self.length is None else prepared(self.length)
         return (Distance(a.local_point(self.at_a), b.local_point(self.at_b), length),)
 
 

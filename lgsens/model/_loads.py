@@ -27,7 +27,7 @@ from lgsens.model._frames import (
     separation_force,
     separation_stiffness,
 )
-from lgsens.model._roads import AbstractSignal
+from lgsens.model._signals import AbstractSignal
 
 
 class LoadTangents(NamedTuple):

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 
 from lgsens._validate import require
-from lgsens.model._constraints import AbstractConstraint, Coincidence, Orthogonality
+from lgsens.model._constraints import AbstractRows, Coincidence, Orthogonality
 from lgsens.model._free import ROTATIONS, TRANSLATIONS, Free, is_along, single_rotation
 from lgsens.model._joints import AbstractJoint, FixedJoint, RevoluteJoint
 
 
 def needed(
-    name: str, joint: AbstractJoint, constraints: Sequence[AbstractConstraint], free_a: Free, free_b: Free
+    name: str, joint: AbstractJoint, constraints: Sequence[AbstractRows], free_a: Free, free_b: Free
 ) -> list[tuple[bool, ...]]:
     """Which equations of each of a joint's basic constraints its bodies could violate; the ground has `free` = ().
 

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from lgsens.dynamics import AbstractSystem
+from lgsens.dynamics import AbstractSystem, full_jacobian
 from lgsens.liegroups import Pose
 from lgsens.model._frames import BODY_DIM, ROTATION, Frame
 
@@ -76,6 +76,6 @@ class Parts(eqx.Module, Generic[System]):
         (group,) = [own for own in self.fixed if joint in own]
         rows = np.concatenate([np.flatnonzero(names == name) for name in group])
         residual = self.system.residual(q, v, vdot, lam, t)
-        jacobian = self.system.constraint_jacobian(q)[rows]
+        jacobian = full_jacobian(self.system, q, t)[rows]
         found = jnp.linalg.solve(jacobian @ jacobian.T, -(jacobian @ residual))
         return jnp.zeros(len(names), lam.dtype).at[rows].set(found)

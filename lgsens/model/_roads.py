@@ -1,21 +1,10 @@
-"""Signals of time: road profiles and load histories, as modules whose numbers are leaves."""
+"""Road profiles, signals of time."""
 
-import abc
-
-import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float, number_field, require
-
-
-class AbstractSignal(eqx.Module):
-    """A scalar function of time. A signal of one's own has leaves for its numbers and `__call__`."""
-
-    @abc.abstractmethod
-    def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
-        """The value at time t [s]."""
+from lgsens._validate import number_field, require
+from lgsens.model._signals import AbstractSignal, samples
 
 
 class FlatRoad(AbstractSignal):
@@ -75,18 +64,7 @@ class SampledRoad(AbstractSignal):
     heights: Float[Array, " n"]
 
     def __init__(self, times, heights):
-        self.times = as_float(times, None, "SampledRoad: `times`")
-        self.heights = as_float(heights, None, "SampledRoad: `heights`")
-        if self.times.ndim != 1 or self.times.shape != self.heights.shape or self.times.size < 2:
-            raise ValueError(
-                "SampledRoad: `times` and `heights` must be two vectors of the same length ≥ 2, got shapes "
-                f"{self.times.shape} and {self.heights.shape}."
-            )
-        require(
-            lambda times: np.all(np.diff(times) > 0),
-            "SampledRoad: `times` must increase from sample to sample; sort them and drop duplicates.",
-            self.times,
-        )
+        self.times, self.heights = samples(times, heights, "SampledRoad", "heights")
 
     def __call__(self, t):
         return jnp.interp(t, self.times, self.heights)

@@ -15,13 +15,18 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.liegroups import Pose, R3xSO3
-from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint
+from lgsens.model._constraints import (
+    AbstractClosedFormConstraint,
+    AbstractConstraint,
+    AbstractRows,
+    AbstractVelocityConstraint,
+)
 from lgsens.model._frames import ALL, BODY_A, BODY_B, TURNING_A, TURNING_B, Frame, ground_frame
 from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, LoadTangents
 from lgsens.model._rows import Row, joined
 from lgsens.model._topology import Ends
 
-Element = TypeVar("Element", AbstractConstraint, AbstractLoad)
+Element = TypeVar("Element", AbstractRows, AbstractLoad)
 
 
 class Placed(NamedTuple, Generic[Element]):
@@ -55,7 +60,7 @@ class Stack(eqx.Module, Generic[Element]):
 
     def __check_init__(self):
         name, acts_on = type(self.elements).__name__, self.elements.acts_on
-        if not isinstance(self.elements, AbstractConstraint):
+        if not isinstance(self.elements, AbstractRows):
             if list(acts_on) != sorted(set(acts_on) & set(ALL)) or not acts_on:
                 raise ValueError(
                     f"{name}: `acts_on` must be increasing places from 0 to 11; got {acts_on!r}. Leave it out where "
@@ -87,7 +92,7 @@ class Stack(eqx.Module, Generic[Element]):
     @property
     def ends(self) -> Ends:
         found = Ends(self.a, self.b, self.owners, self.kept, acts_on=self.elements.acts_on)
-        if not isinstance(self.elements, AbstractConstraint):
+        if not isinstance(self.elements, AbstractRows):
             return found
         return found._replace(relative=self.elements.relative, coupled=self.elements.coupled)
 
@@ -131,7 +136,7 @@ def at_ends(stacks: Sequence[Stack], q: Pose, *arrays) -> list[AtEnds]:
 
 
 def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
-    """Group elements by type and ground side, keeping their order within a group."""
+    """Group elements by type and ground side, keeping their order within a group; rows of velocity level are last."""
     groups: dict[Any, list[Placed[Element]]] = {}
     for item in placed:
         of, axes = (item.element.of, 1) if isinstance(item.element, Row) else (item.element, 0)
@@ -151,7 +156,7 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
                 places=tuple(m.place for m in members),
             )
         )
-    return tuple(stacks)
+    return tuple(sorted(stacks, key=lambda stack: isinstance(stack.elements, AbstractVelocityConstraint)))
 
 
 # Elements with closed-form tangents use them; for the others autodiff perturbs by retraction, R exp(θ̃).
@@ -162,27 +167,30 @@ def moved(frame: Frame, x) -> Frame:
     return Frame(*R3xSO3().retract(Pose(*frame), x))
 
 
-def constraint_jacobian(element: AbstractConstraint, a: Frame, b: Frame):
-    """B of one element, shape (rows, 12)."""
+def constraint_jacobian(element: AbstractRows, a: Frame, b: Frame, t):
+    """B of one element, or A, shape (rows, 12)."""
     if isinstance(element, AbstractClosedFormConstraint):
-        return element.jacobian(a, b)
+        return element.jacobian(a, b, t)
     zero = jnp.zeros(12, a.position.dtype)
-    return jax.jacfwd(lambda x: element.value(moved(a, x[BODY_A]), moved(b, x[BODY_B])))(zero)
+    if isinstance(element, AbstractConstraint):
+        return jax.jacfwd(lambda x: element.value(moved(a, x[BODY_A]), moved(b, x[BODY_B]), t))(zero)
+    assert isinstance(element, AbstractVelocityConstraint)
+    return jax.jacfwd(lambda v: element.rate(a, b, v[BODY_A], v[BODY_B], t))(zero)
 
 
-def constraint_force(element: AbstractConstraint, a: Frame, b: Frame, lam):
-    """Bᵀλ of one element, shape (12,)."""
+def constraint_force(element: AbstractRows, a: Frame, b: Frame, lam, t):
+    """Bᵀλ of one element, or Aᵀλ, shape (12,)."""
     if isinstance(element, AbstractClosedFormConstraint):
-        return element.force(a, b, lam)
-    return lam @ constraint_jacobian(element, a, b)
+        return element.force(a, b, lam, t)
+    return lam @ constraint_jacobian(element, a, b, t)
 
 
-def constraint_stiffness(element: AbstractConstraint, a: Frame, b: Frame, lam):
-    """D_q(Bᵀλ) of one element, shape (12, 12)."""
+def constraint_stiffness(element: AbstractRows, a: Frame, b: Frame, lam, t):
+    """D_q(Bᵀλ) of one element, or D_q(Aᵀλ), shape (12, 12)."""
     if isinstance(element, AbstractClosedFormConstraint):
-        return element.geometric_stiffness(a, b, lam)
+        return element.geometric_stiffness(a, b, lam, t)
     zero = jnp.zeros(12, a.position.dtype)
-    return jax.jacfwd(lambda x: lam @ constraint_jacobian(element, moved(a, x[BODY_A]), moved(b, x[BODY_B])))(zero)
+    return jax.jacfwd(lambda x: constraint_force(element, moved(a, x[BODY_A]), moved(b, x[BODY_B]), lam, t))(zero)
 
 
 def entries_at(arrays: Float[Array, "... n"], places: np.ndarray, axis: int = -1) -> Float[Array, "... p"]:

@@ -13,7 +13,7 @@ from lgsens._validate import suggestion
 from lgsens.dynamics import AbstractRedundantSystem, AbstractSparseSystem, Tangents, least_norm
 from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew, turn
 from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, chosen
-from lgsens.model._constraints import AbstractConstraint
+from lgsens.model._constraints import AbstractRows, AbstractVelocityConstraint
 from lgsens.model._frames import BODY_DIM, ROTATION
 from lgsens.model._loads import AbstractLoad
 from lgsens.model._parts import Parts
@@ -52,7 +52,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     pose: Pose  # reference configuration, leading axis N
     velocity: Float[Array, " k"]  # reference velocity
     centre: Float[Array, "N 3"] | None  # centre of mass in the body frame; None: its origin, for all bodies
-    constraints: tuple[Stack[AbstractConstraint], ...]
+    constraints: tuple[Stack[AbstractRows], ...]  # those of velocity level last
     loads: tuple[Stack[AbstractLoad], ...]
     parts: "Parts[MultibodySystem] | None"  # of merged bodies
     body_names: tuple[str, ...] = eqx.field(static=True)
@@ -67,6 +67,8 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
 
     @property
     def elimination(self):
+        if self.num_velocity_rows:  # their rows of S are not those of B T
+            return None
         return self.topology.elimination(self.linear_solver)
 
     @property
@@ -139,9 +141,9 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         mass = jnp.mean(self.mass)
         square = jnp.mean(jnp.trace(self.inertia, axis1=1, axis2=2)) / (3.0 * mass)
         square = jnp.where(square > 0, square, 1.0)
-        angular = []
+        angular, t = [], jnp.zeros((), mass.dtype)
         for stack, ends, rows in zip(self.constraints, at_ends(self.constraints, self.pose), self.topology.rows):
-            translation = stack.map(constraint_jacobian, ends).reshape(*rows.shape, -1, BODY_DIM)
+            translation = stack.map(constraint_jacobian, ends, (t,)).reshape(*rows.shape, -1, BODY_DIM)
             without = jnp.all(translation[..., : ROTATION.start] == 0.0, axis=(2, 3))
             angular.append((without.astype(mass.dtype), rows))
         angular = lax.stop_gradient(added(angular, self.topology.num_constraints, mass.dtype))
@@ -171,7 +173,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         least = partial(least_norm, self)
         for _ in lam.shape[:-1]:
             least = jax.vmap(least)
-        lam = least(q, lam)
+        lam = least(q, lam, t)
         whole, q, v, vdot = self.of_parts(q, v, vdot)
         if joint not in whole.constraint_names:
             raise ValueError(f"`multiplier`: {suggestion(joint, set(whole.constraint_names))}.")
@@ -258,27 +260,51 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             force = stack.map(lambda e, a, b, va, vb, t: e.force(a, b, va, vb, t), ends, (t,))
             forces.append((-stack.acting(force), coordinates))
         for stack, ends, pattern in zip(self.constraints, at_ends(self.constraints, q), topology.jacobian):
-            force = stack.map(constraint_force, ends, (chosen(lam, pattern.rows),))
+            force = stack.map(constraint_force, ends, (chosen(lam, pattern.rows), t))
             forces.append((stack.acting(force), pattern.columns))
         return added(forces, self.group.dim, v.dtype)
 
+    @property
+    def _num_positions(self) -> int:
+        """How many stacks of constraints are of position level; they come first."""
+        return sum(not isinstance(stack.elements, AbstractVelocityConstraint) for stack in self.constraints)
+
+    @property
+    def num_velocity_rows(self):
+        return sum(int((rows >= 0).sum()) for rows in self.topology.rows[self._num_positions :])
+
     @_traced_once
-    def constraint(self, q):
-        q = self._placed(q)
+    def constraint(self, q, t):
+        q, stacks = self._placed(q), self.constraints[: self._num_positions]
         values = [
-            (stack.map(lambda e, a, b: e.value(a, b), ends), rows)
-            for stack, ends, rows in zip(self.constraints, at_ends(self.constraints, q), self.topology.rows)
+            (stack.map(lambda e, a, b, t: e.value(a, b, t), ends, (t,)), rows)
+            for stack, ends, rows in zip(stacks, at_ends(stacks, q), self.topology.rows)
         ]
-        return added(values, self.topology.num_constraints, self.mass.dtype)
-
-    def constraint_jacobian(self, q):
-        return self.sparse_constraint_jacobian(q).dense()
+        return added(values, self.topology.num_constraints - self.num_velocity_rows, self.mass.dtype)
 
     @_traced_once
-    def sparse_constraint_jacobian(self, q):
+    def velocity_constraint(self, q, v, t):
+        stacks, first = self.constraints[self._num_positions :], self.topology.num_constraints - self.num_velocity_rows
+        rows = [np.where(own < 0, own, own - first) for own in self.topology.rows[self._num_positions :]]
+        values = [
+            (stack.map(lambda e, *args: e.rate(*args), ends, (t,)), own)
+            for stack, ends, own in zip(stacks, at_ends(stacks, self._placed(q), self.twists(v)), rows)
+        ]
+        return added(values, self.num_velocity_rows, self.mass.dtype)
+
+    def constraint_jacobian(self, q, t):
+        every = self.sparse_constraint_jacobian(q, t).dense()
+        return every[: -self.num_velocity_rows] if self.num_velocity_rows else every
+
+    def velocity_jacobian(self, q, t):
+        every = self.sparse_constraint_jacobian(q, t).dense()
+        return every[every.shape[0] - self.num_velocity_rows :]
+
+    @_traced_once
+    def sparse_constraint_jacobian(self, q, t):
         q = self._placed(q)
         parts = [
-            Blocks(stack.acting(stack.map(constraint_jacobian, ends)), pattern)
+            Blocks(stack.acting(stack.map(constraint_jacobian, ends, (t,))), pattern)
             for stack, ends, pattern in zip(self.constraints, at_ends(self.constraints, q), self.topology.jacobian)
         ]
         return SparseMatrix(tuple(parts), (self.topology.num_constraints, self.group.dim), self.mass.dtype)
@@ -305,9 +331,9 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         placed = zip(self.constraints, at_ends(self.constraints, q), topology.rows, topology.stiffness)
         for stack, ends, rows, coupled in placed:
             part = stack.part
-            block = stack.map(constraint_stiffness, ends, (chosen(lam, rows),))[:, part, part]
+            block = stack.map(constraint_stiffness, ends, (chosen(lam, rows), t))[:, part, part]
             stiffness.extend(Blocks(square_blocks(block, places), pattern) for places, pattern in coupled)
-        return Tangents(self._square(stiffness), self._square(damping), self.sparse_constraint_jacobian(q))
+        return Tangents(self._square(stiffness), self._square(damping), self.sparse_constraint_jacobian(q, t))
 
     def measure(self, force: str, q, v, t):
         """What the force element `force` measures at each of the stacked poses, velocities and times.

@@ -10,6 +10,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, suggestion
+from lgsens.dynamics import full_jacobian
 from lgsens.model._forces import AbstractForce, Bushing, SpringDamper, TyreSpring
 from lgsens.model._model import Model
 from lgsens.model._system import MultibodySystem
@@ -57,7 +58,7 @@ def _solve(model: Model, forces: tuple[str, ...], t):
     where = [_place(rest, name) for name in forces]
     q, v = rest.reference()
     zero = jnp.zeros_like(v)
-    jacobian = rest.constraint_jacobian(q)
+    jacobian = full_jacobian(rest, q, t)
     lam = jnp.zeros(jacobian.shape[0], v.dtype)
 
     def residual(values):

@@ -124,7 +124,7 @@ def _final_conditions(functional: Functional, p, system: AbstractSystem, point: 
     state, mass = point.state, system.mass_matrix()
     terminal = near(functional.final, p, system, state, point.t)
     g = gradients(lambda state: terminal(p, system, state, point.t), system.group, state)
-    jacobian_rate = along(system.constraint_jacobian, system, state)
+    jacobian_rate = along(lambda q: system.constraint_jacobian(q, point.t), system, state)
     jacobian = node.constraint_jacobian
     mu, eta1 = constrained_solve(mass, jacobian, -(of.f_m + g.v).T, of.level.T)
     g_k = g.w + g.v @ system.group.ad(state.v)
@@ -139,8 +139,8 @@ def final_cotangents(functional: Functional, p, system: AbstractSystem, point: P
     terminal = near(functional.final, p, system, state, point.t)
 
     def ends(system, p):
-        rate = system.constraint_jacobian(state.q) @ state.v
-        return terminal(p, system, state, point.t), rate, system.constraint(state.q)
+        rate = system.constraint_jacobian(state.q, point.t) @ state.v
+        return terminal(p, system, state, point.t), rate, system.constraint(state.q, point.t)
 
     values, pull_back = jax.vjp(ends, system, p)
     return jax.vmap(pull_back)((jnp.eye(values[0].shape[0], dtype=state.v.dtype), eta1.T, eta2.T))

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from lgsens.dynamics import State, kkt_solve, split_velocity
+from lgsens.dynamics import State, consistent_velocity, full_jacobian, kkt_solve
 from lgsens.integrate import GeneralizedAlpha, Variation
 from lgsens.sensitivity._linear_alpha import Motion, Node, advance, started
 from lgsens.sensitivity._linearization import Parameters, pseudo_load_function
@@ -49,7 +49,7 @@ def continuous_direct_sweep(
             level=-phi_p[:, None],
         )
 
-    motion = _begin(scheme, system, jax.tree.map(lambda leaf: leaf[0], states), first, d, h)
+    motion = _begin(scheme, system, jax.tree.map(lambda leaf: leaf[0], states), first, d, parameters.t0, h)
 
     def sweep(previous: Motion, inputs):
         current = advance(scheme, mass, previous, node(*inputs), h)
@@ -68,29 +68,30 @@ def _variation(group, state: State, motion: Motion) -> Variation:
     return Variation(motion.x, v, vdot, motion.lam, vdot)
 
 
-def _begin(scheme: GeneralizedAlpha, system, state: State, first: Variation, d: Parameters, h) -> Motion:
+def _begin(scheme: GeneralizedAlpha, system, state: State, first: Variation, d: Parameters, t0, h) -> Motion:
     """w, ẇ, ẅ, λ' and the algorithmic acceleration of the linear scheme at t0."""
     ad, delta = system.group.ad, scheme.alpha_m - scheme.alpha_f
     bracket, of_vdot = ad(state.v), ad(state.vdot)
     w = first.w
     rate = first.v - bracket @ w
-    rate = rate - _hidden_violation(system, state, w, rate, d)
+    rate = rate - _hidden_violation(system, state, w, rate, d, t0)
     acceleration = first.vdot - bracket @ rate - of_vdot @ w
     # a' stands for v̇' = ẅ + ad(v) ẇ + ad(v̇) w at t0 + Δ h, and a_0 for v̇ there
     change = (delta * h) * (bracket @ acceleration + 2.0 * of_vdot @ rate) + ad(state.a - state.vdot) @ w
     a = first.a - bracket @ rate - of_vdot @ w - change
     exact = Motion(*(column[:, None] for column in (w, rate, acceleration, first.lam, a)))
-    return started(scheme, system.mass_matrix(), system.constraint_jacobian(state.q), exact, h)
+    return started(scheme, system.mass_matrix(), full_jacobian(system, state.q, t0), exact, h)
 
 
-def _hidden_violation(system, state: State, w, rate, d: Parameters):
+def _hidden_violation(system, state: State, w, rate, d: Parameters, t0):
     """What d/dt (B w + Φ_p p') = 0 forbids of ẇ, as its M-orthogonal part."""
     q, group = state.q, system.group
-    v, _ = split_velocity(system, q, state.v)
+    v = consistent_velocity(system, q, state.v, t0)
 
-    def varied(q, w):
-        return jax.jvp(lambda system, q: system.constraint(q), (system, q), (d.system, group.to_ambient(q, w)))[1]
+    def varied(q, w, t):
+        tangents = d.system, group.to_ambient(q, w), d.t0
+        return jax.jvp(lambda system, q, t: system.constraint(q, t), (system, q, t), tangents)[1]
 
-    violation = jax.jvp(varied, (q, w), (group.to_ambient(q, v), rate))[1]
-    mass, jacobian = system.mass_matrix(), system.constraint_jacobian(q)
+    violation = jax.jvp(varied, (q, w, t0), (group.to_ambient(q, v), rate, jnp.ones_like(t0)))[1]
+    mass, jacobian = system.mass_matrix(), full_jacobian(system, q, t0)
     return kkt_solve(mass, jacobian, jnp.zeros_like(rate), violation)[0]

@@ -93,14 +93,14 @@ def near(function: Pointwise | OfState, p, system: AbstractSystem, state: State,
     vdot, lam = accelerations(system, state.q, state.v, t)
     at = lambda vdot, lam: of(p, system, State(state.q, state.v, vdot, lam, vdot), t)
     f_vdot, f_lam = jax.jacrev(at, argnums=(0, 1))(vdot, lam)
-    jacobian = system.constraint_jacobian(state.q)
+    jacobian = system.constraint_jacobian(state.q, t)
     a, b = kkt_solve(system.mass_matrix(), jacobian, f_vdot.T, f_lam.T)
 
     def fixed(p, system, state, t):
         q, v = state.q, state.v
-        velocity = lambda q: system.constraint_jacobian(q) @ v
+        velocity = lambda q: system.constraint_jacobian(q, t) @ v
         _, hidden = jax.jvp(velocity, (q,), (system.group.to_ambient(q, v),))
-        hidden = hidden + system.constraint_jacobian(q) @ vdot
+        hidden = hidden + system.constraint_jacobian(q, t) @ vdot
         residual = system.residual(q, v, vdot, lam, t)
         return of(p, system, State(q, v, vdot, lam, vdot), t) - residual @ a - hidden @ b
 

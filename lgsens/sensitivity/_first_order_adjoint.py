@@ -95,7 +95,7 @@ def _final_conditions(functional: Functional, p, system: AbstractSystem, point: 
     eta_v = -g.v - jacobian.T @ eta1
 
     def constraint_force(state):
-        return jax.vmap(lambda eta: eta @ (system.constraint_jacobian(state.q) @ state.v), in_axes=1)(eta1)
+        return jax.vmap(lambda eta: eta @ (system.constraint_jacobian(state.q, t) @ state.v), in_axes=1)(eta1)
 
     of_velocity = gradients(constraint_force, group, state).w.T  # D_q(B v)ᵀη₁
 

@@ -90,7 +90,7 @@ def pseudo_load_function(state: State):
     """p ↦ (r, Φ) at a fixed state: its JVP is (r_p p', Φ_p p'), its VJP their transposes."""
 
     def loads(system: AbstractSystem, t):
-        return system.residual(state.q, state.v, state.vdot, state.lam, t), system.constraint(state.q)
+        return system.residual(state.q, state.v, state.vdot, state.lam, t), system.constraint(state.q, t)
 
     return loads
 

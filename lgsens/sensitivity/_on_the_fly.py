@@ -58,7 +58,7 @@ def direct_on_the_fly(
         """f (c,) and f' (p, c)."""
 
         def along(e, d_system, delta):
-            state_, d_state = (scheme.physical(each) for each in (state, to_ambient(group, state, delta)))
+            state_, d_state = (scheme.physical(system, each) for each in (state, to_ambient(group, state, delta)))
             tangents = (e, d_system, d_state)
             return jax.jvp(lambda p, system, state: function(p, system, state, t), (p, system, state_), tangents)
 

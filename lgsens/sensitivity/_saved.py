@@ -43,7 +43,7 @@ class _Shown(eqx.Module):
     scheme: AbstractScheme = eqx.field(static=True)
 
     def __call__(self, system, state: State, t):
-        return self.output(system, self.scheme.physical(state), t)
+        return self.output(system, self.scheme.physical(system, state), t)
 
 
 def saved_run(

@@ -78,7 +78,7 @@ def describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> st
         violation = np.abs(details["violation"])
         worst = int(np.argmax(np.where(np.isfinite(violation), violation, np.inf)))
         return (
-            f"{code.message} It failed at position {int(details['position'])}, driven values "
+            f"{code.message} It failed at position {int(details['position'])}, driven values and time "
             f"{np.array2string(details['values'], precision=6)}. Left over: |Φ| = {violation[worst]:.3g}, largest in "
             f"joint {names[worst]!r}."
         )

@@ -139,10 +139,10 @@ class _Problem(eqx.Module):
         vdot, _ = factorized_accelerations(self.inertia, self.system, group.retract(q, local.x), local.v, t)
         return _Local(group.tangent_inv_mv(local.x, local.v), vdot)
 
-    def projected(self, q, v):
+    def projected(self, q, v, t):
         """q and v on the constraints, and the drift taken out."""
-        found = projection(self.inertia, self.system, jnp.zeros_like(v), q, v)
-        drift = jnp.max(jnp.abs(self.system.constraint(q)), initial=0.0)
+        found = projection(self.inertia, self.system, jnp.zeros_like(v), q, v, t)
+        drift = jnp.max(jnp.abs(self.system.constraint(q, t)), initial=0.0)
         return found.projected, v + found.d, lax.stop_gradient(drift)
 
 
@@ -221,8 +221,9 @@ def _controlled(settings: IndexReducedODE, num_steps: int, problem: _Problem, fi
 
     def interval(problem: _Problem, begin: State, n, running):
         local, finished, steps = _adaptive(settings, problem, begin.q, begin.v, t0 + n * h, h, running)
-        q, v, drift = problem.projected(problem.system.group.retract(begin.q, local.x), local.v)
-        vdot, lam = factorized_accelerations(problem.inertia, problem.system, q, v, t0 + (n + 1) * h)
+        end = t0 + (n + 1) * h
+        q, v, drift = problem.projected(problem.system.group.retract(begin.q, local.x), local.v, end)
+        vdot, lam = factorized_accelerations(problem.inertia, problem.system, q, v, end)
         return State(q=q, v=v, vdot=vdot, lam=lam, a=vdot), drift, finished, steps
 
     # In reverse mode nothing is kept of an interval but how it begins.

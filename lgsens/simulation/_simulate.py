@@ -15,6 +15,7 @@ from lgsens.dynamics import (
     Initial,
     State,
     equilibrium as _equilibrium,
+    full_jacobian,
     initial_state as _initial,
     unsteady_rate,
 )
@@ -72,7 +73,7 @@ def initial_state(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) 
     system = as_system(model)
     t0 = as_float(t0, (), "`t0`")
     initial = _initial_jit(system, t0)
-    return _checked(system, initial, throw)
+    return _checked(system, initial, t0, throw)
 
 
 def equilibrium(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) -> State:
@@ -90,7 +91,7 @@ def equilibrium(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) ->
     """
     system = as_system(model)
     t0 = as_float(t0, (), "`t0`")
-    return _checked(system, _equilibrium_jit(system, t0), throw)
+    return _checked(system, _equilibrium_jit(system, t0), t0, throw)
 
 
 @eqx.filter_jit
@@ -103,10 +104,10 @@ def _equilibrium_jit(system, t0) -> Initial:
     return _equilibrium(system, t0)
 
 
-def _checked(system: AbstractSystem, initial: Initial, throw: bool) -> State:
+def _checked(system: AbstractSystem, initial: Initial, t0, throw: bool) -> State:
     if not throw:
         return initial.state
-    details = {"violation": initial.violation, "jacobian": system.constraint_jacobian(initial.state.q)}
+    details = {"violation": initial.violation, "jacobian": full_jacobian(system, initial.state.q, t0)}
     return throw_if_failed(initial.state, initial.result, details, system.constraint_names)
 
 
@@ -306,9 +307,9 @@ def run(
     result, details = outcome(scheme, begun, newton, turns, t, laid)
     stats = newton if laid.stats is None else laid.stats
     if save is None:
-        found = Trajectory(t=t, states=scheme.physical(states), result=result, stats=stats, system=system)
+        found = Trajectory(t=t, states=scheme.physical(system, states), result=result, stats=stats, system=system)
     else:
-        found = Saved(t, values, scheme.physical(final), result, stats)
+        found = Saved(t, values, scheme.physical(system, final), result, stats)
     return found, details | jax.lax.stop_gradient({"t1": t1})
 
 

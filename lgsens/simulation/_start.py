@@ -27,11 +27,11 @@ def begin(
 ) -> Begin:
     """The state at t0: `state0` as it is, or the consistent one of the reference configuration, `initial` if known."""
     if state0 is not None:
-        jacobian, start = constraint_jacobian(system, state0.q), Start(scheme.complete(system, state0))
+        jacobian, start = constraint_jacobian(system, state0.q, t0), Start(scheme.complete(system, state0))
         none = jnp.zeros((), jnp.int32)
-        return Begin(start, jnp.zeros_like(state0.v), state0.v, none, system.constraint(state0.q), jacobian)
+        return Begin(start, jnp.zeros_like(state0.v), state0.v, none, system.constraint(state0.q, t0), jacobian)
     initial = initial_state(system, t0) if initial is None else initial
     usable = initial.result == RESULTS.successful
-    start = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), scheme.start(system, initial))
-    jacobian = constraint_jacobian(system, initial.state.q)
+    start = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), scheme.start(system, initial, t0))
+    jacobian = constraint_jacobian(system, initial.state.q, t0)
     return Begin(start, initial.jerk, initial.state.v, initial.result, initial.violation, jacobian)

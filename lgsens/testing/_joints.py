@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lgsens._validate import as_float
 from lgsens.model import (
     AbstractClosedFormConstraint,
     AbstractConstraint,
@@ -27,6 +28,7 @@ def check_joint(
     *,
     bodies: Mapping[str, RigidBody] | None = None,
     length: float = 1.0,
+    t: float = 0.0,
     poses: int = 3,
     seed: int = 0,
 ) -> Report:
@@ -44,12 +46,13 @@ def check_joint(
         joint: an `AbstractJoint` or an `AbstractConstraint`.
         bodies: the bodies that a joint names, in its reference configuration; None: bodies at random poses.
         length: size of the scene [m], shape (): random poses and steps of differences are in proportion.
+        t: the time at which what is prescribed is taken [s].
         poses: how many random poses.
         seed: of poses and multipliers.
 
     Returns a `Report`; a row holds the worst of all poses. Raises `ValueError` for a Φ that has not `num_rows` entries.
     """
-    scene = Poses(seed, length)
+    scene, time = Poses(seed, length), as_float(t, (), "`t`")
     is_joint = isinstance(joint, AbstractJoint)
     names = (joint.a, joint.b) if is_joint else ("a", "b")
     bodies = scene.bodies([name for name in names if name is not None]) if bodies is None else bodies
@@ -62,7 +65,7 @@ def check_joint(
     labels = [f"{i + 1} {type(e).__name__}: " for i, e in enumerate(elements)] if is_joint else [""]
     multipliers = []
     for label, element in zip(labels, elements):
-        rows = jax.eval_shape(element.value, a, b).shape
+        rows = jax.eval_shape(element.value, a, b, time).shape
         if rows != (element.num_rows,):
             raise ValueError(
                 f"{label or f'{type(element).__name__}: '}`value` has shape {rows}, `num_rows` is {element.num_rows}."
@@ -70,9 +73,9 @@ def check_joint(
         multipliers.append(jnp.asarray(scene.rng.standard_normal(rows), scene.dtype))
     starts = [scene.displacement(free) for _ in range(poses)]
 
-    checks: list[Check] = list(_reference(joint, scene, a, b, free)) if is_joint else []
+    checks: list[Check] = list(_reference(joint, scene, a, b, time, free)) if is_joint else []
     for label, element, lam in zip(labels, elements, multipliers):
-        program = _program(element, lam, free)
+        program = _program(element, lam, time, free)
         for start in starts:
             first, second = displaced(a, b, start)
             found = scene.sampled(program(scene.points(free), first, second), free)
@@ -82,7 +85,11 @@ def check_joint(
     def numbers(joint):
         frames = displaced(a, b, starts[0])
         return [
-            (e.value(*frames), constraint_force(e, *frames, lam), constraint_stiffness(e, *frames, lam))
+            (
+                e.value(*frames, time),
+                constraint_force(e, *frames, lam, time),
+                constraint_stiffness(e, *frames, lam, time),
+            )
             for e, lam in zip(elements_of(joint), multipliers)
         ]
 
@@ -91,7 +98,7 @@ def check_joint(
     return Report(f"{type(joint).__name__}, {poses} poses", worst(checks))
 
 
-def _program(element: AbstractConstraint, lam, free):
+def _program(element: AbstractConstraint, lam, t, free):
     """What a constraint says, and what follows from its value, at displacements x of two frames."""
     zero = jnp.zeros(DIM, lam.dtype)
     acts = np.isin(np.arange(DIM), element.acts_on)  # what is taken of B
@@ -100,18 +107,18 @@ def _program(element: AbstractConstraint, lam, free):
         coupled[np.ix_(places, places)] = True
 
     def jacobian(a, b):
-        return jax.jacfwd(lambda y: element.value(*displaced(a, b, y)))(zero)
+        return jax.jacfwd(lambda y: element.value(*displaced(a, b, y), t))(zero)
 
     def quantities(x, a, b):
         a, b = displaced(a, b, x)
         force = lambda y: lam @ jacobian(*displaced(a, b, y))
         return {
-            "Φ": element.value(a, b),
-            "B": jnp.where(acts, constraint_jacobian(element, a, b), 0.0)[:, free],
+            "Φ": element.value(a, b, t),
+            "B": jnp.where(acts, constraint_jacobian(element, a, b, t), 0.0)[:, free],
             "B by autodiff": jacobian(a, b)[:, free],
-            "force": jnp.where(acts, constraint_force(element, a, b, lam), 0.0)[free],
+            "force": jnp.where(acts, constraint_force(element, a, b, lam, t), 0.0)[free],
             "force by autodiff": force(zero)[free],
-            "K": jnp.where(coupled, constraint_stiffness(element, a, b, lam), 0.0)[free][:, free],
+            "K": jnp.where(coupled, constraint_stiffness(element, a, b, lam, t), 0.0)[free][:, free],
             "K by autodiff": jax.jacfwd(force)(zero)[free][:, free],
         }
 
@@ -128,7 +135,7 @@ def _compared(label: str, given: bool, found) -> Iterator[Check]:
     yield slope(stiffness, found["K by autodiff"], found["force by autodiff"])
 
 
-def _reference(joint: AbstractJoint, scene: Poses, a, b, free) -> Iterator[Check]:
+def _reference(joint: AbstractJoint, scene: Poses, a, b, t, free) -> Iterator[Check]:
     """Φ = 0 and full rank of B where the joint was made; moved with the bodies, it is made elsewhere."""
 
     @jax.jit
@@ -137,8 +144,8 @@ def _reference(joint: AbstractJoint, scene: Poses, a, b, free) -> Iterator[Check
         frames = displaced(a, b, x)
         elements = joint.constraints(*frames)
         return {
-            "Φ": jnp.concatenate([element.value(*frames) for element in elements]),
-            "B": jnp.concatenate([constraint_jacobian(element, *frames) for element in elements])[:, free],
+            "Φ": jnp.concatenate([element.value(*frames, t) for element in elements]),
+            "B": jnp.concatenate([constraint_jacobian(element, *frames, t) for element in elements])[:, free],
         }
 
     found = scene.sampled(at(scene.points(free)), free)

@@ -159,7 +159,7 @@ def trimmed(car):
         return (
             model,
             system.residual(q, zero, zero, lam, jnp.zeros_like(car.tyre_stiffness)),
-            system.constraint_jacobian(q),
+            system.constraint_jacobian(q, 0.0),
         )
 
     return {wheel: at_design(car.model(wheel=wheel)) for wheel in WHEELS}
@@ -225,7 +225,7 @@ def test_quarter_car_rests_at_its_design_position(car, design):
     # The wheel turns without stiffness: the cutoff of the pseudo-inverse is all that holds it.
     assert turned[wheel] < 1e-9
     np.testing.assert_array_equal(state.v, np.zeros(48))
-    assert np.abs(system.constraint(state.q)).max() < 1e-13  # some hundred round-offs of 1 m
+    assert np.abs(system.constraint(state.q, 0.0)).max() < 1e-13  # some hundred round-offs of 1 m
 
 
 def test_quarter_car_settles_on_a_spring_of_another_rate(car, design):

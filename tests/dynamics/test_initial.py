@@ -40,7 +40,7 @@ def matrices(model, state):
     """M, B and r."""
     system = model.system()
     residual = system.residual(state.q, state.v, state.vdot, state.lam, TIME)
-    return system.mass_matrix(), system.constraint_jacobian(state.q), residual
+    return system.mass_matrix(), system.constraint_jacobian(state.q, 0.0), residual
 
 
 @pytest.fixture(scope="module", params=range(3))
@@ -93,7 +93,7 @@ def along(model, state):
     system = model.system()
 
     def value(s):
-        return system.constraint(system.group.retract(state.q, s * state.v + s**2 / 2 * state.vdot))
+        return system.constraint(system.group.retract(state.q, s * state.v + s**2 / 2 * state.vdot), 0.0)
 
     rate = lambda s: jax.jvp(value, (s,), (jnp.ones_like(s),))[1]
     return value(0.0 * TIME), *jax.jvp(rate, (0.0 * TIME,), (jnp.ones_like(TIME),))
@@ -224,9 +224,9 @@ def assembled(model):
     """The assembled pose as x with q = q_ref exp(x̃), Φ there, and M and B at the reference."""
     system = model.system()
     group = system.group
-    q, violation = assemble(system)
+    q, violation = assemble(system, 0.0)
     x = group.log(group.compose(group.inverse(system.pose), q))
-    return x, violation, system.mass_matrix(), system.constraint_jacobian(system.pose)
+    return x, violation, system.mass_matrix(), system.constraint_jacobian(system.pose, 0.0)
 
 
 def test_assembly_moves_along_the_constraint_directions():

@@ -138,7 +138,7 @@ def test_levels_in_a_loop(first, kind):
     assert len(equal) == len(some) - first + (first == 0)  # three clusters are two and two, one of them filled up
     plan, looped = Elimination(some, size), Elimination([*some[:first], *equal], size, len(equal))
     q, v = system.reference()
-    mass, jacobian = system.sparse_mass_matrix(), system.sparse_constraint_jacobian(q)
+    mass, jacobian = system.sparse_mass_matrix(), system.sparse_constraint_jacobian(q, 0.0)
     # not symmetric: K and its transpose exchange X and Y
     dynamic = mass + 0.3 * tangents(system, q, v, v, jnp.ones(jacobian.shape[0]), jnp.zeros(())).stiffness
     factors = [Factors.of(dynamic, jacobian.T, jacobian, jnp.ones(()), plan=p, kind=kind) for p in (plan, looped)]
@@ -173,7 +173,7 @@ def test_everything_is_eliminated_once():
 def test_joints_go_with_bodies_that_hold_them(name, early):
     """Rows of B of joints that are gone are independent in the columns of bodies that are gone, level after level."""
     system = (SCENES | {"suspension": lambda: QuarterCar.load().model()})[name]().system()
-    rows_of_all = np.asarray(system.constraint_jacobian(system.reference()[0]))
+    rows_of_all = np.asarray(system.constraint_jacobian(system.reference()[0], 0.0))
     k = rows_of_all.shape[1]
     gone, incomplete = np.zeros(0, int), False
     for own, _ in levels(system.topology._graph, early=early):
@@ -267,8 +267,8 @@ def two_hinges(*, apart: bool) -> lg.Model:
 @pytest.mark.slow
 def test_redundant_constraints_are_found_and_named():
     good, bad = (two_hinges(apart=apart).system() for apart in (True, False))
-    assert not is_redundant(good, good.sparse_constraint_jacobian(good.pose))
-    assert is_redundant(bad, bad.sparse_constraint_jacobian(bad.pose))
+    assert not is_redundant(good, good.sparse_constraint_jacobian(good.pose, 0.0))
+    assert is_redundant(bad, bad.sparse_constraint_jacobian(bad.pose, 0.0))
     assert int(initial_state(good, jnp.asarray(0.0)).result) == lg.RESULTS.successful
     with pytest.raises(ValueError, match=r"\['high', 'low'\]"):
         lg.simulate(bad, t1=0.1, num_steps=10)
@@ -290,10 +290,10 @@ def test_single_precision_after_double():
         with jax.enable_x64(enabled):
             system = dataclasses.replace(spatial_chain(9).system(), linear_solver=lg.BlockSparse())
             q, v = system.reference()
-            jacobian = system.sparse_constraint_jacobian(q)
+            jacobian = system.sparse_constraint_jacobian(q, 0.0)
             mass = system.sparse_mass_matrix()
             ones, none = jnp.ones_like(v), jnp.zeros(jacobian.shape[0], v.dtype)
-            x, mu = ConstrainedMass.of(system, q).solve(mass @ ones, none)
+            x, mu = ConstrainedMass.of(system, q, 0.0).solve(mass @ ones, none)
             left = mass @ x + mu @ jacobian - mass @ ones
             # a sum of a dozen terms, through a condition below 1e3
             assert float(jnp.abs(left).max()) < 1e3 * float(jnp.finfo(v.dtype).eps) * float(jnp.abs(mass @ ones).max())

@@ -60,7 +60,7 @@ def sample(name, seed=0):
 @eqx.filter_jit
 @eqx.filter_vmap
 def closed_form(element, a, b, lam):
-    return element.value(a, b), element.jacobian(a, b), element.geometric_stiffness(a, b, lam)
+    return element.value(a, b, 0.0), element.jacobian(a, b, 0.0), element.geometric_stiffness(a, b, lam, 0.0)
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -103,7 +103,7 @@ class UserCoincidence(AbstractConstraint):
     def num_rows(self):
         return 3
 
-    def value(self, a, b):
+    def value(self, a, b, t):
         return b.position + b.orientation @ self.point_b - (a.position + a.orientation @ self.point_a)
 
 
@@ -116,7 +116,7 @@ class UserDistance(AbstractConstraint):
     def num_rows(self):
         return 1
 
-    def value(self, a, b):
+    def value(self, a, b, t):
         first = a.position + a.orientation @ self.point_a
         second = b.position + b.orientation @ self.point_b
         return jnp.sqrt(jnp.sum((second - first) ** 2, keepdims=True)) - self.length[None]
@@ -167,7 +167,7 @@ def users_scene(own: bool):
 @eqx.filter_jit
 def evaluate(model, point):
     system = model.system()
-    return system.residual(*point), system.constraint(point.q), system.tangents(*point)
+    return system.residual(*point), system.constraint(point.q, point.t), system.tangents(*point)
 
 
 def test_constraint_without_tangents_gets_them():
@@ -239,7 +239,7 @@ def test_only_what_elements_act_on_is_added():
     joints = {"hinge": lg.RevoluteJoint("one", "two", at=jnp.zeros(3), axis=jnp.asarray([0.0, 0.0, 1.0]))}
     system = lg.Model(bodies, joints, {"gravity": lg.Gravity(GRAVITY)}).system()
     q, _ = system.reference()
-    assert [part.values.shape for part in system.sparse_constraint_jacobian(q).parts] == [(1, 3, 12), (2, 1, 6)]
+    assert [part.values.shape for part in system.sparse_constraint_jacobian(q, 0.0).parts] == [(1, 3, 12), (2, 1, 6)]
     assert [places.shape for places in system.topology.forces] == [(2, 3)]
 
 

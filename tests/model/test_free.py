@@ -33,7 +33,7 @@ def differentiated(system, point):
 
 @eqx.filter_jit
 def evaluate(system, point):
-    return system.residual(*point), system.constraint(point.q), system.tangents(*point), system.mass_matrix()
+    return system.residual(*point), system.constraint(point.q, point.t), system.tangents(*point), system.mass_matrix()
 
 
 @pytest.fixture(scope="module")

@@ -115,7 +115,7 @@ def test_joints_keep_the_equations_that_can_be_violated(name):
     model = lg.Model(bodies, {"joint": joint("a", None if other is None else "b")})
     assert model.summary().equations == {"joint": equations}
     system = model.system()
-    jacobian = np.asarray(system.constraint_jacobian(system.pose))
+    jacobian = np.asarray(system.constraint_jacobian(system.pose, 0.0))
     assert jacobian.shape == (equations, system.group.dim)
     assert np.abs(jacobian).max(axis=1).min() > 0.1  # arms and axes of length 1
 

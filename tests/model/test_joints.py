@@ -134,7 +134,7 @@ def scene(name, side, seed=0, axis=AXIS, **body):
 @eqx.filter_jit
 def evaluate(model, q):
     system = model.system()
-    return system.constraint(q), system.constraint_jacobian(q)
+    return system.constraint(q, 0.0), system.constraint_jacobian(q, 0.0)
 
 
 def placed(model, displacements) -> Pose:

@@ -36,7 +36,7 @@ class Leash(AbstractConstraint):
     def num_rows(self):
         return 1
 
-    def value(self, a, b):
+    def value(self, a, b, t):
         return jnp.sum(a.position * b.orientation[0])[None] - self.product
 
 

@@ -60,7 +60,7 @@ def test_constraints_are_those_of_each_joint(scene):
     system = scene.system()
     rng = np.random.default_rng(1)
     q = system.group.retract(system.pose, jnp.asarray(rng.standard_normal(system.group.dim)))
-    found = np.asarray(system.constraint(q))
+    found = np.asarray(system.constraint(q, 0.0))
 
     def frame(name, of):
         if name is None:
@@ -73,7 +73,7 @@ def test_constraints_are_those_of_each_joint(scene):
     )
     for name, joint in scene.joints.items():
         elements = joint.constraints(frame(joint.a, system.pose), frame(joint.b, system.pose))
-        moved = [element.value(frame(joint.a, q), frame(joint.b, q)) for element in elements]
+        moved = [element.value(frame(joint.a, q), frame(joint.b, q), 0.0) for element in elements]
         # the same products of numbers of order one, perhaps added in another order
         np.testing.assert_allclose(found[system.multiplier_rows(name)], np.concatenate(moved), atol=1e-13)
 

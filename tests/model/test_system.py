@@ -25,7 +25,7 @@ from lgsens.liegroups import Pose
 @eqx.filter_jit
 def evaluate(system, point):
     """What the system says, compiled once for the scene with everything."""
-    return system.residual(*point), system.constraint(point.q), system.tangents(*point)
+    return system.residual(*point), system.constraint(point.q, point.t), system.tangents(*point)
 
 
 @eqx.filter_jit

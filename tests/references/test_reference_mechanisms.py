@@ -79,7 +79,7 @@ def test_motion_of_the_slider_crank():
 def test_the_slider_crank_moves_in_its_plane():
     """One degree of freedom, 17 independent equations; nothing leaves the plane or turns out of it."""
     system = slider_crank().system()
-    jacobian = np.asarray(system.constraint_jacobian(system.reference()[0]))
+    jacobian = np.asarray(system.constraint_jacobian(system.reference()[0], 0.0))
     assert jacobian.shape == (17, 18)
     assert np.linalg.matrix_rank(jacobian) == 17
     trajectory = runs("slider_crank_sundials")[1].trajectory
@@ -88,7 +88,7 @@ def test_the_slider_crank_moves_in_its_plane():
         # Newton leaves the square of its tolerance of 1e-10; round-off of 1000 steps is what there is
         assert float(jnp.abs(body.position[:, 2]).max()) <= 1e-13
         assert float(jnp.abs(body.orientation[:, :2, 2]).max()) <= 1e-13
-    jacobians = jax.vmap(trajectory.system.constraint_jacobian)(trajectory.states.q)
+    jacobians = jax.vmap(trajectory.system.constraint_jacobian)(trajectory.states.q, trajectory.t)
     # far from a singular configuration all the way: the crank is shorter than the rod
     assert float(jnp.linalg.svd(jacobians, compute_uv=False)[:, -1].min()) > 0.1
 
@@ -141,6 +141,6 @@ def test_motion_of_the_four_bar():
 
     check_states("four_bar_spring", document("four_bar_spring.json")["states"], observe, expect)
     system = four_bar().system()
-    jacobian = np.asarray(system.constraint_jacobian(system.reference()[0]))
+    jacobian = np.asarray(system.constraint_jacobian(system.reference()[0], 0.0))
     assert jacobian.shape == (17, 18)
     assert np.linalg.matrix_rank(jacobian) == 17

@@ -47,13 +47,13 @@ class Gyropendulum(lg.AbstractSystem):
         pull = self.coupling * rotation[0, :2]
         torque = self.coupling * jnp.cross(jnp.eye(3)[0], rotation.T @ jnp.concatenate([x, jnp.zeros(1)]))
         force = jnp.concatenate([pull * jnp.cos(t), gyroscopic + torque])
-        return self.mass_matrix() @ vdot + force + lam @ self.constraint_jacobian(q)
+        return self.mass_matrix() @ vdot + force + lam @ self.constraint_jacobian(q, t)
 
-    def constraint(self, q):
+    def constraint(self, q, t):
         return (jnp.linalg.norm(q[0]) - self.length)[None]
 
-    def constraint_jacobian(self, q):
-        return autodiff_constraint_jacobian(self, q)
+    def constraint_jacobian(self, q, t):
+        return autodiff_constraint_jacobian(self, q, t)
 
     def tangents(self, q, v, vdot, lam, t):
         return autodiff_tangents(self, q, v, vdot, lam, t)

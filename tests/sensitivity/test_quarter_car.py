@@ -31,7 +31,7 @@ def comfort(trajectory):
 def test_mechanism(wheel, constraints, freedoms):
     system = CAR.model(wheel=wheel).system()
     q, _ = system.reference()
-    jacobian = np.asarray(system.constraint_jacobian(q))
+    jacobian = np.asarray(system.constraint_jacobian(q, 0.0))
     assert jacobian.shape == (constraints, 48)
     assert 48 - np.linalg.matrix_rank(jacobian) == freedoms
 

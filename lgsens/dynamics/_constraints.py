@@ -1,0 +1,65 @@
+"""Constraints with time and level: J, Φ̇ and Φ̈ of all rows, in one place.
+
+The rows of a system are m_p at position level and m_v at velocity level (nonholonomic),
+
+    Φ(q, t) = 0,     A(q, t) v + b(q, t) = 0,     λ = [λ_p; λ_v],
+
+and the dynamic equilibrium holds Bᵀλ_p + Aᵀλ_v with DΦ·(q w̃) = B w. Once differentiated along the motion, q̇ = q ṽ, all
+of them are affine in v with the same matrix J that the multipliers see:
+
+    c(q, v, t) = [B v + Φ_t; A v + b] = J v + c(q, 0, t),     J = [B; A].
+
+So the rows of a level hold consistently where Φ = 0 and c = 0, and at acceleration level
+
+    d/dt c = Dc·(q ṽ) + J v̇ + c_t = J v̇ + γ(q, v, t),
+
+with γ = [D²Φ·(q ṽ, q ṽ) + 2 DΦ_t·(q ṽ) + Φ_tt; …] one directional derivative of c along (q ṽ, 0, 1): Φ is
+differentiated in q and t together, and no derivative is written by hand. Where a row does not depend on t, its tangent
+is a symbolic zero of JAX: scenes without a prescribed motion compile what they would compile without t.
+
+At a given (q, t) the velocities that are consistent differ by what J allows: a correction of v is split by the
+homogeneous J x = 0, a velocity is made consistent by J v = −c(q, 0, t) (`_initial`).
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem
+
+
+def full_jacobian(system: AbstractSystem, q, t) -> Float[Array, "m k"]:
+    """J = [B; A]."""
+    if isinstance(system, AbstractSparseSystem):
+        return system.sparse_constraint_jacobian(q, t).dense()
+    jacobian = system.constraint_jacobian(q, t)
+    return jnp.concatenate([jacobian, system.velocity_jacobian(q, t)]) if system.num_velocity_rows else jacobian
+
+
+def _with_level(system: AbstractSystem, q, v, t, rate) -> Float[Array, " m"]:
+    """The rate of Φ, and the rows of velocity level if there are any."""
+    return jnp.concatenate([rate, system.velocity_constraint(q, v, t)]) if system.num_velocity_rows else rate
+
+
+def constraint_velocity(system: AbstractSystem, q, v, t) -> Float[Array, " m"]:
+    """c = [B v + Φ_t; A v + b], without J."""
+    motion = system.group.to_ambient(q, v), jnp.ones_like(t)
+    return _with_level(system, q, v, t, jax.jvp(system.constraint, (q, t), motion)[1])
+
+
+def prescribed_velocity(system: AbstractSystem, q, t) -> Float[Array, " m"]:
+    """c(q, 0, t) = [Φ_t; b]: what the rows say of a mechanism that does not move; zero where none depends on time."""
+    _, rate = jax.jvp(lambda t: system.constraint(q, t), (t,), (jnp.ones_like(t),))
+    return _with_level(system, q, jnp.zeros_like(system.reference()[1]), t, rate)
+
+
+def constraint_acceleration(system: AbstractSystem, q, v, vdot, t) -> Float[Array, " m"]:
+    """d/dt c = J v̇ + γ of the motion through (q, v) at t with the acceleration v̇."""
+    motion = system.group.to_ambient(q, v), vdot, jnp.ones_like(t)
+    return jax.jvp(lambda q, v, t: constraint_velocity(system, q, v, t), (q, v, t), motion)[1]
+
+
+def fixed_velocity_rate(system: AbstractSystem, q, v, t) -> Float[Array, " m"]:
+    """γ: d/dt c at v̇ = 0."""
+    motion = system.group.to_ambient(q, v), jnp.ones_like(t)
+    return jax.jvp(lambda q, t: constraint_velocity(system, q, v, t), (q, t), motion)[1]

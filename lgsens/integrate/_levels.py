@@ -1,0 +1,215 @@
+"""The step of `_level_step.py`, linearized, and what all steps share.
+
+The rows and columns are those of `_index3.py`, with ν' as the last part of λ'. With y = N ν
+
+    M y' = B_nᵀ ν' + G w_n + g_p p',   G w = D(Bᵀν)·(q w̃) at q_n,   g_p p' = (Bᵀν)_p p' − (M_p p') y
+    x'   = h v'_n + h² ((½ − β) a'_n + β (a'_{n+1} + y')) + x_h h',      x_h = v_n + 2h ((½ − β) a_n + β (u + y))
+    (c) (C v'_{n+1} + V w_{n+1} + c_p p')/(γh) = b.lam there,      c = [B v + Φ_t; A v + b], C = ∂c/∂v, V by q
+
+all other rows are as there. Forwards, from (w, v', v̇')_0 at u' = ν' = 0, S₂ exact,
+
+    S₂ [u'; λ'; ν'] = [ b.a − r_p p' − (M v̇'_0 + C_t v'_0 + K_t w_0);
+                        b.lam − [(Φ_p p' + B w_0)/(βh²); (c_p p' + C v'_0 + V w_0)/(γh)] ]
+
+and w = w_0 + βh² T (u' + N ν').
+
+Backwards, with μ_Φ and μ_c the multipliers of the rows over βh² and γh,
+
+    μ.w + K_tᵀ μ.a + Bᵀ μ_Φ + Vᵀ μ_c = c.w
+    μ.v + C_tᵀ μ.a + Cᵀ μ_c          = c.v
+    −βh² Nᵀ Tᵀ μ.w                   = c.nu
+
+and the rest as there. Elimination of μ.w, μ.v, μ.vdot leaves
+
+    S₂ᵀ [μ.a; μ.lam] = [ c.a + βh² Tᵀ c.w + γh c.v + c c.vdot;  c.lam;  c.nu + βh² Nᵀ Tᵀ c.w ].
+
+The columns of step n receive besides, with μ_y = βh² M⁻¹ Tᵀ μ.w,
+
+    c_n.w += Gᵀ μ_y,      p̄ += −c_pᵀ μ_c + g_pᵀ μ_y.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from lgsens.dynamics import AbstractSystem, State, full_jacobian, require_independent
+from lgsens.integrate._alpha import AbstractAlpha, increment
+from lgsens.integrate._alpha_step import AbstractEquations
+from lgsens.integrate._level_step import Counts, LevelFactors, LevelStep, LevelTangents, by_configuration
+from lgsens.integrate._linearized import AbstractLinearizedStep, Variation
+from lgsens.integrate._singular import margin_by_mass
+from lgsens.liegroups import AbstractLieGroup
+
+
+class Loads(NamedTuple):
+    """What the equations of a step depend on the parameters by."""
+
+    residual: Float[Array, " k"]
+    violation: Float[Array, " p"]  # Φ
+    rate: Float[Array, " c"]  # c
+    correction: Float[Array, " k"]  # Bᵀν − M y
+    x: Float[Array, " k"]
+    v: Float[Array, " k"]
+
+
+class LevelLinearizedStep(AbstractLinearizedStep):
+    """The equations above, and the factors of S₂ at the converged state."""
+
+    scheme: AbstractAlpha = eqx.field(static=True)
+    group: AbstractLieGroup = eqx.field(static=True)
+    counts: Counts = eqx.field(static=True)
+    mass: Float[Array, "k k"]
+    inverse_mass: Float[Array, "k k"]
+    h: Float[Array, ""]
+    x: Float[Array, " k"]
+    tangents: LevelTangents
+    normal: Float[Array, "k b"]  # N
+    curvature: Float[Array, "k k"]  # G
+    factors: LevelFactors
+
+    def margin(self, scale):
+        """Not known: that of these factors says nothing."""
+        return None
+
+    @property
+    def _jacobians(self):
+        """B and C."""
+        counts, jacobian = self.counts, self.tangents.jacobian
+        return jacobian[: counts.positions], jacobian[counts.positions - counts.both :]
+
+    def forward(self, previous, loads, row):
+        scheme, group, h, x, counts = self.scheme, self.group, self.h, self.x, self.counts
+        position, velocity = scheme.beta * h**2, scheme.gamma * h
+        k_t, c_t, _, rate_stiffness = self.tangents
+        of_positions, of_rates = self._jacobians
+        dy = self.inverse_mass @ (self.curvature @ previous.w + loads.correction)
+        dx = h * previous.v + (h**2 * (0.5 - scheme.beta)) * previous.a + loads.x + position * dy
+        w = group.Ad_inv_mv(group.exp(x), previous.w) + group.tangent_mv(x, dx) + row.w
+        v = previous.v + (h * (1.0 - scheme.gamma)) * previous.a + loads.v + row.v
+        vdot = (scheme.alpha_m * previous.a - scheme.alpha_f * previous.vdot) / (1.0 - scheme.alpha_f) + row.vdot
+        left = counts.as_rows(
+            (loads.violation + of_positions @ w) / position, (loads.rate + of_rates @ v + rate_stiffness @ w) / velocity
+        )
+        u, lam = self.factors.solve(row.a - loads.residual - (self.mass @ vdot + c_t @ v + k_t @ w), row.lam - left)
+        return Variation(
+            w=w + group.tangent_mv(x, position * (u + self.normal @ lam[counts.multipliers :])),
+            v=v + velocity * u,
+            vdot=vdot + scheme.inertia_factor * u,
+            lam=lam,
+            a=u,
+        )
+
+    def backward(self, c, loads):
+        scheme, group, h, x, m = self.scheme, self.group, self.h, self.x, self.counts.multipliers
+        position, velocity = scheme.beta * h**2, scheme.gamma * h
+        alpha_m, alpha_f = scheme.alpha_m, scheme.alpha_f
+        k_t, c_t, _, rate_stiffness = self.tangents
+        of_positions, of_rates = self._jacobians
+        turned = position * group.tangent_rmv(x, c.w)
+        mu_a, mu_lam = self.factors.solve(
+            c.a + turned + velocity * c.v + scheme.inertia_factor * c.vdot,
+            jnp.concatenate([c.lam[:m], c.lam[m:] + turned @ self.normal]),
+            transposed=True,
+        )
+        phi, rate = self.counts.apart(mu_lam)
+        phi, rate = phi / position, rate / velocity
+        mu_w = c.w - mu_a @ k_t - phi @ of_positions - rate @ rate_stiffness
+        mu_v = c.v - mu_a @ c_t - rate @ of_rates
+        mu_vdot = c.vdot - mu_a @ self.mass
+        mu_x = group.tangent_rmv(x, mu_w)
+        mu_y = position * (self.inverse_mass @ mu_x)
+        previous = Variation(
+            w=group.Ad_inv_rmv(group.exp(x), mu_w) + mu_y @ self.curvature,
+            v=h * mu_x + mu_v,
+            vdot=-(alpha_f / (1.0 - alpha_f)) * mu_vdot,
+            lam=jnp.zeros_like(c.lam),
+            a=(h**2 * (0.5 - scheme.beta)) * mu_x
+            + (h * (1.0 - scheme.gamma)) * mu_v
+            + (alpha_m / (1.0 - alpha_f)) * mu_vdot,
+        )
+        of_loads = Loads(-mu_a, -phi, -rate, mu_y, mu_x, mu_v)
+        return previous, of_loads, Variation(mu_w, mu_v, mu_vdot, mu_lam, mu_a)
+
+
+class Levels(AbstractEquations):
+    """The equations of a step with rows of velocity level."""
+
+    scheme: AbstractAlpha = eqx.field(static=True)
+    counts: Counts = eqx.field(static=True)
+    system: AbstractSystem
+    mass: Float[Array, "k k"]
+    inverse_mass: Float[Array, "k k"]
+    scale: Float[Array, " k"]
+
+    @classmethod
+    def of(cls, scheme, system):
+        require_independent(system, "A step with constraints of velocity level (`stabilized`, nonholonomic)")
+        mass, counts = system.mass_matrix(), Counts.of(scheme, system)
+        return cls(scheme, counts, system, mass, jnp.linalg.inv(mass), system.coordinate_scale())
+
+    @staticmethod
+    def numbers(scheme, system):
+        counts = Counts.of(scheme, system)
+        return (system.group.dim + counts.multipliers + counts.both) ** 2
+
+    def _correction(self, system: AbstractSystem, q, nu, t):
+        """Bᵀν."""
+        return nu @ system.constraint_jacobian(q, t) if self.counts.both else jnp.zeros_like(self.scale)
+
+    def loads(self, previous, state):
+        scheme, counts, before = self.scheme, self.counts, previous.q
+        lam, nu = state.lam[: counts.multipliers], state.lam[counts.multipliers :]
+
+        def function(system, node):
+            h = node.h
+            y = lax.stop_gradient(self.inverse_mass @ self._correction(system, before, nu, node.begin))
+            return Loads(
+                residual=system.residual(state.q, state.v, state.vdot, lam, node.t),
+                violation=system.constraint(state.q, node.t),
+                rate=counts.rate(system, state.q, state.v, node.t),
+                correction=self._correction(system, before, nu, node.begin) - system.mass_matrix() @ y,
+                x=increment(scheme, previous, state.a + y, h),
+                v=h * ((1.0 - scheme.gamma) * previous.a + scheme.gamma * state.a),
+            )
+
+        return function
+
+    @property
+    def unknowns(self):
+        return self.system.group.dim + self.counts.multipliers + self.counts.both
+
+    def step(self, previous, node):
+        return LevelStep(self, previous, self._normal(previous, node), node.h)
+
+    def _normal(self, previous: State, node):
+        if not self.counts.both:
+            return jnp.zeros((self.scale.shape[0], 0), self.scale.dtype)
+        return self.inverse_mass @ self.system.constraint_jacobian(previous.q, node.begin).T
+
+    def linearized(self, node, previous, state):
+        system, h, nu = self.system, node.h, state.lam[self.counts.multipliers :]
+        equations = self.step(previous, node)
+        x = increment(self.scheme, previous, state.a + equations.correction(state.lam), h)
+        at_state = equations.tangents(state.q, state.v, state.vdot, state.lam, node.t)
+        return LevelLinearizedStep(
+            scheme=self.scheme,
+            group=system.group,
+            counts=self.counts,
+            mass=self.mass,
+            inverse_mass=self.inverse_mass,
+            h=h,
+            x=x,
+            tangents=at_state,
+            normal=equations.normal,
+            curvature=by_configuration(system, lambda q: self._correction(system, q, nu, node.begin), previous.q),
+            factors=equations.factorized(at_state, x),
+        )
+
+    def margin_at(self, jacobian):
+        return margin_by_mass(self.system, self.mass, jacobian, self.scale)
+
+    def margin(self, state, t):
+        return self.margin_at(full_jacobian(self.system, state.q, t))

@@ -1,0 +1,223 @@
+"""Signals: numbers that are functions of time, as modules whose numbers are leaves.
+
+Drivers differentiate them twice by t, so each branch here is finite where it is not taken, and the derivatives by t
+and by every leaf are those of the formula at its breaks as well.
+
+Cubic spline. With the second derivatives m_i at the samples (t_i, y_i), h_i = t_{i+1} − t_i, and on an interval the
+weights β = (t − t_i)/h_i and α = 1 − β of its ends,
+
+    y = α y_i + β y_{i+1} + h_i²/6 ((α³ − α) m_i + (β³ − β) m_{i+1})
+
+is twice continuously differentiable if the first derivatives of neighbours agree,
+
+    h_{i−1} m_{i−1} + 2 (h_{i−1} + h_i) m_i + h_i m_{i+1} = 6 ((y_{i+1} − y_i)/h_i − (y_i − y_{i−1})/h_{i−1}).
+
+The natural one has m = 0 at both ends, and with α₊³ = max(α, 0)³ for α³ it goes on straight outside of the samples: C²
+everywhere. m is solved for where a scene is assembled (`prepared`), not in its time steps.
+"""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from lgsens._validate import as_float, number_field, require
+
+_KINDS = ("linear", "cubic")
+
+
+class AbstractSignal(eqx.Module):
+    """A scalar function of time. A signal of one's own has leaves for its numbers and `__call__`.
+
+    What drives a mechanism needs two derivatives by t; JAX takes them.
+    """
+
+    @abc.abstractmethod
+    def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
+        """The value at time t [s]."""
+
+
+class Constant(AbstractSignal):
+    """s(t) = value.
+
+    Arguments:
+        value: in the unit of what it prescribes, shape ().
+    """
+
+    value: Float[Array, ""] = number_field("value")
+
+    def __call__(self, t):
+        return self.value
+
+
+class Harmonic(AbstractSignal):
+    """s(t) = offset + amplitude sin(2π frequency t + phase).
+
+    Arguments:
+        amplitude, offset: in the unit of what it prescribes, shape ().
+        frequency: [Hz], shape ().
+        phase: [rad], shape ().
+    """
+
+    amplitude: Float[Array, ""] = number_field("amplitude")
+    frequency: Float[Array, ""] = number_field("frequency")
+    phase: Float[Array, ""] = number_field("phase", default=0.0)
+    offset: Float[Array, ""] = number_field("offset", default=0.0)
+
+    def __call__(self, t):
+        return self.offset + self.amplitude * jnp.sin(2.0 * jnp.pi * self.frequency * t + self.phase)
+
+
+class Polynomial(AbstractSignal):
+    """s(t) = c_0 + c_1 t + c_2 t² + …; `Polynomial(coefficients=(0, 5))` is a constant rate of 5.
+
+    Arguments:
+        coefficients: c_i, in the unit of what it prescribes per s^i, shape (n,), n ≥ 1.
+    """
+
+    coefficients: Float[Array, " n"]
+
+    def __init__(self, coefficients):
+        self.coefficients = as_float(coefficients, None, "Polynomial: `coefficients`")
+        if self.coefficients.ndim != 1 or not self.coefficients.size:
+            raise ValueError(
+                "Polynomial: `coefficients` must be a vector of one number or more, c_0 first, got shape "
+                f"{self.coefficients.shape}."
+            )
+
+    def __call__(self, t):
+        value = self.coefficients[-1]
+        for i in range(self.coefficients.size - 2, -1, -1):
+            value = self.coefficients[i] + t * value
+        return value
+
+
+class Ramp(AbstractSignal):
+    """From one value to another with continuous rate and acceleration:
+
+        s(t) = start + (end − start) (10 x³ − 15 x⁴ + 6 x⁵),     x = (t − t_start)/duration, between 0 and 1
+
+    Arguments:
+        start, end: values before and after, in the unit of what it prescribes, shape ().
+        t_start: when it begins [s], shape ().
+        duration: how long it takes [s], shape (), positive.
+
+    The largest rate is 1.875 (end − start)/duration. Raises `ValueError` for a duration ≤ 0.
+    """
+
+    start: Float[Array, ""] = number_field("start", default=0.0)
+    end: Float[Array, ""] = number_field("end")
+    t_start: Float[Array, ""] = number_field("t_start", default=0.0)
+    duration: Float[Array, ""] = number_field("duration")
+
+    def __check_init__(self):
+        require(
+            lambda duration: duration > 0, f"Ramp: `duration` must be positive, got {self.duration} s.", self.duration
+        )
+
+    def __call__(self, t):
+        # the polynomial has zero slope and curvature at 0 and 1, whatever JAX says of those of `clip` there
+        x = jnp.clip((t - self.t_start) / self.duration, 0.0, 1.0)
+        return self.start + (self.end - self.start) * (x * x * x * (10.0 + x * (6.0 * x - 15.0)))
+
+
+class Sampled(AbstractSignal):
+    """Interpolation between samples, by straight lines or by the natural cubic spline.
+
+    Arguments:
+        times: sample times [s], shape (n,), n ≥ 2, increasing.
+        values: values at these times, in the unit of what they prescribe, shape (n,).
+        kind: "linear", constant outside of the samples; its rate jumps at them, so it cannot drive a mechanism
+            smoothly. "cubic", twice continuously differentiable, straight outside of them.
+
+    Raises `ValueError` for shapes that differ, times that do not increase and another kind.
+    """
+
+    times: Float[Array, " n"]
+    values: Float[Array, " n"]
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, times, values, kind: str = "linear"):
+        self.times, self.values = samples(times, values, "Sampled", "values")
+        self.kind = kind
+        if kind not in _KINDS:
+            raise ValueError(f"Sampled: `kind` must be one of {_KINDS}, got {kind!r}.")
+
+    def __call__(self, t):
+        return jnp.interp(t, self.times, self.values) if self.kind == "linear" else _Spline.through(self)(t)
+
+
+class _Spline(AbstractSignal):
+    """The spline of the formulas above."""
+
+    times: Float[Array, " n"]
+    values: Float[Array, " n"]
+    curvatures: Float[Array, " n"]  # m
+
+    @classmethod
+    def through(cls, sampled: Sampled) -> "_Spline":
+        times, values = sampled.times, sampled.values
+        h = jnp.diff(times)
+        slope, none, one = jnp.diff(values) / h, jnp.zeros(1, h.dtype), jnp.ones(1, h.dtype)
+        lower = jnp.concatenate([none, h[:-1], none])
+        diagonal = jnp.concatenate([one, 2.0 * (h[:-1] + h[1:]), one])
+        upper = jnp.concatenate([none, h[1:], none])
+        rhs = jnp.concatenate([none, 6.0 * jnp.diff(slope), none])
+        return cls(times, values, lax.linalg.tridiagonal_solve(lower, diagonal, upper, rhs[:, None])[:, 0])
+
+    def __call__(self, t):
+        last = self.times.shape[0] - 2
+        i = jnp.clip(jnp.searchsorted(lax.stop_gradient(self.times), t, side="right") - 1, 0, last)
+        (t_0, t_1), (y_0, y_1), (m_0, m_1) = ((x[i], x[i + 1]) for x in (self.times, self.values, self.curvatures))
+        h = t_1 - t_0
+        beta = (t - t_0) / h
+        alpha = 1.0 - beta
+        bend = lambda weight: jnp.maximum(weight, 0.0) ** 3 - weight
+        return alpha * y_0 + beta * y_1 + h * h / 6.0 * (bend(alpha) * m_0 + bend(beta) * m_1)
+
+
+def samples(times, values, what: str, name: str) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Two vectors of one length ≥ 2, the first increasing, as float leaves of `what`."""
+    times, values = as_float(times, None, f"{what}: `times`"), as_float(values, None, f"{what}: `{name}`")
+    if times.ndim != 1 or times.shape != values.shape or times.size < 2:
+        raise ValueError(
+            f"{what}: `times` and `{name}` must be two vectors of the same length ≥ 2, got shapes "
+            f"{times.shape} and {values.shape}."
+        )
+    require(
+        lambda times: np.all(np.diff(times) > 0),
+        f"{what}: `times` must increase from sample to sample; sort them and drop duplicates.",
+        times,
+    )
+    return times, values
+
+
+Prescribed = Float[Array, ""] | AbstractSignal
+
+
+def prepared(value: Any) -> Any:
+    """A number or signal with what can be computed before the time steps."""
+    return _Spline.through(value) if isinstance(value, Sampled) and value.kind == "cubic" else value
+
+
+def at_time(value: Prescribed, t) -> Float[Array, ""]:
+    """A number, or the value of a signal."""
+    return value(t) if isinstance(value, AbstractSignal) else value
+
+
+def prescribed_field(name: str) -> Any:
+    """A keyword-only scalar leaf or signal of an element, None by default."""
+
+    def convert(value: Any) -> Prescribed | None:
+        if callable(value) and not isinstance(value, AbstractSignal):
+            raise ValueError(
+                f"`{name}` must be a number or a signal (Harmonic, Polynomial, Ramp, Sampled, or a subclass of "
+                f"AbstractSignal, whose numbers are leaves), got {value!r}."
+            )
+        return value if value is None or isinstance(value, AbstractSignal) else as_float(value, (), f"`{name}`")
+
+    return eqx.field(converter=convert, kw_only=True, default=None)

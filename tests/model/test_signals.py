@@ -1,0 +1,104 @@
+"""Signals against their formulas, SciPy's spline and differences, by time twice and by every number."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import says
+from scipy.interpolate import CubicSpline
+
+import lgsens as lg
+from lgsens.model._signals import prepared
+
+TIMES, VALUES = np.array([-0.4, 0.1, 0.35, 1.0, 1.3]), np.array([0.2, -0.5, 0.3, 0.1, 0.6])
+SMOOTH = {
+    "constant": lg.Constant(value=0.7),
+    "harmonic": lg.Harmonic(amplitude=0.3, frequency=1.4, phase=0.2, offset=-0.1),
+    "polynomial": lg.Polynomial((0.2, -0.3, 0.5, 0.1)),
+    "ramp": lg.Ramp(start=0.2, end=1.1, t_start=-0.1, duration=0.8),
+    "spline": lg.Sampled(TIMES, VALUES, "cubic"),
+    "prepared spline": prepared(lg.Sampled(TIMES, VALUES, "cubic")),
+}
+# within, outside, and at the breaks of ramp and spline
+POINTS = np.array([-1.1, -0.7, -0.4, -0.1, 0.1, 0.23, 0.35, 0.6, 0.7, 0.97, 1.0, 1.3, 1.9])
+
+
+def jet(signal, points=POINTS):
+    """The signal and its first two derivatives by time."""
+    rate = lambda t: jax.jvp(signal, (t,), (jnp.ones_like(t),))[1]
+    found = jax.vmap(lambda t: (signal(t), rate(t), jax.jvp(rate, (t,), (jnp.ones_like(t),))[1]))(jnp.asarray(points))
+    return [np.asarray(each) for each in found]
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+def test_two_derivatives_by_time(name):
+    """Central differences, of which each value lies on both sides of a break: C² where they agree to O(h)."""
+    value, rate, acceleration = jet(SMOOTH[name])
+    h = 1e-5
+    after, before = jet(SMOOTH[name], POINTS + h), jet(SMOOTH[name], POINTS - h)
+    # third derivatives of up to 250: h²/6 of it for a rate, h/2 for its rate where it jumps; round-off ε/h = 2e-11
+    np.testing.assert_allclose(rate, (after[0] - before[0]) / (2 * h), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(acceleration, (after[1] - before[1]) / (2 * h), rtol=0, atol=2e-3)
+    np.testing.assert_allclose(after[2], before[2], rtol=0, atol=5e-3)
+    np.testing.assert_allclose(value, (after[0] + before[0]) / 2, rtol=0, atol=1e-8)
+
+
+def test_values():
+    t = POINTS
+    at = {name: jet(signal) for name, signal in SMOOTH.items()}
+    np.testing.assert_array_equal(at["constant"], [np.full_like(t, 0.7), 0 * t, 0 * t])
+    angle = 2 * np.pi * 1.4 * t + 0.2
+    np.testing.assert_allclose(at["harmonic"][0], -0.1 + 0.3 * np.sin(angle), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(at["polynomial"][0], 0.2 - 0.3 * t + 0.5 * t**2 + 0.1 * t**3, rtol=0, atol=1e-15)
+    x = np.clip((t + 0.1) / 0.8, 0.0, 1.0)
+    np.testing.assert_allclose(at["ramp"][0], 0.2 + 0.9 * (10 * x**3 - 15 * x**4 + 6 * x**5), rtol=0, atol=1e-14)
+    spline = CubicSpline(TIMES, VALUES, bc_type="natural")
+    inside = (t >= TIMES[0]) & (t <= TIMES[-1])
+    for order in range(3):
+        # some ten operations on numbers of up to 30
+        np.testing.assert_allclose(at["spline"][order][inside], spline(t[inside], order), rtol=0, atol=1e-13)
+        np.testing.assert_allclose(at["prepared spline"][order], at["spline"][order], rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(at["spline"][2][~inside], 0.0)
+    linear = jax.vmap(lg.Sampled(TIMES, VALUES))(jnp.asarray(t))
+    np.testing.assert_allclose(linear, np.interp(t, TIMES, VALUES), rtol=0, atol=1e-15)
+    np.testing.assert_array_equal(linear, jax.vmap(lg.SampledRoad(TIMES, VALUES))(jnp.asarray(t)))
+
+
+@pytest.mark.parametrize("name", [*SMOOTH, "linear"])
+def test_derivatives_by_every_number(name):
+    """Value, rate and acceleration by each leaf, away from breaks, against central differences, in both modes."""
+    signal = SMOOTH.get(name, lg.Sampled(TIMES, VALUES))
+    leaves, structure = jax.tree.flatten(signal)
+    x, sizes = np.concatenate([np.ravel(leaf) for leaf in leaves]), [leaf.size for leaf in leaves]
+
+    def numbers(x):
+        pieces = jnp.split(x, np.cumsum(sizes)[:-1])
+        signal = jax.tree.unflatten(structure, [p.reshape(leaf.shape) for p, leaf in zip(pieces, leaves)])
+        return jnp.stack(jet_of(signal))
+
+    def jet_of(signal):
+        rate = lambda t: jax.jvp(signal, (t,), (jnp.ones_like(t),))[1]
+        at = lambda t: (signal(t), rate(t), jax.jvp(rate, (t,), (jnp.ones_like(t),))[1])
+        return jax.vmap(at)(jnp.asarray([-0.7, 0.02, 0.23, 0.68, 1.9]))
+
+    forward, backward = (np.asarray(mode(numbers)(jnp.asarray(x))) for mode in (jax.jacfwd, jax.jacrev))
+    h = 1e-6
+    difference = [(numbers(jnp.asarray(x + h * e)) - numbers(jnp.asarray(x - h * e))) / (2 * h) for e in np.eye(x.size)]
+    # round-off ε/h of accelerations of up to 100, and h² times a third derivative of up to 1e4
+    np.testing.assert_allclose(forward, np.moveaxis(np.asarray(difference), 0, -1), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(backward, forward, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: lg.Ramp(end=1.0, duration=0.0), says("Ramp: `duration` must be positive", "0.0 s")),
+        (lambda: lg.Polynomial(()), says("Polynomial: `coefficients`", "(0,)")),
+        (lambda: lg.Sampled((0.0, 1.0), (1.0,)), says("Sampled: `times` and `values`", "(2,) and (1,)")),
+        (lambda: lg.Sampled((0.0, 0.0), (1.0, 1.0)), says("Sampled: `times` must increase")),
+        (lambda: lg.Sampled((0.0, 1.0), (1.0, 2.0), "quintic"), says("`kind` must be one of", "'quintic'")),
+    ],
+)
+def test_bad_input(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
