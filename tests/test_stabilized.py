@@ -15,7 +15,7 @@ from helpers import EPS, says
 import lgsens as lg
 from lgsens.dynamics import State, accelerations, constraint_velocity
 from lgsens.examples import four_bar, heavy_top, spinning_top
-from lgsens.integrate import Constants, integrate, with_corrections
+from lgsens.integrate import EqualGrid, Node, states_of
 
 STABILIZED = lg.GeneralizedAlpha(0.9, stabilized=True)
 
@@ -23,7 +23,7 @@ STABILIZED = lg.GeneralizedAlpha(0.9, stabilized=True)
 def violations(trajectory):
     """The largest entries of Φ and of B v at the steps, the first state left out."""
     system, states = trajectory.system, jax.tree.map(lambda leaf: leaf[1:], trajectory.states)
-    position = jax.vmap(system.constraint)(states.q)
+    position = jax.vmap(lambda q: system.constraint(q, 0.0))(states.q)
     velocity = jax.vmap(lambda q, v: constraint_velocity(system, q, v, 0.0))(states.q, states.v)
     return float(jnp.abs(position).max()), float(jnp.abs(velocity).max())
 
@@ -108,7 +108,7 @@ def test_iteration_matrix():
 
     @jax.jit
     def matrix_and_factors(h):
-        step = Constants.of(system, stabilized=True).step(STABILIZED, system, state, h)
+        step = STABILIZED.shared(system).step(state, Node(t, t, h))
         defect = lambda x: jnp.concatenate(step.defect(step.motion(x[:6], x[6:]), x[6:], t))
         factors, _ = step.factors(step.motion(unknowns[:6], unknowns[6:]), unknowns[6:], t)
         matrix = jax.jacfwd(defect)(unknowns)
@@ -279,7 +279,8 @@ def test_a_budget_has_no_loop_that_waits():
         system = heavy_top().system()
         zero = jnp.zeros(6)
         state = State(q=system.reference()[0], v=zero, vdot=zero, lam=zero[:3], a=zero)
-        steps = lambda s: integrate(scheme, 3, system, with_corrections(scheme, s), jnp.zeros(()), jnp.asarray(1e-3))
+        grid = EqualGrid(jnp.zeros(()), jnp.asarray(1e-3), 3)
+        steps = lambda s: states_of(scheme, system, grid, scheme.complete(system, s))
         batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), state)
         return re.findall(r"= while\[", str(jax.make_jaxpr(jax.vmap(steps))(batch)))
 

@@ -25,7 +25,6 @@ from lgsens.integrate._grid import (
     with_first as with_first,
 )
 from lgsens.integrate._index3 import factorize_iteration_matrix as factorize_iteration_matrix
-from lgsens.integrate._integrator import AbstractIntegrator as AbstractIntegrator, Laid as Laid
 from lgsens.integrate._linearized import AbstractLinearizedStep as AbstractLinearizedStep, Variation as Variation
 from lgsens.integrate._march import (
     Mark as Mark,
@@ -36,5 +35,12 @@ from lgsens.integrate._march import (
     march_on as march_on,
     states_of as states_of,
 )
-from lgsens.integrate._scheme import AbstractScheme as AbstractScheme, Start as Start, Stats as Stats, rows as rows
+from lgsens.integrate._scheme import (
+    AbstractIntegrator as AbstractIntegrator,
+    AbstractScheme as AbstractScheme,
+    Laid as Laid,
+    Start as Start,
+    Stats as Stats,
+    rows as rows,
+)
 from lgsens.integrate._singular import margin_of as margin_of, singular_steps as singular_steps

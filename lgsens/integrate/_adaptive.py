@@ -34,11 +34,10 @@ from jaxtyping import Array, Bool, Float, Int
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
 from lgsens.integrate._grid import Node, UnevenGrid, with_first
-from lgsens.integrate._integrator import AbstractIntegrator, Laid
 from lgsens.integrate._lanes import in_any_lane
 from lgsens.integrate._march import Progress, Walk, chosen
 from lgsens.integrate._pace import UnevenPace
-from lgsens.integrate._scheme import AbstractScheme, Start, Stats
+from lgsens.integrate._scheme import AbstractIntegrator, AbstractScheme, Laid, Start, Stats
 
 _AIM = 0.5  # θ: few steps are rejected
 _LIMIT = 1.0  # κ: no step is more than 2.6 times as long as the one before

@@ -11,8 +11,7 @@ from jaxtyping import Array, Float
 from lgsens._validate import as_float, is_concrete, require
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
 from lgsens.integrate._grid import UnevenGrid
-from lgsens.integrate._integrator import AbstractIntegrator, Laid
-from lgsens.integrate._scheme import AbstractScheme
+from lgsens.integrate._scheme import AbstractIntegrator, AbstractScheme, Laid
 
 
 class GivenSteps(AbstractIntegrator):

@@ -12,8 +12,8 @@ from helpers import equations
 import lgsens as lg
 from lgsens.dynamics import State
 from lgsens.examples import heavy_top, spatial_chain, spinning_top
-from lgsens.integrate import integrate
-from lgsens.integrate._newton import Wear
+from lgsens.integrate import EqualGrid, states_of
+from lgsens.integrate._alpha_step import Wear
 
 HEAVY = json.loads((Path(__file__).parents[1] / "data" / "heavy_top_bruls2012.json").read_text())
 
@@ -107,7 +107,8 @@ def test_a_failed_step_ends_the_run():
     model = heavy_top()
     scheme = lg.GeneralizedAlpha(0.9, max_iterations=1, tolerance=1e-14, factor_every=0)
     state0 = lg.initial_state(model)
-    states, stats = jax.jit(lambda s: integrate(scheme, 5, model.system(), s, jnp.zeros(()), jnp.asarray(0.05)))(state0)
+    grid = EqualGrid(jnp.zeros(()), jnp.asarray(0.05), 5)
+    states, stats = jax.jit(lambda s: states_of(scheme, model.system(), grid, s))(state0)
     assert isinstance(states, State)
     assert stats.converged.tolist() == [False] * 5
     assert stats.iterations.tolist() == [1, 0, 0, 0, 0]
@@ -136,7 +137,8 @@ def test_what_makes_a_matrix_is_compiled_once(factor_every):
     system, zero = heavy_top().system(), jnp.zeros(6)
     state = State(q=system.reference()[0], v=zero, vdot=zero, lam=zero[:3], a=zero)
     scheme = lg.GeneralizedAlpha(0.9, factor_every=factor_every)
-    steps = lambda state: integrate(scheme, 3, system, state, jnp.zeros(()), jnp.asarray(1e-3))
+    grid = EqualGrid(jnp.zeros(()), jnp.asarray(1e-3), 3)
+    steps = lambda state: states_of(scheme, system, grid, state)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf])[None], state)
     program = list(equations(jax.make_jaxpr(jax.vmap(jax.vmap(steps)))(batch).jaxpr))
     assert [each.invars[0].aval.shape for each in program if each.primitive.name == "lu"] == [(1, 2, 9, 9)]

@@ -8,7 +8,7 @@ from helpers import says
 
 import lgsens as lg
 from lgsens.examples import spinning_top
-from lgsens.integrate import Guess, Mark, integrate_onward
+from lgsens.integrate import EqualGrid, Walk, first_mark, march_on, states_of
 from lgsens.sensitivity import AbstractSensitivity
 from lgsens.sensitivity._segments import Segments
 
@@ -51,7 +51,7 @@ def all_states():
     ids=str,
 )
 def test_reverse_mode(method, all_states):
-    """67 steps fill neither segments of 20 and 40 steps nor the blocks of the sweeps."""
+    """67 steps fill neither segments of 9 and 34 steps nor the blocks of the sweeps."""
     value, gradient = jax.jit(jax.value_and_grad(lambda p: psi(p, method)))(PARAMETERS)
     np.testing.assert_allclose(value, all_states[0], rtol=1e-10)
     # accelerations and multipliers carry a round-off of 1e-16/(βh²) = 4e-11, of which Ψ takes a hundredth
@@ -81,43 +81,37 @@ def test_second_derivatives_and_batches():
 
 
 def test_segments_are_the_long_run():
-    """Integrated on from its marks, a run has the same states to the last bit."""
+    """Integrated on from its marks, a run repeats its states to the last bit; it is the long run to round-off."""
     system = spinning_top(0.7).system()
-    state0 = lg.initial_state(system)
-    t0, h = jnp.zeros(()), jnp.asarray(5e-3)
+    grid = EqualGrid(jnp.zeros(()), jnp.asarray(5e-3), 80)
+    parts = Segments(80, 40).grids(grid)
+    first, second = (jax.tree.map(lambda leaf, i=i: leaf[i], parts) for i in range(2))
+    walk = Walk.of(SCHEME, system)
 
-    def onward(mark, length):
-        return jax.jit(lambda mark: integrate_onward(SCHEME, length, system, mark, t0, h, lambda s, _: s))(mark)
+    @jax.jit
+    def onward(grid, mark):
+        return march_on(walk, grid, mark, lambda s, _: s)
 
-    whole, end, stats = onward(Mark.first(state0), 80)
-    mark, rows, counts = Mark.first(state0), [], []
-    for _ in range(2):
-        states, mark, part = onward(mark, 40)
-        rows.append(states)
-        counts.append(part.iterations)
-    jax.tree.map(lambda x, *parts: np.testing.assert_array_equal(np.concatenate(parts), x), whole, *rows)
-    jax.tree.map(np.testing.assert_array_equal, mark, end)
-    np.testing.assert_array_equal(np.concatenate(counts), stats.iterations)
-    # A mark is more than a state: the iteration from another guess ends on other digits.
-    _, half, _ = onward(Mark.first(state0), 40)
-    anew, _, _ = onward(half._replace(guess=Guess.first(half.state)), 40)
-    assert np.any(anew.a != rows[1].a)
-    np.testing.assert_allclose(anew.a, rows[1].a, rtol=0, atol=1e-8 * np.abs(rows[1].a).max())
+    begin = first_mark(walk, grid, lg.initial_state(system))
+    _, mark, _ = onward(first, begin)
+    rows, end, counts = onward(second, mark)
+    again, _, _ = onward(second, mark)
+    jax.tree.map(np.testing.assert_array_equal, again, rows)
+    assert float(end.n) == 80.0
+    whole, _ = jax.jit(lambda s: states_of(SCHEME, system, grid, s))(lg.initial_state(system))
+    np.testing.assert_allclose(rows.q.position, whole.q.position[41:], rtol=0, atol=1e-13)  # round-off of 80 steps
+    # A mark is more than a state: from another guess the iteration takes longer.
+    anew = mark.progress._replace(memory=begin.progress.memory)
+    _, _, slower = onward(second, mark._replace(progress=anew))
+    assert slower.iterations.sum() > counts.iterations.sum()
 
 
 @pytest.mark.parametrize(
-    ("num_steps", "checkpoints", "every", "expected"),
-    [
-        (1000, "sqrt", 20, (40, 25)),
-        (10000, "sqrt", 0, (100, 100)),
-        (10, "sqrt", 20, (20, 1)),
-        (1000, 10, 20, (100, 10)),
-        (1000, 3, 20, (340, 3)),
-        (7, 100, 0, (1, 7)),
-    ],
+    ("num_steps", "checkpoints", "expected"),
+    [(1000, "sqrt", (32, 32)), (10000, "sqrt", (100, 100)), (1000, 10, (100, 10)), (7, 100, (1, 7))],
 )
-def test_division(num_steps, checkpoints, every, expected):
-    segments = Segments.of(lg.GeneralizedAlpha(factor_every=every), num_steps, checkpoints)
+def test_division(num_steps, checkpoints, expected):
+    segments = Segments.of(num_steps, checkpoints)
     assert (segments.length, segments.count) == expected
     assert 0 <= segments.filling < segments.length
 

@@ -11,6 +11,7 @@ import pytest
 
 import lgsens as lg
 from lgsens.examples import QuarterCar, four_bar, spinning_top
+from lgsens.integrate import EqualGrid
 from lgsens.model import AbstractForce, AbstractLoad, Attached
 from lgsens.sensitivity import Parameters
 
@@ -223,7 +224,7 @@ def test_one_unbatched_factorization_per_step():
 
     def run(system):
         states, _ = lg.DirectDifferentiation().trajectory(
-            lg.GeneralizedAlpha(0.9), 4, state0, Parameters(system, zero, h)
+            lg.GeneralizedAlpha(0.9), state0, Parameters(system, EqualGrid(zero, h, 4))
         )
         return states.v
 

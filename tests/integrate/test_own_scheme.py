@@ -1,0 +1,134 @@
+"""A scheme that lgsens does not ship, said by its equations alone: it has every grid, output and derivative."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from differences import central
+
+import lgsens as lg
+from lgsens.dynamics import constraint_velocity
+from lgsens.examples import spinning_top
+from lgsens.integrate import AbstractScheme, Start
+
+STEPS = 9
+
+
+class ImplicitMidpoint(AbstractScheme):
+    """The implicit midpoint rule on stabilized index 2, with q_m = q exp(h v_m/2) and v_m = (v + v⁺)/2:
+
+    q⁺ = q exp(h (v_m + M⁻¹B(q)ᵀν)),   r(q_m, v_m, (v⁺ − v)/h, λ, t + h/2) = 0,   Φ(q⁺, t⁺) = 0,   B v⁺ + Φ_t = 0.
+    """
+
+    tolerance: float = eqx.field(static=True, default=1e-10)
+    max_iterations: int = eqx.field(static=True, default=10)
+
+    def equations(self, system, node, previous, state):
+        h, m = node.h, len(system.constraint_names)
+        middle, vdot = (previous.v + state.v) / 2.0, (state.v - previous.v) / h
+        push = jnp.linalg.solve(
+            system.mass_matrix(), state.lam[m:] @ system.constraint_jacobian(previous.q, node.begin)
+        )
+        there = system.group.retract(previous.q, h / 2.0 * middle)
+        kept = system.constraint(state.q, node.t) / h, constraint_velocity(system, state.q, state.v, node.t)
+        return lg.State(
+            q=system.group.retract(previous.q, h * (middle + push)),
+            v=system.residual(there, middle, vdot, state.lam[:m], node.begin + h / 2.0),
+            vdot=state.vdot - vdot,
+            lam=jnp.concatenate(kept),
+            a=state.a - vdot,
+        )
+
+    def start(self, system, initial, t0):
+        return Start(self.complete(system, initial.state))
+
+    def complete(self, system, state):
+        return dataclasses.replace(state, lam=jnp.concatenate([state.lam, jnp.zeros_like(state.lam)]))
+
+    def physical(self, system, states):
+        return dataclasses.replace(states, lam=states.lam[..., : len(system.constraint_names)])
+
+
+MIDPOINT = ImplicitMidpoint()
+GIVEN = lg.GivenSteps(1.0 + 0.5 * np.sin(np.arange(STEPS)), MIDPOINT)
+P = jnp.array([0.7, 1.0, 0.3])  # angle, length, end
+
+
+def side(s):
+    return s.body("top").position[0] ** 2 + 1e-5 * s.multiplier("pivot")[2]
+
+
+def psi(p, **settings):
+    """A criterion of positions and of multipliers, by an angle, a length and the end of the run."""
+    run = lg.simulate(spinning_top(p[0], length=p[1]), t1=p[2], num_steps=STEPS, throw=False, **settings)
+    if "save" in settings:
+        return lg.time_integral(run.t, run.values) * 1e3
+    return (
+        lg.time_integral(
+            run.t,
+            jax.vmap(lambda x, lam: x**2 + 1e-5 * lam)(run.body("top").position[:, 0], run.multiplier("pivot")[:, 2]),
+        )
+        * 1e3
+    )
+
+
+def differences(f):
+    """Central differences of sixth order: δ⁶ = 1e-18 × derivatives of size 10, round-off 1e-15/1e-3 of Ψ."""
+    compiled = jax.jit(f)
+    return np.array([central(lambda s, e=e: compiled(P + s * e), 1e-3) for e in jnp.eye(3)])
+
+
+@pytest.mark.parametrize("integrator", [MIDPOINT, GIVEN], ids=["equal", "given"])
+def test_both_modes_on_every_grid(integrator):
+    f = lambda p: psi(p, integrator=integrator)
+    expected = differences(f)
+    assert np.abs(expected).min() > 1e-2
+    forward, reverse = jax.jit(lambda p: (jax.jacfwd(f)(p), jax.grad(f)(p)))(P)
+    np.testing.assert_allclose(forward, expected, rtol=1e-7)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-10)  # the same systems, other order of round-off
+
+
+def test_adaptive_steps_are_given_steps():
+    """The derivative is that on the grid found."""
+    adaptive = lg.AdaptiveSteps(MIDPOINT, tolerance=1e-4)
+    model = spinning_top(P[0], length=P[1])
+    found = lg.simulate(model, t1=P[2], num_steps=STEPS, integrator=adaptive)
+    assert int(found.stats.steps) < STEPS
+    frozen = lg.GivenSteps.of(found, MIDPOINT)
+    f = lambda p: psi(p, integrator=adaptive)
+    on_grid = lambda p: lg.time_integral(*_sides(p, frozen)) * 1e3
+    value, slope = jax.jit(jax.value_and_grad(f))(P)
+    expected, expected_slope = jax.jit(jax.value_and_grad(on_grid))(P)
+    np.testing.assert_allclose(value, expected, rtol=1e-10)
+    np.testing.assert_allclose(slope, expected_slope, rtol=1e-8)
+
+
+def _sides(p, integrator):
+    run = lg.simulate(
+        spinning_top(p[0], length=p[1]), t1=p[2], num_steps=integrator.num_steps, integrator=integrator, throw=False
+    )
+    return run.t, run.body("top").position[:, 0] ** 2 + 1e-5 * run.multiplier("pivot")[:, 2]
+
+
+def test_outputs_and_checkpoints():
+    plain = jax.jit(jax.value_and_grad(lambda p: psi(p, integrator=MIDPOINT)))(P)
+    for integrator in (MIDPOINT, GIVEN):
+        for method in (lg.DirectDifferentiation(), lg.AdjointVariable(checkpoints=2)):
+            f = lambda p, i=integrator, m=method: psi(p, integrator=i, save=side, sensitivity=m)
+            value, slope = jax.jit(jax.value_and_grad(f))(P)
+            if integrator is MIDPOINT:
+                np.testing.assert_allclose(value, plain[0], rtol=1e-10)
+                np.testing.assert_allclose(slope, plain[1], rtol=1e-8)
+            else:
+                forward = jax.jit(jax.jacfwd(lambda p, i=integrator: psi(p, integrator=i)))(P)
+                np.testing.assert_allclose(slope, forward, rtol=1e-8)
+
+
+def test_second_derivatives():
+    f = lambda p: psi(p, integrator=MIDPOINT)
+    hessian = jax.jit(jax.hessian(f))(P)
+    expected = differences(jax.grad(f))
+    np.testing.assert_allclose(hessian, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
