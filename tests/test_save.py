@@ -93,9 +93,6 @@ def test_one_compilation_for_one_function():
     assert len(traces) == count
 
 
-@pytest.mark.parametrize(
-    "settings", [{"save": "side"}, {"save": asked, "integrator": lg.Richardson()}], ids=["text", "Richardson"]
-)
-def test_bad_input(settings):
-    with pytest.raises(ValueError, match=says("`save` must be a function", "GeneralizedAlpha", "Leave `save` out")):
-        lg.simulate(spinning_top(0.7), **(SETTINGS | settings))
+def test_bad_input():
+    with pytest.raises(ValueError, match=says("`save` must be a function", "'side'", "Leave it out")):
+        lg.simulate(spinning_top(0.7), **(SETTINGS | {"save": "side"}))

@@ -214,7 +214,7 @@ def integrate_controlled(
     expected = relative(first.state.v, first.state.vdot, jerk, h)
     guess = h * jnp.minimum(1.0, (_AIM / jnp.maximum(expected, _LEAST)) ** (1.0 / 3.0))
     begun = first.at(system, guess)
-    memory = scheme.memory(system, walk.shared, begun, Node(t0, t0 + guess, guess), UnevenPace.first(guess))
+    memory = scheme.memory(system, walk.shared, begun, Node(t0, t0 + guess, guess), UnevenPace.first(h.dtype))
     running = jnp.all(jnp.isfinite(begun.a))
     begin = (Progress(begun, memory, running), guess, guess, jnp.full((), _AIM, h.dtype), h * 0.0)
     (*_, elapsed), (sizes, later, newton, errors, rejected) = lax.scan(step, begin, jnp.arange(num_steps))

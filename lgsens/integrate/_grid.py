@@ -235,7 +235,7 @@ class UnevenGrid(AbstractGrid):
         return place.size == 0.0
 
     def pace(self):
-        return UnevenPace.first(self.before)
+        return UnevenPace.first(self.h.dtype)
 
     @property
     def first_size(self):

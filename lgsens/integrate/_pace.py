@@ -61,14 +61,14 @@ class EqualPace(AbstractPace):
 class UnevenPace(AbstractPace):
     """Steps of different sizes, in units of the next one: equal ones have the weights 3, −3, 1 to the last bit."""
 
-    h: Float[Array, "3"]  # of the last three steps
+    h: Float[Array, "3"]  # of the last three steps; 0 before the first: values are alike there, and any size will do
 
     @classmethod
-    def first(cls, h) -> "UnevenPace":
-        return cls(jnp.broadcast_to(h, (3,)))
+    def first(cls, dtype) -> "UnevenPace":
+        return cls(jnp.zeros(3, dtype))
 
     def weights(self, h, delta):
-        r = self.h / h
+        r = jnp.where(self.h > 0.0, self.h / h, 1.0)
         to = (1.0 + delta * (1.0 - r[0]), 1.0 + r[0] + delta * (1.0 - r[1]), 1.0 + r[0] + r[1] + delta * (1.0 - r[2]))
         return (
             to[1] * to[2] / ((to[1] - to[0]) * (to[2] - to[0])),

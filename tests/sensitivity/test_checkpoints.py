@@ -100,10 +100,10 @@ def test_segments_are_the_long_run():
     assert float(end.n) == 80.0
     whole, _ = jax.jit(lambda s: states_of(SCHEME, system, grid, s))(lg.initial_state(system))
     np.testing.assert_allclose(rows.q.position, whole.q.position[41:], rtol=0, atol=1e-13)  # round-off of 80 steps
-    # A mark is more than a state: from another guess the iteration takes longer.
+    # A mark is more than a state: from another guess the iteration of the first step takes longer.
     anew = mark.progress._replace(memory=begin.progress.memory)
     _, _, slower = onward(second, mark._replace(progress=anew))
-    assert slower.iterations.sum() > counts.iterations.sum()
+    assert slower.iterations[0] > counts.iterations[0]
 
 
 @pytest.mark.parametrize(
