@@ -227,9 +227,6 @@ def test_sparse_models_are_solved_densely():
 
 
 def test_what_is_refused():
-    run = partial(lg.simulate, spinning_top(0.7), t1=0.1, num_steps=10, integrator=STABILIZED)
-    with pytest.raises(ValueError, match=says("ContinuousDirect", "stabilized", "DirectDifferentiation()")):
-        run(sensitivity=lg.ContinuousDirect())
     for name, value, said in (("stabilized", 1, "True"), ("iterations", 0, "at least 1"), ("iterations", 2.0, "int")):
         bad: dict[str, Any] = {name: value}
         with pytest.raises(ValueError, match=says(f"GeneralizedAlpha: `{name}` must be", said, f"got {value!r}")):

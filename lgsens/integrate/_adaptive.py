@@ -89,6 +89,10 @@ class AdaptiveSteps(AbstractIntegrator):
     def scheme(self):
         return self.integrator
 
+    @property
+    def equal_steps(self):
+        return False
+
     def lay(self, system, start, jerk, t0, t1, num_steps):
         mean = (t1 - t0) / num_steps
         # What error control decides has no derivative: its sizes, as parts of the interval, are constants of the run.

@@ -64,6 +64,10 @@ class GivenSteps(AbstractIntegrator):
     def scheme(self):
         return self.integrator
 
+    @property
+    def equal_steps(self):
+        return False
+
     def check(self, num_steps):
         if self.num_steps != num_steps:
             raise ValueError(

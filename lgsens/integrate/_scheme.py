@@ -83,6 +83,11 @@ class AbstractIntegrator(eqx.Module):
         """Whether two runs, the second in twice as many steps, are extrapolated."""
         return False
 
+    @property
+    def equal_steps(self) -> bool:
+        """Whether all steps of a run are equal."""
+        return True
+
     def check(self, num_steps: int) -> None:
         """Raise `ValueError` for a number of steps that these are not."""
         return

@@ -49,7 +49,7 @@ def continuous_direct_sweep(
             level=-phi_p[:, None],
         )
 
-    motion = _begin(scheme, system, jax.tree.map(lambda leaf: leaf[0], states), first, d, parameters.t0, h)
+    motion = _begin(scheme, system, jax.tree.map(lambda leaf: leaf[0], states), first, d, t0, h)
 
     def sweep(previous: Motion, inputs):
         current = advance(scheme, mass, previous, node(*inputs), h)
@@ -89,7 +89,7 @@ def _hidden_violation(system, state: State, w, rate, d: Parameters, t0):
     v = consistent_velocity(system, q, state.v, t0)
 
     def varied(q, w, t):
-        tangents = d.system, group.to_ambient(q, w), d.t0
+        tangents = d.system, group.to_ambient(q, w), d.grid.t0
         return jax.jvp(lambda system, q, t: system.constraint(q, t), (system, q, t), tangents)[1]
 
     violation = jax.jvp(varied, (q, w, t0), (group.to_ambient(q, v), rate, jnp.ones_like(t0)))[1]

@@ -5,7 +5,7 @@ from typing import ClassVar
 import equinox as eqx
 
 from lgsens.dynamics import State
-from lgsens.integrate import GeneralizedAlpha
+from lgsens.integrate import AbstractScheme
 from lgsens.sensitivity._continuous_adjoint import Cotangents, continuous_adjoint_sweep
 from lgsens.sensitivity._criterion_terms import (
     Functional,
@@ -16,7 +16,7 @@ from lgsens.sensitivity._criterion_terms import (
 )
 from lgsens.sensitivity._first_order_adjoint import first_order_adjoint_sweep
 from lgsens.sensitivity._linearization import Parameters
-from lgsens.sensitivity._methods import require_index_3
+from lgsens.sensitivity._methods import linear_scheme, require_equal_steps
 
 TREATMENTS = ("state", "derivatives", "first_order", None)
 
@@ -50,7 +50,7 @@ class ContinuousAdjoint(eqx.Module):
 
     def cotangents(
         self,
-        scheme: GeneralizedAlpha,
+        scheme: AbstractScheme,
         states: State,
         parameters: Parameters,
         functional: Functional,
@@ -59,7 +59,8 @@ class ContinuousAdjoint(eqx.Module):
         uses: tuple[bool, bool],
     ) -> Cotangents:
         """dΨ as it acts on the initial state, the system and p; `uses`: whether F and G use v̇ or λ."""
-        require_index_3("ContinuousAdjoint", scheme, parameters)
+        require_equal_steps("ContinuousAdjoint", parameters)
+        scheme = linear_scheme(scheme)
         t, h = parameters.grid.times(), parameters.grid.h
         derivatives = uses[0] and self.accelerations in ("derivatives", None)
         path = points(scheme, states, t, h, derivatives=derivatives)

@@ -4,6 +4,7 @@ Both rules are module-level functions of explicit arguments, and keep states onl
 """
 
 import abc
+import dataclasses
 from functools import partial
 
 import equinox as eqx
@@ -114,7 +115,7 @@ class ContinuousDirect(AbstractSensitivity):
     """
 
     def trajectory(self, scheme, state0, parameters, found=None):
-        require_index_3("ContinuousDirect", scheme, parameters)
+        require_equal_steps("ContinuousDirect", parameters)
         return _decoded(_continuous_trajectory(scheme, state0, parameters))
 
 
@@ -130,15 +131,20 @@ class Autodiff(AbstractSensitivity):
         return _decoded(_run(scheme.for_autodiff(), state0, parameters))
 
 
-def require_index_3(method: str, scheme: AbstractScheme, parameters: Parameters) -> None:
-    """Raise `ValueError` where a continuous method, by generalized-α in a linear space, does not fit the motion."""
+def require_equal_steps(method: str, parameters: Parameters) -> None:
+    """Raise `ValueError` where a continuous method, whose start is a polynomial over equal steps, has others."""
     require_independent(parameters.system, method)
-    if not isinstance(scheme, GeneralizedAlpha) or scheme.stabilized or not isinstance(parameters.grid, EqualGrid):
+    if not isinstance(parameters.grid, EqualGrid) or parameters.system.num_velocity_rows:
         raise ValueError(
-            f"{method} integrates the differentiated equations of motion by generalized-α of index 3 in equal steps, "
-            f"and the motion is by {scheme!r}; take `integrator=GeneralizedAlpha(…)` as it is, or "
-            "DirectDifferentiation() or AdjointVariable()."
+            f"{method} integrates the differentiated equations of motion in equal steps, with constraints of position "
+            "level: leave GivenSteps, AdaptiveSteps and `Rolling` out, or take DirectDifferentiation() or "
+            "AdjointVariable()."
         )
+
+
+def linear_scheme(scheme: AbstractScheme) -> GeneralizedAlpha:
+    """What integrates linear equations along a motion: index 3, with the numbers of its scheme where it has them."""
+    return dataclasses.replace(scheme, stabilized=False) if isinstance(scheme, GeneralizedAlpha) else GeneralizedAlpha()
 
 
 # The custom rules see statistics as floats: an integer output of a `custom_vjp` reaches operations that have no
@@ -222,7 +228,8 @@ def _direct_rule(scheme, primals, tangents):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _continuous_trajectory(scheme, state0, parameters):
-    return _run(scheme, state0, parameters)
+    states, stats = _run(scheme, state0, parameters)
+    return scheme.physical(parameters.system, states), stats
 
 
 @_continuous_trajectory.defjvp
@@ -231,8 +238,9 @@ def _continuous_rule(scheme, primals, tangents):
     d_state0, d_parameters = tangents
     states, stats = _continuous_trajectory(scheme, state0, parameters)
     group = parameters.system.group
-    first = to_algebra(group, state0, d_state0)
-    delta = continuous_direct_sweep(scheme, states, parameters, first, d_parameters)
+    physical = partial(scheme.physical, parameters.system)
+    first = to_algebra(group, physical(state0), physical(d_state0))
+    delta = continuous_direct_sweep(linear_scheme(scheme), states, parameters, first, d_parameters)
     d_states = jax.vmap(partial(to_ambient, group))(states, delta)
     return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
 

@@ -231,13 +231,7 @@ def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, sa
     if isinstance(integrator, IndexReducedODE):
         return _run_ode(system, state0, initial, t0, (t1 - t0) / num_steps, num_steps, integrator)
     start = begin(integrator.scheme, system, t0, state0, initial)
-    one = lambda num_steps: run(system, start, t0, t1, num_steps, integrator, sensitivity, save)
-    if not integrator.extrapolated:
-        return one(num_steps)
-    (coarse, of_coarse), (fine, of_fine) = (one(n) for n in (num_steps, 2 * num_steps))
-    failed = coarse.result != RESULTS.successful
-    details = jax.tree.map(lambda first, second: jnp.where(failed, first, second), of_coarse, of_fine)
-    return extrapolate_runs(system, coarse, fine), details | {"run": jnp.where(failed, 1, 2)}
+    return run(system, start, t0, t1, num_steps, integrator, sensitivity, save)
 
 
 def _run_ode(system: AbstractSystem, state0, initial, t0, h, num_steps: int, integrator: IndexReducedODE):
@@ -294,6 +288,16 @@ def run(
     save: Save | None = None,
 ):
     """`simulate` without its checks: the trajectory or what is saved of it, and what the message of a failure needs."""
+    one = lambda num_steps: _single_run(system, begun, t0, t1, num_steps, integrator, sensitivity, save)
+    if not integrator.extrapolated:
+        return one(num_steps)
+    (coarse, of_coarse), (fine, of_fine) = (one(n) for n in (num_steps, 2 * num_steps))
+    failed = coarse.result != RESULTS.successful
+    details = jax.tree.map(lambda first, second: jnp.where(failed, first, second), of_coarse, of_fine)
+    return extrapolate_runs(system, coarse, fine), details | {"run": jnp.where(failed, 1, 2)}
+
+
+def _single_run(system, begun: Begin, t0, t1, num_steps: int, integrator: AbstractIntegrator, sensitivity, save):
     scheme = integrator.scheme
     laid = integrator.lay(system, begun.start, begun.jerk, t0, t1, num_steps)
     grid, t = laid.grid, laid.grid.times()
