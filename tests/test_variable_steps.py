@@ -275,8 +275,6 @@ def test_bad_input():
     given = lg.GivenSteps([1.0, 2.0])
     with pytest.raises(ValueError, match=says("`num_steps` = 3", "has 2")):
         run(given, num_steps=3)
-    with pytest.raises(ValueError, match=says("ContinuousDirect", "in equal steps", "DirectDifferentiation()")):
-        run(given, num_steps=2, sensitivity=lg.ContinuousDirect())
     with pytest.raises(ValueError, match=says("checkpoints")):
         run(given, num_steps=2, sensitivity=lg.DirectDifferentiation(checkpoints="sqrt"))
 

@@ -17,7 +17,7 @@ from lgsens.criteria._criterion import Criterion
 from lgsens.criteria._criterion_use import Use, checked_for
 from lgsens.criteria._reference_methods import STENCIL, FiniteDifferences, IndexReduced
 from lgsens.dynamics import RESULTS, AbstractSystem, State, is_redundant, softness
-from lgsens.integrate import AbstractIntegrator, EqualGrid, GeneralizedAlpha, UnevenGrid
+from lgsens.integrate import AbstractIntegrator, AdaptiveSteps, EqualGrid, GeneralizedAlpha, UnevenGrid
 from lgsens.model import Model
 from lgsens.sensitivity import (
     AbstractSensitivity,
@@ -265,6 +265,12 @@ def _continuous_adjoint(task: _Task, p, method: ContinuousAdjoint, uses: list[Us
         return system, begun.start.state.q, begun.consistent_v
 
     (system, q0, _), pull_back = jax.vjp(initial, p)
+    if isinstance(task.integrator, AdaptiveSteps):
+        raise ValueError(
+            "ContinuousAdjoint integrates backwards from t1, where the steps that error control has left over are "
+            "empty: give it the grid found, `GivenSteps.of(trajectory)`, or take DirectDifferentiation() or "
+            "AdjointVariable()."
+        )
     h = (task.t1 - task.t0) / task.num_steps
     equal = task.integrator.equal_steps
     grid = EqualGrid(task.t0, h, task.num_steps) if equal else UnevenGrid.first(task.t0, jnp.diff(trajectory.t))

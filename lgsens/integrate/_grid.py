@@ -15,7 +15,7 @@ its arrays have places ends with such. For its equations it has the size before 
 
 import abc
 import dataclasses
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import equinox as eqx
 import jax
@@ -60,6 +60,8 @@ class AbstractLink(eqx.Module):
 
 class EqualLink(AbstractLink):
     """Nothing changes from step to step."""
+
+    ratio: ClassVar[float] = 1.0
 
     def begun(self, previous, d_place):
         return previous

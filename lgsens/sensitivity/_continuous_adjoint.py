@@ -76,7 +76,7 @@ def continuous_adjoint_sweep(
     scheme: GeneralizedAlpha, path: Point, parameters: Parameters, functional: Functional, p, terms
 ) -> Cotangents:
     """The cotangents of c criteria, by the second-order adjoint equations; `terms` is one of `_criterion_terms`."""
-    system, h = parameters.system, parameters.grid.h
+    system, sizes = parameters.system, jnp.diff(path.t)
     group, mass = system.group, system.mass_matrix()
 
     def node(point: Point) -> tuple[Node, Any]:
@@ -98,21 +98,28 @@ def continuous_adjoint_sweep(
     last, of_last = node(at(-1))
     final = _final_conditions(functional, p, system, at(-1), last, of_last)
     nodes = (last, node(at(-2))[0], node(at(-3))[0], node(at(-4))[0])
-    motion = start(scheme, mass, nodes, final.mu, -final.mu_rate, h)
+    last_h = sizes[-1]
+    s = [(path.t[-1] - path.t[-1 - i]) / last_h for i in (1, 2, 3)]
+    motion = start(scheme, mass, nodes, s, final.mu, -final.mu_rate, last_h)
     bar = final_cotangents(functional, p, system, at(-1), final.eta1, final.eta2)
-    bar = accumulated(bar, functional, p, system, at(-1), motion.x, motion.lam, h / 2)
+    bar = accumulated(bar, functional, p, system, at(-1), motion.x, motion.lam, last_h / 2)
 
-    def sweep(carry, point: Point):
+    # in the time that runs backwards a step of size h[n] leads to the n-th point, and follows one of size h[n + 1]
+    ratios = sizes / jnp.concatenate([sizes[1:], sizes[-1:]])
+
+    def sweep(carry, inputs):
         motion, bar = carry
+        point, h, ratio, weight = inputs
         here, _ = node(point)
-        motion = advance(scheme, mass, motion, here, h)
-        return (motion, accumulated(bar, functional, p, system, point, motion.x, motion.lam, h)), None
+        motion = advance(scheme, mass, motion, here, h, ratio)
+        return (motion, accumulated(bar, functional, p, system, point, motion.x, motion.lam, weight)), None
 
     interior = jax.tree.map(lambda leaf: leaf[1:-1], path)
-    (motion, bar), _ = lax.scan(sweep, (motion, bar), interior, reverse=True)
+    inputs = (interior, sizes[1:], ratios[1:], (sizes[1:] + sizes[:-1]) / 2)
+    (motion, bar), _ = lax.scan(sweep, (motion, bar), inputs, reverse=True)
     first, of = node(at(0))
-    motion = advance(scheme, mass, motion, first, h)
-    bar = accumulated(bar, functional, p, system, at(0), motion.x, motion.lam, h / 2)
+    motion = advance(scheme, mass, motion, first, sizes[0], ratios[0])
+    bar = accumulated(bar, functional, p, system, at(0), motion.x, motion.lam, sizes[0] / 2)
 
     rho = of.f_m.T + mass @ motion.x
     pi = of.f_c.T + first.damping @ motion.x - of.df_m.T + mass @ motion.rate  # μ̇ = −dμ/dτ

@@ -21,26 +21,25 @@ import jax.numpy as jnp
 from jax import lax
 
 from lgsens.dynamics import State, consistent_velocity, full_jacobian, kkt_solve
-from lgsens.integrate import GeneralizedAlpha, Variation
+from lgsens.integrate import GeneralizedAlpha, Variation, earlier, later, with_first
 from lgsens.sensitivity._linear_alpha import Motion, Node, advance, started
-from lgsens.sensitivity._linearization import Parameters, pseudo_load_function
+from lgsens.sensitivity._linearization import Parameters, node_tangent, pseudo_load_function
 
 
 def continuous_direct_sweep(
     scheme: GeneralizedAlpha, states: State, parameters: Parameters, first: Variation, d: Parameters
 ) -> Variation:
     """The sensitivities (w, v', v̇', λ', a' = v̇') of all states, stacked, given those of the first."""
-    system, t0, h = parameters.system, parameters.grid.t0, parameters.grid.h
+    system, grid = parameters
     group, mass = system.group, system.mass_matrix()
-    num_steps = states.v.shape[0] - 1
-    count = jnp.arange(num_steps + 1, dtype=states.v.dtype)
+    places, d_places = jax.jvp(lambda grid: grid.places(), (grid,), (d.grid,))
 
-    def node(state: State, n) -> Node:
-        t = t0 + n * h
+    def node(state: State, place, d_place) -> Node:
+        t, d_t = grid.node(place).t, node_tangent(grid, d.grid, place, d_place).t
         k_t, c_t, jacobian = system.tangents(state.q, state.v, state.vdot, state.lam, t)
         bracket = group.ad(state.v)
         loads = pseudo_load_function(state)
-        r_p, phi_p = jax.jvp(loads, (system, t), (d.system, d.grid.t0 + n * d.grid.h))[1]
+        r_p, phi_p = jax.jvp(loads, (system, t), (d.system, d_t))[1]
         return Node(
             damping=c_t + mass @ bracket,
             stiffness=k_t + c_t @ bracket + mass @ group.ad(state.vdot),
@@ -49,15 +48,18 @@ def continuous_direct_sweep(
             level=-phi_p[:, None],
         )
 
-    motion = _begin(scheme, system, jax.tree.map(lambda leaf: leaf[0], states), first, d, t0, h)
+    motion = _begin(scheme, system, jax.tree.map(lambda leaf: leaf[0], states), first, d, grid.t0, grid.first_size)
 
     def sweep(previous: Motion, inputs):
-        current = advance(scheme, mass, previous, node(*inputs), h)
+        state, place, d_place, link = inputs
+        h = grid.node(place).h
+        current = advance(scheme, mass, previous, node(state, place, d_place), h, link.ratio)
+        current = link.unless_empty(current, previous)
         return current, current
 
-    later = (jax.tree.map(lambda leaf: leaf[1:], states), count[1:])
-    _, rest = lax.scan(sweep, motion, later)
-    motion = jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest])[..., 0], motion, rest)
+    links = jax.vmap(lambda place, state: grid.link(scheme, place, state))(places, earlier(states))
+    _, rest = lax.scan(sweep, motion, (later(states), places, d_places, links))
+    motion = jax.tree.map(lambda leaf: leaf[..., 0], with_first(motion, rest))
     return jax.vmap(partial(_variation, group))(states, motion)
 
 

@@ -16,7 +16,7 @@ from lgsens.sensitivity._criterion_terms import (
 )
 from lgsens.sensitivity._first_order_adjoint import first_order_adjoint_sweep
 from lgsens.sensitivity._linearization import Parameters
-from lgsens.sensitivity._methods import linear_scheme, require_equal_steps
+from lgsens.sensitivity._methods import linear_scheme, require_positions
 
 TREATMENTS = ("state", "derivatives", "first_order", None)
 
@@ -59,9 +59,14 @@ class ContinuousAdjoint(eqx.Module):
         uses: tuple[bool, bool],
     ) -> Cotangents:
         """dΨ as it acts on the initial state, the system and p; `uses`: whether F and G use v̇ or λ."""
-        require_equal_steps("ContinuousAdjoint", parameters)
+        require_positions("ContinuousAdjoint", parameters)
         scheme = linear_scheme(scheme)
         t, h = parameters.grid.times(), parameters.grid.h
+        if self.accelerations != "state" and h.ndim:
+            raise ValueError(
+                f"ContinuousAdjoint({self.accelerations!r}) takes differences in equal steps: leave GivenSteps and "
+                "AdaptiveSteps out, or take ContinuousAdjoint('state'), DirectDifferentiation() or AdjointVariable()."
+            )
         derivatives = uses[0] and self.accelerations in ("derivatives", None)
         path = points(scheme, states, t, h, derivatives=derivatives)
         if self.accelerations == "first_order":

@@ -43,15 +43,15 @@ class Motion(NamedTuple):
     a: Float[Array, "k c"]
 
 
-def start(scheme: GeneralizedAlpha, mass, nodes: tuple[Node, Node, Node, Node], x, rate, h) -> Motion:
-    """The starting values that follow from x and ẋ at the first of four nodes, a distance h apart.
+def start(scheme: GeneralizedAlpha, mass, nodes: tuple[Node, Node, Node, Node], s, x, rate, h) -> Motion:
+    """The starting values that follow from x and ẋ at the first of four nodes, the others at distances s_i h from it.
 
     The second derivative of the constraint would give ẍ; it asks for B̈ and g̈. Here x is instead a polynomial of degree
     four through x_0 and ẋ_0, with y_d = h^d x^(2+d)_0, d = 0, 1, 2, that solves the equations at the three later nodes,
-    i = 1, 2, 3:
+    i = 1, 2, 3, with s = s_i:
 
         M ẍ_i + D_i ẋ_i + K_i x_i + B_iᵀλ_i = l_i,      B_i x_i = g_i
-        ẍ_i = Σ i^d/d! y_d,     ẋ_i = ẋ_0 + h Σ i^(d+1)/(d+1)! y_d,     x_i = x_0 + ih ẋ_0 + h² Σ i^(d+2)/(d+2)! y_d
+        ẍ_i = Σ s^d/d! y_d,   ẋ_i = ẋ_0 + h Σ s^(d+1)/(d+1)! y_d,   x_i = x_0 + s h ẋ_0 + h² Σ s^(d+2)/(d+2)! y_d
 
     ẍ_0 is then accurate to O(h³) and x⃛_0 to O(h²). (A cubic through two nodes has order 2 as well, but an h³ that hid
     it down to h = 3e-4 s in a terminal criterion of the quarter-car.)
@@ -62,14 +62,14 @@ def start(scheme: GeneralizedAlpha, mass, nodes: tuple[Node, Node, Node, Node], 
     dynamic, constraints, loads, levels = [], [], [], []
     for i, node in enumerate(nodes[1:], 1):
         jacobian = scale * node.constraint_jacobian
-        weights = [[i ** (d + n) / math.factorial(d + n) for d in range(3)] for n in range(3)]
+        weights = [[s[i - 1] ** (d + n) / math.factorial(d + n) for d in range(3)] for n in range(3)]
         columns = [
             weights[0][d] * mass + (h * weights[1][d]) * node.damping + (h**2 * weights[2][d]) * node.stiffness
             for d in range(3)
         ]
         dynamic.append([*columns, *(jacobian.T if n == i else none for n in (1, 2, 3))])
         constraints.append([*(weights[2][d] * jacobian for d in range(3)), empty, empty, empty])
-        free = x + (i * h) * rate
+        free = x + (s[i - 1] * h) * rate
         loads.append(node.load - node.damping @ rate - node.stiffness @ free)
         levels.append(scale * (node.level - node.constraint_jacobian @ free) / h**2)
     solution = jnp.linalg.solve(jnp.block([*dynamic, *constraints]), jnp.concatenate([*loads, *levels]))
@@ -94,8 +94,9 @@ def started(scheme: GeneralizedAlpha, mass, jacobian, exact: Motion, h) -> Motio
     return exact._replace(rate=exact.rate + h * (missed - tangential))
 
 
-def advance(scheme: GeneralizedAlpha, mass, previous: Motion, node: Node, h) -> Motion:
-    """One step: one factorization, one solve for all columns."""
+def advance(scheme: GeneralizedAlpha, mass, previous: Motion, node: Node, h, ratio) -> Motion:
+    """One step, `ratio` times as long as the one before: one factorization, one solve for all columns."""
+    previous = previous._replace(a=scheme.resized(previous.acceleration, previous.a, ratio))
     x = previous.x + h * previous.rate + (h**2 * (0.5 - scheme.beta)) * previous.a
     rate = previous.rate + (h * (1.0 - scheme.gamma)) * previous.a
     acceleration = (scheme.alpha_m * previous.a - scheme.alpha_f * previous.acceleration) / (1.0 - scheme.alpha_f)

@@ -14,7 +14,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from lgsens.dynamics import State, require_independent
-from lgsens.integrate import AbstractScheme, EqualGrid, GeneralizedAlpha, Stats, earlier, states_of, with_first
+from lgsens.integrate import AbstractScheme, GeneralizedAlpha, Stats, earlier, states_of, with_first
 from lgsens.sensitivity._adjoint import adjoint_sweep
 from lgsens.sensitivity._continuous_direct import continuous_direct_sweep
 from lgsens.sensitivity._direct import direct_sweep
@@ -115,7 +115,7 @@ class ContinuousDirect(AbstractSensitivity):
     """
 
     def trajectory(self, scheme, state0, parameters, found=None):
-        require_equal_steps("ContinuousDirect", parameters)
+        require_positions("ContinuousDirect", parameters)
         return _decoded(_continuous_trajectory(scheme, state0, parameters))
 
 
@@ -131,14 +131,13 @@ class Autodiff(AbstractSensitivity):
         return _decoded(_run(scheme.for_autodiff(), state0, parameters))
 
 
-def require_equal_steps(method: str, parameters: Parameters) -> None:
-    """Raise `ValueError` where a continuous method, whose start is a polynomial over equal steps, has others."""
+def require_positions(method: str, parameters: Parameters) -> None:
+    """Raise `ValueError` where the constraints of a motion are not those of the paper: of positions, independent."""
     require_independent(parameters.system, method)
-    if not isinstance(parameters.grid, EqualGrid) or parameters.system.num_velocity_rows:
+    if parameters.system.num_velocity_rows:
         raise ValueError(
-            f"{method} integrates the differentiated equations of motion in equal steps, with constraints of position "
-            "level: leave GivenSteps, AdaptiveSteps and `Rolling` out, or take DirectDifferentiation() or "
-            "AdjointVariable()."
+            f"{method} integrates the differentiated equations of motion with constraints of position level only: "
+            "leave `Rolling` out, or take DirectDifferentiation() or AdjointVariable()."
         )
 
 
