@@ -35,6 +35,7 @@ from lgsens.integrate import (
     AdaptiveSteps as AdaptiveSteps,
     GeneralizedAlpha as GeneralizedAlpha,
     GivenSteps as GivenSteps,
+    IndexReducedODE as IndexReducedODE,
 )
 from lgsens.linear import BlockSparse as BlockSparse, DenseLU as DenseLU
 from lgsens.model import (
@@ -75,7 +76,6 @@ from lgsens.sensitivity import (
 from lgsens.simulation import (
     BodyMotion as BodyMotion,
     Extrapolated as Extrapolated,
-    IndexReducedODE as IndexReducedODE,
     Instant as Instant,
     Richardson as Richardson,
     Saved as Saved,

@@ -288,6 +288,7 @@ def test_mechanism_that_cannot_be_assembled():
 
 
 CRITERION = lg.Criterion(terminal=lambda s, p: s.state.q[0])
+CONTROLLED = lg.IndexReducedODE(rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -301,12 +302,19 @@ CRITERION = lg.Criterion(terminal=lambda s, p: s.state.q[0])
         (lambda: lg.IndexReducedODE(max_steps=0), says("`max_steps` must be at least 1", "0")),
         (lambda: lg.IndexReducedODE(mode="both"), says("`mode` must be one of", "'both'")),
         (
-            lambda: lg.simulate(pendulum(), t1=1.0, num_steps=2, integrator=TSIT5, sensitivity=lg.AdjointVariable()),
-            says("`sensitivity` = AdjointVariable()", "leave it out"),
+            lambda: swing(9.81, 2, CONTROLLED, sensitivity=lg.AdjointVariable()),
+            says("`sensitivity` = AdjointVariable()", "`mode`", "leave `rtol` out"),
         ),
+        (lambda: swing(9.81, 2, CONTROLLED, save=lambda s: s.t), says("`save`", "leave `rtol` out")),
         (
-            lambda: lg.differentiate(CRITERION, pendulum, 9.81, t1=1.0, num_steps=2, integrator=TSIT5),
-            says("`integrator` must be a GeneralizedAlpha", "`jax.grad` and `jax.jacfwd`"),
+            lambda: lg.differentiate(CRITERION, pendulum, 9.81, t1=1.0, num_steps=2, integrator=CONTROLLED),
+            says("`rtol` = 1e-06", "`mode`", "Leave `rtol` out"),
+        ),
+        (lambda: lg.AdaptiveSteps(CONTROLLED), says("`rtol` = 1e-06", "Leave `rtol` out")),
+        (lambda: lg.Richardson(TSIT5), says("`integrator` must be of second order", "as it is")),
+        (
+            lambda: swing(9.81, 4, sensitivity=lg.ContinuousDirect()),
+            says("ContinuousDirect", "the motion is by IndexReducedODE"),
         ),
     ],
 )

@@ -25,8 +25,7 @@ import numpy as np
 
 from lgsens.accuracy._programs import Evaluated, Study, evaluate
 from lgsens.accuracy._setting import Setting
-from lgsens.integrate import GeneralizedAlpha
-from lgsens.simulation import IndexReducedODE
+from lgsens.integrate import GeneralizedAlpha, IndexReducedODE
 
 TARGET = 1e-11  # an error at which a route need not go on
 _TRUSTED = 1e-3  # an error above which a route is no reference

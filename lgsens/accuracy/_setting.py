@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from lgsens._validate import as_count
 from lgsens.criteria import Criterion
 from lgsens.dynamics import RESULTS
-from lgsens.integrate import GeneralizedAlpha
-from lgsens.simulation import IndexReducedODE, Trajectory, richardson, simulate
+from lgsens.integrate import GeneralizedAlpha, IndexReducedODE
+from lgsens.simulation import Trajectory, richardson, simulate
 
 # A user's own function: of the trajectory, or a `Criterion`, which is one of the trajectory and the parameters.
 Function = Callable[[Trajectory], Any] | Criterion

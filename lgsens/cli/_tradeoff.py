@@ -18,8 +18,7 @@ from lgsens.accuracy import Recommendation, Setting, Table, grid, ladder, plot, 
 from lgsens.cli._report import output_folder, version
 from lgsens.criteria import Criterion
 from lgsens.examples import PROBLEMS, QuarterCar
-from lgsens.integrate import GeneralizedAlpha
-from lgsens.simulation import IndexReducedODE
+from lgsens.integrate import GeneralizedAlpha, IndexReducedODE
 
 TARGETS = (1e-2, 1e-4, 1e-6, 1e-8)
 NAMES = {

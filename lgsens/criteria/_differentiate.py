@@ -71,7 +71,8 @@ def differentiate(
         build: p ↦ the scene, a `Model` or an `AbstractSystem`; `lambda model: model` for every number of a model.
         p: the design parameters, a pytree of floats.
         t0, t1, num_steps, integrator: as in `simulate`.
-        method: `DirectDifferentiation()`: on the fly, no trajectory is stored. `AdjointVariable()`: one forward
+        method: `DirectDifferentiation()`: on the fly, no trajectory is stored (unless criteria are integrated over
+            stages, as those of `IndexReducedODE`). `AdjointVariable()`: one forward
             and one backward sweep. `ContinuousDirect()`, `ContinuousAdjoint()`: the equations of motion
             differentiated, then integrated. For comparison: `Autodiff()`, `FiniteDifferences()`, `IndexReduced()`.
             None: direct or adjoint, as `direct_or_adjoint` advises for these numbers of parameters and criteria.
@@ -213,7 +214,7 @@ def _differentiate_jit(criteria, names, build, start, p, t0, t1, num_steps, inte
         found = _differences(task, flat, method)
     elif isinstance(method, ContinuousAdjoint):
         found = _continuous_adjoint(task, flat, method, uses)
-    elif isinstance(method, DirectDifferentiation) and not integrator.extrapolated:
+    elif isinstance(method, DirectDifferentiation) and not (integrator.extrapolated or integrator.scheme.has_stages):
         found = _on_the_fly(task, flat)
     else:
         found = _through_the_trajectory(task, flat, method)

@@ -6,10 +6,10 @@ from lgsens.integrate._adaptive import (
     integrate_controlled as integrate_controlled,
 )
 from lgsens.integrate._alpha import AbstractAlpha as AbstractAlpha
-from lgsens.integrate._explicit_steps import (
-    Coefficients as Coefficients,
-    Numbers as Numbers,
-    equal_steps as equal_steps,
+from lgsens.integrate._explicit import (
+    IndexReducedODE as IndexReducedODE,
+    StepStats as StepStats,
+    drift as drift,
     projection as projection,
 )
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha as GeneralizedAlpha
@@ -39,8 +39,10 @@ from lgsens.integrate._scheme import (
     AbstractIntegrator as AbstractIntegrator,
     AbstractScheme as AbstractScheme,
     Laid as Laid,
+    Stages as Stages,
     Start as Start,
     Stats as Stats,
     rows as rows,
+    scheme_of as scheme_of,
 )
 from lgsens.integrate._singular import margin_of as margin_of, singular_steps as singular_steps

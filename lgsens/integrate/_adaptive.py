@@ -37,7 +37,7 @@ from lgsens.integrate._grid import Node, UnevenGrid, with_first
 from lgsens.integrate._lanes import in_any_lane
 from lgsens.integrate._march import Progress, Walk, chosen
 from lgsens.integrate._pace import UnevenPace
-from lgsens.integrate._scheme import AbstractIntegrator, AbstractScheme, Laid, Start, Stats
+from lgsens.integrate._scheme import AbstractIntegrator, AbstractScheme, Laid, Start, Stats, scheme_of
 
 _AIM = 0.5  # θ: few steps are rejected
 _LIMIT = 1.0  # κ: no step is more than 2.6 times as long as the one before
@@ -78,8 +78,7 @@ class AdaptiveSteps(AbstractIntegrator):
     longest: float = eqx.field(static=True, default=0.02, kw_only=True)
 
     def __check_init__(self):
-        if not isinstance(self.integrator, AbstractScheme):
-            raise ValueError(f"AdaptiveSteps: `integrator` must be a GeneralizedAlpha, got {self.integrator!r}.")
+        scheme_of("AdaptiveSteps", self.integrator)
         if not isinstance(self.tolerance, int | float) or not 0.0 < self.tolerance < math.inf:
             raise ValueError(f"AdaptiveSteps: `tolerance` must be positive, got {self.tolerance!r}; try 1e-6.")
         if not isinstance(self.longest, int | float) or not 0.0 < self.longest <= 1.0:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from lgsens._validate import as_float, is_concrete, require
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
 from lgsens.integrate._grid import UnevenGrid
-from lgsens.integrate._scheme import AbstractIntegrator, AbstractScheme, Laid
+from lgsens.integrate._scheme import AbstractIntegrator, AbstractScheme, Laid, scheme_of
 
 
 class GivenSteps(AbstractIntegrator):
@@ -37,11 +37,9 @@ class GivenSteps(AbstractIntegrator):
 
     def __init__(self, fractions, integrator: AbstractScheme = GeneralizedAlpha()):
         self.fractions = as_float(fractions, None, "GivenSteps: `fractions`")
-        self.integrator = integrator
+        self.integrator = scheme_of("GivenSteps", integrator)
         if self.fractions.ndim != 1 or not self.fractions.size:
             raise ValueError(f"GivenSteps: `fractions` must have shape (num_steps,), got {self.fractions.shape}.")
-        if not isinstance(integrator, AbstractScheme):
-            raise ValueError(f"GivenSteps: `integrator` must be a GeneralizedAlpha, got {integrator!r}.")
         require(
             lambda sizes: np.all(np.isfinite(sizes)) and np.all(sizes >= 0.0) and sizes[0] > 0.0,
             "GivenSteps: `fractions` must be finite, not negative, and the first one positive.",

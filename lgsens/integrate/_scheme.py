@@ -8,7 +8,7 @@ the product with it that second derivatives are taken of. Schemes that want to b
 import abc
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,7 +18,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from lgsens.dynamics import AbstractSystem, Initial, State
+from lgsens.dynamics import RESULTS, AbstractSystem, Initial, State
 from lgsens.integrate._grid import AbstractGrid, EqualGrid, Node
 from lgsens.integrate._linearized import AbstractLinearizedStep, DenseLinearizedStep, Variation
 from lgsens.integrate._pace import AbstractPace
@@ -61,6 +61,22 @@ class Start(NamedTuple):
         )
 
 
+class Stages(NamedTuple):
+    """The stages of Runge–Kutta steps: ∫ F dt = Σ w F(stage), of the order of the scheme, is its own quadrature.
+
+    A stage on its own is of low order; only the sum over all of them is of that of the scheme.
+
+    Attributes:
+        t: times [s], shape (s,), in the order of the steps.
+        weights: w [s], shape (s,).
+        states: the states, stacked along a leading axis.
+    """
+
+    t: Float[Array, " s"]
+    weights: Float[Array, " s"]
+    states: State
+
+
 class Laid(NamedTuple):
     """Where steps begin and end, and what is known of them already."""
 
@@ -97,16 +113,29 @@ class AbstractIntegrator(eqx.Module):
         return Laid(EqualGrid(t0, (t1 - t0) / num_steps, num_steps))
 
 
+def scheme_of(owner: str, integrator: Any) -> "AbstractScheme":
+    """The scheme that an integrator is to lay steps for; `ValueError` where that is none."""
+    if not isinstance(integrator, AbstractScheme):
+        raise ValueError(f"{owner}: `integrator` must be a GeneralizedAlpha, got {integrator!r}.")
+    return integrator.scheme
+
+
 class AbstractScheme(AbstractIntegrator):
     """A one-step scheme on a constrained system; static and hashable.
 
     Attributes:
         tolerance: the last Newton increment of a configuration, relative to 1 rad or the length of the scene.
         max_iterations: Newton iterations per step before the step has failed.
+        order: 2, or 4 where the states deserve a rule of fourth order (`Trajectory.order`).
+        failure: what a step that failed is called.
+        has_stages: whether criteria are integrated over `stages`.
     """
 
     tolerance: eqx.AbstractVar[float]
     max_iterations: eqx.AbstractVar[int]
+    order: ClassVar[int] = 2
+    failure: ClassVar[RESULTS] = RESULTS.newton_failed
+    has_stages: ClassVar[bool] = False
 
     @property
     def scheme(self):
@@ -126,6 +155,10 @@ class AbstractScheme(AbstractIntegrator):
         """What the scheme starts from, given consistent values."""
         return Start(initial.state)
 
+    def resumed(self, system: AbstractSystem, state0: State, t0) -> State:
+        """What the scheme starts from, given the state of another run."""
+        return self.complete(system, state0)
+
     def complete(self, system: AbstractSystem, state: State) -> State:
         """A state with what else the scheme carries."""
         return state
@@ -133,6 +166,14 @@ class AbstractScheme(AbstractIntegrator):
     def physical(self, system: AbstractSystem, states: State) -> State:
         """A state, or stacked ones, without what else the scheme carries."""
         return states
+
+    def statistics(self, stats: Stats) -> Any:
+        """What the trajectory shows of them."""
+        return stats
+
+    def stages(self, system: AbstractSystem, grid: AbstractGrid, states: State) -> Stages | None:
+        """Those of all steps, if criteria are integrated over them."""
+        return None
 
     def resized(self, vdot, a, ratio) -> Float[Array, " k"]:
         """a of a state as a step begins with it that is `ratio` times as long as the one that led there."""

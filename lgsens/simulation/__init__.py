@@ -7,7 +7,6 @@ from lgsens.simulation._errors import (
     redundant_names as redundant_names,
     throw_if_failed as throw_if_failed,
 )
-from lgsens.simulation._index_reduced_ode import IndexReducedODE as IndexReducedODE
 from lgsens.simulation._richardson import (
     Extrapolated as Extrapolated,
     Richardson as Richardson,

@@ -90,7 +90,8 @@ def describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> st
     if code is RESULTS.integration_failed:
         return (
             f"{code.message} It failed in interval {int(details['step'])} of {int(details['num_steps'])}, from "
-            f"t = {details['time']:.6g} s on, in {int(details['steps'])} steps. `throw=False` returns the data before."
+            f"t = {details['begin']:.6g} s on, in {int(details['iterations'])} steps. "
+            "`throw=False` returns the data before."
         )
     return code.message
 

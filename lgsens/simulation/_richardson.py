@@ -35,7 +35,7 @@ from jaxtyping import PyTree
 
 from lgsens._validate import as_count
 from lgsens.dynamics import RESULTS, AbstractSystem, State
-from lgsens.integrate import AbstractIntegrator, AbstractScheme, GeneralizedAlpha
+from lgsens.integrate import AbstractIntegrator, AbstractScheme, GeneralizedAlpha, scheme_of
 from lgsens.simulation._trajectory import Saved, StateError, Trajectory
 
 Run = TypeVar("Run", Trajectory, Saved)
@@ -67,8 +67,11 @@ class Richardson(AbstractIntegrator):
     integrator: AbstractScheme = eqx.field(static=True, default=GeneralizedAlpha())
 
     def __check_init__(self):
-        if not isinstance(self.integrator, AbstractScheme):
-            raise ValueError(f"Richardson: `integrator` must be a GeneralizedAlpha, got {self.integrator!r}.")
+        if scheme_of("Richardson", self.integrator).order != 2:
+            raise ValueError(
+                f"Richardson: `integrator` must be of second order, as GeneralizedAlpha, got {self.integrator!r}; take "
+                "it as it is, in more steps."
+            )
 
     @property
     def scheme(self):

@@ -24,6 +24,7 @@ from lgsens.integrate import (
     AbstractScheme,
     EqualGrid,
     GeneralizedAlpha,
+    IndexReducedODE,
     Laid,
     Stats,
     singular_steps,
@@ -31,7 +32,7 @@ from lgsens.integrate import (
 from lgsens.model import Model
 from lgsens.sensitivity import AbstractSensitivity, DirectDifferentiation, Parameters, saved_run
 from lgsens.simulation._errors import throw_if_failed
-from lgsens.simulation._index_reduced_ode import IndexReducedODE, integrate_ode, ode_failure
+from lgsens.simulation._index_reduced_ode import integrate_ode, ode_failure
 from lgsens.simulation._richardson import extrapolate_runs
 from lgsens.simulation._start import Begin, begin
 from lgsens.simulation._trajectory import Instant, Saved, Trajectory
@@ -111,7 +112,6 @@ def _checked(system: AbstractSystem, initial: Initial, t0, throw: bool) -> State
     return throw_if_failed(initial.state, initial.result, details, system.constraint_names)
 
 
-Integrator = AbstractIntegrator | IndexReducedODE
 Save = Callable[[Instant], Any]
 
 
@@ -122,7 +122,7 @@ def simulate(
     t0: Any = ...,
     t1: Any,
     num_steps: int,
-    integrator: Integrator = ...,
+    integrator: AbstractIntegrator = ...,
     sensitivity: AbstractSensitivity = ...,
     state0: State | None = ...,
     save: None = ...,
@@ -137,7 +137,7 @@ def simulate(
     t0: Any = ...,
     t1: Any,
     num_steps: int,
-    integrator: Integrator = ...,
+    integrator: AbstractIntegrator = ...,
     sensitivity: AbstractSensitivity = ...,
     state0: State | None = ...,
     save: Save,
@@ -151,7 +151,7 @@ def simulate(
     t0=0.0,
     t1,
     num_steps: int,
-    integrator: Integrator = GeneralizedAlpha(),
+    integrator: AbstractIntegrator = GeneralizedAlpha(),
     sensitivity: AbstractSensitivity = DirectDifferentiation(),
     state0: State | None = None,
     save: Save | None = None,
@@ -171,8 +171,8 @@ def simulate(
             transformation; `AdjointVariable` is reverse mode only.
         state0: the state at t0, used as it is: one of `equilibrium`, or `Trajectory.state` to continue. None: the
             consistent initial state of the model.
-        save: what to return of each instant instead of the trajectory, a function s ↦ pytree of an `Instant`, of
-            `GeneralizedAlpha` only; the result is a `Saved`. Without derivatives no state is stored, so that a batch of
+        save: what to return of each instant instead of the trajectory, a function s ↦ pytree of an `Instant`; the
+            result is a `Saved`. Without derivatives no state is stored, so that a batch of
             designs takes the memory of what it asks for. Define it once: a new lambda in each call compiles anew.
             Numbers that it depends on come through the model, or are constants.
         throw: raise if the simulation fails. With False `Trajectory.result` says so, and the data are
@@ -189,16 +189,17 @@ def simulate(
     system = as_system(model)
     warn_of_single_precision(system)
     num_steps = as_count(num_steps, "num_steps", " (it is static)")
-    check_integrator(integrator, num_steps)
+    if not _by_diffrax(integrator):
+        check_integrator(integrator, num_steps)
     if not isinstance(sensitivity, AbstractSensitivity):
         raise ValueError(
             "`sensitivity` must be DirectDifferentiation(), AdjointVariable(), ContinuousDirect() or Autodiff(), got "
             f"{sensitivity!r}; ContinuousAdjoint() needs a Criterion, see `differentiate`."
         )
-    if isinstance(integrator, IndexReducedODE) and (sensitivity != DirectDifferentiation() or save is not None):
+    if _by_diffrax(integrator) and (sensitivity != DirectDifferentiation() or save is not None):
         raise ValueError(
-            f"`sensitivity` = {sensitivity!r} and `save` are for schemes with a linearization of their own; leave them "
-            "out, IndexReducedODE has its own derivative."
+            f"`sensitivity` = {sensitivity!r} and `save` need steps of the scheme. With `rtol` diffrax takes its own, "
+            "and differentiates them in one direction only (`mode`): leave them out, or leave `rtol` out."
         )
     if save is not None and not callable(save):
         raise ValueError(f"`save` must be a function of an Instant, got {save!r}. Leave it out to have the trajectory.")
@@ -210,12 +211,15 @@ def simulate(
 
 
 def check_integrator(integrator: Any, num_steps: int) -> None:
-    """Raise `ValueError` for what is no integrator, or none of so many steps."""
-    if isinstance(integrator, IndexReducedODE):
-        return
+    """Raise `ValueError` for what is no integrator of a scheme, or none of so many steps."""
     if not isinstance(integrator, AbstractIntegrator):
         raise ValueError(f"`integrator` must be a GeneralizedAlpha or another integrator, got {integrator!r}.")
+    _ = integrator.scheme  # which may say why there is none
     integrator.check(num_steps)
+
+
+def _by_diffrax(integrator: Any) -> bool:
+    return isinstance(integrator, IndexReducedODE) and integrator.rtol is not None
 
 
 def interval(t0, t1):
@@ -228,32 +232,31 @@ def interval(t0, t1):
 @eqx.filter_jit
 def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, save):
     initial = None if state0 is not None else _initial(system, t0)
-    if isinstance(integrator, IndexReducedODE):
+    if _by_diffrax(integrator):
         return _run_ode(system, state0, initial, t0, (t1 - t0) / num_steps, num_steps, integrator)
     start = begin(integrator.scheme, system, t0, state0, initial)
     return run(system, start, t0, t1, num_steps, integrator, sensitivity, save)
 
 
 def _run_ode(system: AbstractSystem, state0, initial, t0, h, num_steps: int, integrator: IndexReducedODE):
-    """`run` of the index-reduced equations, with nothing of generalized-α in the initial state."""
-    begun = begin(GeneralizedAlpha(second_order_start=False), system, t0, state0, initial)
-    states, stats, stages = integrate_ode(integrator, num_steps, system, begun.start.state, t0, h)
+    """`run` with the steps of diffrax."""
+    begun = begin(integrator, system, t0, state0, initial)
+    states, stats = integrate_ode(integrator, num_steps, system, integrator.physical(system, begun.start.state), t0, h)
     result, details = ode_failure(stats, t0, h)
     result = jnp.where(begun.result == RESULTS.successful, result, begun.result).astype(jnp.int32)
     details = jax.lax.stop_gradient(details | {"violation": begun.violation, "jacobian": begun.jacobian})
     t = EqualGrid(t0, h, num_steps).times()
-    found = Trajectory(t=t, states=states, result=result, stats=stats, system=system, order=4, stages=stages)
-    return found, details
+    return Trajectory(t, states, result, stats, system, order=integrator.order), details
 
 
 def outcome(scheme: AbstractScheme, begun: Begin, stats: Stats, turns, t, laid: Laid):
     """The result code of a simulation, and what its message needs; `turns`: h `unsteady_rate` of each step."""
     failed = jnp.argmin(stats.converged)  # the first step that did not converge, 0 if all did
-    newton = jnp.where(jnp.all(stats.converged), RESULTS.successful, RESULTS.newton_failed)
+    newton = jnp.where(jnp.all(stats.converged), RESULTS.successful, scheme.failure)
     singular = singular_steps(stats.margin)
     newton = jnp.where(jnp.any(singular), RESULTS.singular_configuration, newton)
     failed = jnp.where(jnp.any(singular), jnp.argmax(singular), failed)
-    unresolved = jnp.any(turns > jnp.pi) & (newton != RESULTS.newton_failed)  # which may look singular later
+    unresolved = jnp.any(turns > jnp.pi) & (newton != scheme.failure)  # which may look singular later
     newton = jnp.where(unresolved, RESULTS.turn_not_resolved, newton)
     failed = jnp.where(unresolved, jnp.argmax(turns > jnp.pi), failed)
     result = jnp.where(begun.result == RESULTS.successful, newton, begun.result).astype(jnp.int32)
@@ -268,6 +271,7 @@ def outcome(scheme: AbstractScheme, begun: Begin, stats: Stats, turns, t, laid: 
         "step": failed + 1,
         "num_steps": jnp.asarray(stats.converged.shape[0]),
         "time": time,
+        "begin": t[failed],
         "iterations": stats.iterations[failed],
         "increment": stats.increment[failed],
         "residual": stats.residual[failed],
@@ -309,9 +313,11 @@ def _single_run(system, begun: Begin, t0, t1, num_steps: int, integrator: Abstra
         (values, rates), final, newton = saved_run(sensitivity, _Output(save), scheme, state0, parameters)
         turns = jnp.diff(t) * rates[1:]
     result, details = outcome(scheme, begun, newton, turns, t, laid)
-    stats = newton if laid.stats is None else laid.stats
+    stats = scheme.statistics(newton) if laid.stats is None else laid.stats
     if save is None:
-        found = Trajectory(t=t, states=scheme.physical(system, states), result=result, stats=stats, system=system)
+        stages = scheme.stages(system, grid, states)
+        states = scheme.physical(system, states)
+        found = Trajectory(t, states, result, stats, system, order=scheme.order, stages=stages)
     else:
         found = Saved(t, values, scheme.physical(system, final), result, stats)
     return found, details | jax.lax.stop_gradient({"t1": t1})

@@ -27,7 +27,7 @@ def begin(
 ) -> Begin:
     """The state at t0: `state0` as it is, or the consistent one of the reference configuration, `initial` if known."""
     if state0 is not None:
-        jacobian, start = constraint_jacobian(system, state0.q, t0), Start(scheme.complete(system, state0))
+        jacobian, start = constraint_jacobian(system, state0.q, t0), Start(scheme.resumed(system, state0, t0))
         none = jnp.zeros((), jnp.int32)
         return Begin(start, jnp.zeros_like(state0.v), state0.v, none, system.constraint(state0.q, t0), jacobian)
     initial = initial_state(system, t0) if initial is None else initial

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from lgsens._validate import suggestion
 from lgsens.dynamics import AbstractSystem, State
+from lgsens.integrate import Stages
 from lgsens.model import MultibodySystem
 
 
@@ -56,22 +57,6 @@ class StateError(NamedTuple):
     v: Float[Array, "n+1 k"]
     vdot: Float[Array, "n+1 k"]
     lam: Float[Array, "n+1 m"]
-
-
-class Stages(NamedTuple):
-    """The stages of equal Runge–Kutta steps: ∫ F dt = Σ w F(stage), of the order of the scheme, is its own quadrature.
-
-    A stage on its own is of low order; only the sum over all of them is of that of the scheme.
-
-    Attributes:
-        t: times [s], shape (s,), in the order of the steps.
-        weights: w [s], shape (s,).
-        states: the states, stacked along a leading axis.
-    """
-
-    t: Float[Array, " s"]
-    weights: Float[Array, " s"]
-    states: State
 
 
 class AbstractMotion(eqx.Module):
@@ -135,7 +120,7 @@ class Trajectory(AbstractMotion):
         system: the equations that were integrated.
         error: an estimate of the errors of the states, from integrators that have one (`Richardson`); else None.
         order: 2, or 4 where the states deserve a rule of fourth order: what to give `time_integral`, static.
-        stages: those of `IndexReducedODE` at equal steps, by which a `Criterion` integrates; else None.
+        stages: those of `IndexReducedODE` without `rtol`, by which a `Criterion` integrates; else None.
     """
 
     t: Float[Array, " n+1"]
