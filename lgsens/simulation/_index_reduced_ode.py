@@ -194,7 +194,8 @@ def _equal(settings: IndexReducedODE, num_steps: int, numbers: Numbers, first: S
     converged = jnp.cumprod(finite.astype(jnp.int32)) == 1
     keep = lambda leaf: jnp.where(jnp.expand_dims(converged, range(1, leaf.ndim)), leaf, jnp.nan)
     system, p = numbers.system, found.projection
-    violation = jax.vmap(system.constraint)(p.q)
+    ends = numbers.t0 + (1.0 + jnp.arange(num_steps, dtype=numbers.h.dtype)) * numbers.h
+    violation = jax.vmap(system.constraint)(p.q, ends)
     drift = lax.stop_gradient(jnp.max(jnp.abs(violation), axis=1, initial=0.0))
     tried = jnp.concatenate([jnp.ones(1, bool), converged[:-1]])  # NaN is where a step failed, 0 after it
     scheme = Coefficients.of(settings.tableau)
