@@ -44,8 +44,9 @@ class Quality(NamedTuple):
 def _evaluated(system: AbstractSystem, states: State, t):
     def at(state: State, t):
         rest = system.residual(state.q, state.v, jnp.zeros_like(state.v), jnp.zeros_like(state.lam), t)
+        driven = jnp.dot(state.lam, prescribed_velocity(system, state.q, t))
         kinetic = 0.5 * jnp.dot(state.v, system.mass_matrix() @ state.v)
-        return jnp.max(jnp.abs(system.constraint(state.q, t)), initial=0.0), kinetic, -jnp.dot(state.v, rest)
+        return jnp.max(jnp.abs(system.constraint(state.q, t)), initial=0.0), kinetic, driven - jnp.dot(state.v, rest)
 
     return jax.vmap(at)(states, t)
 

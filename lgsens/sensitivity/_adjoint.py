@@ -108,7 +108,7 @@ def adjoint_sweep(scheme: GeneralizedAlpha, states: State, parameters: Parameter
             return (c, bar), (solved, Grid(bar_t, bar_t + jnp.sum(rates, axis=1), bar_ratio))
         n = (step.t - parameters.t0) / h
         if softness(system) is not None:
-            violation = jax.vmap(system.constraint)(step.state.q)
+            violation = jax.vmap(system.constraint)(step.state.q, step.t)
             bar = bar._replace(h=bar.h + jnp.sum(mu.lam * violation) * 2.0 / (scheme.beta * h**3))
         bar = Parameters(
             system=jax.tree.map(jnp.add, bar.system, bar_system),

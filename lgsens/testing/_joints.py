@@ -18,7 +18,6 @@ from lgsens.model import (
     constraint_jacobian,
     constraint_stiffness,
 )
-from lgsens.model._frames import BODY_A, BODY_B
 from lgsens.testing._poses import DIM, Poses, displaced, same, slope, vanishes
 from lgsens.testing._report import Check, Report, worst
 from lgsens.testing._sensitivities import check_sensitivities
@@ -108,7 +107,7 @@ def _said(element: AbstractRows, a, b, velocity, t):
     if isinstance(element, AbstractConstraint):
         return element.value(a, b, t)
     assert isinstance(element, AbstractVelocityConstraint)
-    return element.rate(a, b, velocity[BODY_A], velocity[BODY_B], t)
+    return element.rate(a, b, *jnp.split(velocity, 2), t)
 
 
 def _program(element: AbstractRows, lam, velocity, t, free):
