@@ -10,6 +10,7 @@ import pytest
 from helpers import EPS, GRAVITY
 
 import lgsens as lg
+from lgsens.accuracy._balance import quality
 from lgsens.examples import slider_crank
 
 END = 0.4
@@ -48,6 +49,9 @@ def test_driven_slider_crank_is_that_of_kinematics(name):
     violation = jax.jit(jax.vmap(system.constraint))(states.q, fine.t)
     # Newton ends at round-off of accelerations, that is of Φ/h² where h < 1
     assert np.abs(violation).max() < 256 * EPS
+    # the motor's work is in the balance of energy
+    drift = [quality(found).energy_drift for found in (coarse, fine)]
+    assert drift[1] < max(drift[0] / 3.5, 1e-9) and drift[0] < 1e-2
 
 
 def shaken(x, num_steps, t0=0.0, **settings):

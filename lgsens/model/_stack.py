@@ -94,7 +94,14 @@ class Stack(eqx.Module, Generic[Element]):
         found = Ends(self.a, self.b, self.owners, self.kept, acts_on=self.elements.acts_on)
         if not isinstance(self.elements, AbstractRows):
             return found
-        return found._replace(relative=self.elements.relative, coupled=self.elements.coupled)
+        velocity = isinstance(self.elements, AbstractVelocityConstraint)
+        return found._replace(relative=self.elements.relative, coupled=self.elements.coupled, velocity=velocity)
+
+    def only(self, i: int) -> "Stack[Element]":
+        """The stack of one of its elements."""
+        own = lambda values: None if values is None else values[i : i + 1]
+        elements = jax.tree.map(own, self.elements)
+        return Stack(elements, own(self.a), own(self.b), own(self.owners), own(self.kept), own(self.places))
 
     def map(self, function, ends: AtEnds, extra: Sequence[Any] = ()):
         """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra)` for every element; `ends`: of `at_ends`.
@@ -156,7 +163,7 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
                 places=tuple(m.place for m in members),
             )
         )
-    return tuple(sorted(stacks, key=lambda stack: isinstance(stack.elements, AbstractVelocityConstraint)))
+    return tuple(sorted(stacks, key=lambda stack: stack.ends.velocity))
 
 
 # Elements with closed-form tangents use them; for the others autodiff perturbs by retraction, R exp(θ̃).

@@ -163,30 +163,53 @@ def test_rows_that_depend_on_time_at_both_levels():
     close(state.lam, -mass * np.array([1.6, across @ a]), 64, scale=5.0)
 
 
-def test_equilibrium_of_a_wheel_on_a_slope():
-    """A spring along the slope holds a wheel; the ground carries no friction but the weight across the slope."""
-    slope, radius = 0.2, 0.3
-    down, normal = np.array([np.cos(slope), 0.0, -np.sin(slope)]), np.array([np.sin(slope), 0.0, np.cos(slope)])
-    centre = radius * normal
-    wheel = lg.RigidBody(2.0, (0.1, 0.2, 0.1), position=centre)
-    rolling = lg.Rolling("wheel", at=centre, axis=(0.0, 1.0, 0.0), radius=radius, normal=normal)
-    spring = lg.SpringDamper(
-        None, "wheel", at_a=centre - down, at_b=centre, stiffness=400.0, damping=0.0, free_length=1.0
-    )
-    upright = lg.RevoluteJoint("frame", "wheel", at=centre, axis=(0.0, 1.0, 0.0))
-    frame = lg.RigidBody(0.5, (0.1, 0.1, 0.1), position=centre, free="x z")
-    model = lg.Model(
-        {"wheel": wheel, "frame": frame},
-        {"rolling": rolling, "upright": upright},
-        {"spring": spring, "weight": lg.Gravity(tuple(rolling_disc.G))},
-        redundant="minimum_norm",
-    )
+def planar_wheel(free, slope=0.2, **settings) -> lg.Model:
+    """A wheel on a slope about y, with a spring along it that is free where it is."""
+    radius, normal = 0.3, np.array([np.sin(slope), 0.0, np.cos(slope)])
+    down, centre = np.array([np.cos(slope), 0.0, -np.sin(slope)]), radius * normal
+    wheel = lg.RigidBody(2.0, (0.1, 0.2, 0.1), position=centre, free=free)
+    rolling = lg.Rolling("wheel", at=centre, axis=(0.0, 1.0, 0.0), radius=radius, normal=normal, **settings)
+    ends = {"at_a": centre - down, "at_b": centre}
+    spring = lg.SpringDamper(None, "wheel", **ends, stiffness=400.0, damping=0.0, free_length=1.0)
+    weight = lg.Gravity(tuple(rolling_disc.G))
+    return lg.Model({"wheel": wheel}, {"rolling": rolling}, {"spring": spring, "weight": weight})
+
+
+@pytest.mark.parametrize(
+    ("free", "slope", "rows"),
+    [("x y z rx ry rz", 0.2, 3), ("x y z ry", 0.2, 3), ("x z ry", 0.2, 2), ("x ry", 0.0, 1), ("x y ry", 0.0, 2)],
+)
+def test_rows_that_a_planar_wheel_can_violate(free, slope, rows):
+    """No row of zeros is left, and the wheel accelerates by m g sin / (m + I/r²) whatever is free."""
+    model = planar_wheel(free, slope)
+    assert model.summary().equations["rolling"] == rows
+    system = model.system()
+    initial = jax.jit(initial_state)(system, ZERO)
+    assert initial.result == lg.RESULTS.successful
+    _, _, _, _, acceleration, _ = system.motion(0, initial.state.q, initial.state.v, initial.state.vdot)
+    expected = 2.0 * 9.81 * np.sin(slope) / (2.0 + 0.2 / 0.3**2)
+    close(acceleration, expected * np.array([np.cos(slope), 0.0, -np.sin(slope)]), 64, scale=10.0)
+
+
+def test_what_a_planar_wheel_cannot_do():
+    with pytest.raises(ValueError, match=says("'rolling': `axis`", "'rx', the only rotation")):
+        planar_wheel("x z rx").system()
+    with pytest.raises(ValueError, match=says("'wheel' moves along 'x' only", "`normal`")):
+        planar_wheel("x ry").system()
+
+
+@pytest.mark.parametrize("free", ["x z ry", "x y z rx ry rz"])
+def test_equilibrium_of_a_wheel_on_a_slope(free):
+    """The spring holds the weight along the slope; the ground carries what is across it, and no friction."""
+    model, slope = planar_wheel(free), 0.2
     state = lg.equilibrium(model)
-    shift = 2.5 * 9.81 * np.sin(slope) / 400.0
-    names = model.system().body_names
-    np.testing.assert_allclose(state.q.position[names.index("wheel")], centre + shift * down, rtol=0, atol=1e-8)
+    shift = 2.0 * 9.81 * np.sin(slope) / 400.0
+    down, normal = np.array([np.cos(slope), 0.0, -np.sin(slope)]), np.array([np.sin(slope), 0.0, np.cos(slope)])
+    # Newton ends at √ε of the forces or better
+    np.testing.assert_allclose(state.q.position[0], 0.3 * normal + shift * down, rtol=0, atol=1e-8)
     found = lg.Instant(jnp.zeros(()), state, model.system()).multiplier("rolling")
-    np.testing.assert_allclose(found, [-2.5 * 9.81 * np.cos(slope), 0.0, 0.0], rtol=0, atol=1e-6)
+    expected = np.array([-2.0 * 9.81 * np.cos(slope), 0.0, 0.0])[: found.size]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(

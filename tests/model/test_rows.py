@@ -100,7 +100,7 @@ def test_the_equations_of_a_chain_take_as_many_operations_whatever_its_length():
 def test_poses_are_taken_once_for_each_side_of_all_elements(scene):
     """Each gather's transpose is a scatter to compile; but of one alone XLA would make the poses anew for each end."""
     system = scene.system()
-    program = jax.make_jaxpr(system.constraint)(system.pose)
+    program = jax.make_jaxpr(system.constraint)(system.pose, 0.0)
     orientations = system.pose.orientation.shape
     taken = [
         each.primitive.name == "gather" and each.invars[0].aval.shape == orientations for each in equations(program)
