@@ -144,7 +144,7 @@ def test_configurations_stay_on_the_group_and_near_the_constraints():
     np.testing.assert_allclose(
         orientation @ jnp.swapaxes(orientation, 1, 2), np.tile(np.eye(3), (51, 1, 1)), atol=1e3 * EPS
     )
-    violation = np.abs(jax.vmap(trajectory.system.constraint)(trajectory.states.q)).max()
+    violation = np.abs(jax.vmap(trajectory.system.constraint)(trajectory.states.q, trajectory.t)).max()
     # a point 1 m away on the chord or the arc of w: less than 2 w² (4e-6 m² here) times 4/3
     assert violation < 3.0 * np.abs(trajectory.error.w).max() ** 2
 

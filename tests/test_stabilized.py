@@ -23,7 +23,7 @@ STABILIZED = lg.GeneralizedAlpha(0.9, stabilized=True)
 def violations(trajectory):
     """The largest entries of Φ and of B v at the steps, the first state left out."""
     system, states = trajectory.system, jax.tree.map(lambda leaf: leaf[1:], trajectory.states)
-    position = jax.vmap(system.constraint)(states.q)
+    position = jax.vmap(lambda q: system.constraint(q, 0.0))(states.q)
     velocity = jax.vmap(lambda q, v: constraint_velocity(system, q, v, 0.0))(states.q, states.v)
     return float(jnp.abs(position).max()), float(jnp.abs(velocity).max())
 

@@ -82,7 +82,7 @@ def test_converges_to_the_reference_at_second_order(runs):
 def test_joints_hold(runs):
     _, results = runs
     for (_, trajectory), _ in results.values():
-        violation = jax.vmap(trajectory.system.constraint)(trajectory.states.q)
+        violation = jax.vmap(trajectory.system.constraint)(trajectory.states.q, trajectory.t)
         assert float(jnp.abs(violation).max()) <= 1e-10  # m; the constraint is solved at position level
 
 
