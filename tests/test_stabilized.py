@@ -108,7 +108,7 @@ def test_iteration_matrix():
 
     @jax.jit
     def matrix_and_factors(h):
-        step = Constants.of(system, stabilized=True).step(STABILIZED, system, state, h)
+        step = Constants.of(system, stabilized=True).step(STABILIZED, system, state, h, jnp.zeros(()))
         defect = lambda x: jnp.concatenate(step.defect(step.motion(x[:6], x[6:]), x[6:], t))
         factors, _ = step.factors(step.motion(unknowns[:6], unknowns[6:]), unknowns[6:], t)
         matrix = jax.jacfwd(defect)(unknowns)

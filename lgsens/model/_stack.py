@@ -99,9 +99,10 @@ class Stack(eqx.Module, Generic[Element]):
 
     def only(self, i: int) -> "Stack[Element]":
         """The stack of one of its elements."""
-        own = lambda values: None if values is None else values[i : i + 1]
-        elements = jax.tree.map(own, self.elements)
-        return Stack(elements, own(self.a), own(self.b), own(self.owners), own(self.kept), own(self.places))
+        own = slice(i, i + 1)
+        a, b = (None if side is None else side[own] for side in (self.a, self.b))
+        elements = jax.tree.map(lambda leaf: leaf[own], self.elements)
+        return Stack(elements, a, b, self.owners[own], self.kept[own], self.places[own])
 
     def map(self, function, ends: AtEnds, extra: Sequence[Any] = ()):
         """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra)` for every element; `ends`: of `at_ends`.

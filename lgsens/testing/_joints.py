@@ -107,7 +107,8 @@ def _said(element: AbstractRows, a, b, velocity, t):
     if isinstance(element, AbstractConstraint):
         return element.value(a, b, t)
     assert isinstance(element, AbstractVelocityConstraint)
-    return element.rate(a, b, *jnp.split(velocity, 2), t)
+    va, vb = jnp.split(velocity, 2)
+    return element.rate(a, b, va, vb, t)
 
 
 def _program(element: AbstractRows, lam, velocity, t, free):
