@@ -56,6 +56,7 @@ from lgsens.model import (
     Ramp as Ramp,
     RevoluteJoint as RevoluteJoint,
     RigidBody as RigidBody,
+    Rolling as Rolling,
     RotationDriver as RotationDriver,
     Sampled as Sampled,
     SampledRoad as SampledRoad,

@@ -16,8 +16,8 @@ from helpers import says
 from sweep_job import BATCH, COUNT, designs, psi
 
 import lgsens as lg
-from lgsens import _batches
 from lgsens.examples import spinning_top
+from lgsens.sweeps import _batches
 
 # Batched and single programs round differently: 1e-15 per step × condition 5e2 of a step × 5 steps
 RTOL = 1e-12

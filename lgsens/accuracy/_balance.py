@@ -1,10 +1,11 @@
 """What a trajectory says of itself: how far joints are violated, how well energy is balanced.
 
-The work of forces. With v·(eq. 25), v·ad(v)ᵀMv = (ad(v) v)·Mv = 0 and B v = 0,
+The work of forces and drivers. With v·(eq. 25), v·ad(v)ᵀMv = (ad(v) v)·Mv = 0 and J v = −[Φ_t; b] (`_constraints` of
+`dynamics`),
 
-    d/dt T = v·M v̇ = −v·f(q, v, t) = P,     T = ½ v·M v,     P = −v·r(q, v, 0, 0, t),
+    d/dt T = v·M v̇ = P,     T = ½ v·M v,     P = −v·r(q, v, 0, 0, t) + λ·[Φ_t; b].
 
-for every system whose constraints do not depend on time. What is left of the balance at t_n,
+What is left of the balance at t_n,
 
     δ_n = T_n − T_0 − ∫ P dt,
 
@@ -20,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lgsens.dynamics import AbstractSystem, State
+from lgsens.dynamics import AbstractSystem, State, prescribed_velocity
 from lgsens.simulation import Trajectory
 
 _CHUNK = 64  # states that are evaluated together: one compilation for all numbers of steps
@@ -44,8 +45,9 @@ class Quality(NamedTuple):
 def _evaluated(system: AbstractSystem, states: State, t):
     def at(state: State, t):
         rest = system.residual(state.q, state.v, jnp.zeros_like(state.v), jnp.zeros_like(state.lam), t)
+        driven = jnp.dot(state.lam, prescribed_velocity(system, state.q, t))
         kinetic = 0.5 * jnp.dot(state.v, system.mass_matrix() @ state.v)
-        return jnp.max(jnp.abs(system.constraint(state.q, t)), initial=0.0), kinetic, -jnp.dot(state.v, rest)
+        return jnp.max(jnp.abs(system.constraint(state.q, t)), initial=0.0), kinetic, driven - jnp.dot(state.v, rest)
 
     return jax.vmap(at)(states, t)
 

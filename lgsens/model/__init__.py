@@ -49,6 +49,7 @@ from lgsens.model._loads import (
 )
 from lgsens.model._model import Model as Model
 from lgsens.model._roads import BumpRoad as BumpRoad, FlatRoad as FlatRoad, SampledRoad as SampledRoad
+from lgsens.model._rolling import Rolling as Rolling
 from lgsens.model._signals import (
     AbstractSignal as AbstractSignal,
     Constant as Constant,

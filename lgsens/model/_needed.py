@@ -6,6 +6,7 @@ from lgsens._validate import require
 from lgsens.model._constraints import AbstractRows, Coincidence, Orthogonality
 from lgsens.model._free import ROTATIONS, TRANSLATIONS, Free, is_along, single_rotation
 from lgsens.model._joints import AbstractJoint, FixedJoint, RevoluteJoint
+from lgsens.model._rolling import Rolling
 
 
 def needed(
@@ -22,13 +23,19 @@ def needed(
       - R_a e_a · R_b e_b is constant without rotations. With the one about e it is constant in a hinge about e; of
         the three orthogonalities of a triad x·y, y·z, z·x only that of the two axes other than e changes.
 
-    A joint that the reference configuration need not satisfy keeps all its equations.
+      - A wheel that only turns about its axle slips sideways by translation along it only. It lifts by translation
+        along one line not at all, if the plane is along that line.
 
-    Raises `ValueError` for a hinge about another axis than the one rotation that its bodies have.
+    A joint that the reference configuration need not satisfy keeps all its equations of position level.
+
+    Raises `ValueError` for a hinge or an axle about another axis than the one rotation that its bodies have, and for a
+    wheel that can only move along a line that leaves the plane.
     """
     free = {*free_a, *free_b}
     rotations = free & set(ROTATIONS)
     axis = single_rotation(free)
+    if axis is not None and isinstance(joint, Rolling):
+        return _of_rolling(name, joint, free, axis)
     keep_all = [(True,) * constraint.num_rows for constraint in constraints]
     if not joint.assembled or (rotations and axis is None):
         return keep_all
@@ -52,3 +59,23 @@ def needed(
         else:
             kept.append(default)
     return kept
+
+
+def _of_rolling(name: str, joint: Rolling, free: set[str], axis: int) -> list[tuple[bool, ...]]:
+    """Of a wheel that turns about one inertial axis: its height; forward and sideways."""
+    require(
+        lambda axle: is_along(axle, axis),
+        f"Joint {name!r}: `axis` {joint.axis} must be that of {ROTATIONS[axis]!r}, the only rotation that {joint.b!r} "
+        "has; turn the axle, or free all rotations.",
+        joint.axis,
+    )
+    line = [i for i, translation in enumerate(TRANSLATIONS) if i != axis and translation in free]
+    lifts = len(line) > 1 or not joint.assembled
+    if not lifts and line:
+        require(
+            lambda normal: is_along(normal, 3 - axis - line[0]),
+            f"Joint {name!r}: {joint.b!r} moves along {TRANSLATIONS[line[0]]!r} only, out of the plane with the "
+            f"`normal` {joint.normal}; free another translation.",
+            joint.normal,
+        )
+    return [(lifts,), (True, TRANSLATIONS[axis] in free)]

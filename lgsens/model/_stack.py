@@ -94,7 +94,15 @@ class Stack(eqx.Module, Generic[Element]):
         found = Ends(self.a, self.b, self.owners, self.kept, acts_on=self.elements.acts_on)
         if not isinstance(self.elements, AbstractRows):
             return found
-        return found._replace(relative=self.elements.relative, coupled=self.elements.coupled)
+        velocity = isinstance(self.elements, AbstractVelocityConstraint)
+        return found._replace(relative=self.elements.relative, coupled=self.elements.coupled, velocity=velocity)
+
+    def only(self, i: int) -> "Stack[Element]":
+        """The stack of one of its elements."""
+        own = slice(i, i + 1)
+        a, b = (None if side is None else side[own] for side in (self.a, self.b))
+        elements = jax.tree.map(lambda leaf: leaf[own], self.elements)
+        return Stack(elements, a, b, self.owners[own], self.kept[own], self.places[own])
 
     def map(self, function, ends: AtEnds, extra: Sequence[Any] = ()):
         """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra)` for every element; `ends`: of `at_ends`.
@@ -156,7 +164,7 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
                 places=tuple(m.place for m in members),
             )
         )
-    return tuple(sorted(stacks, key=lambda stack: isinstance(stack.elements, AbstractVelocityConstraint)))
+    return tuple(sorted(stacks, key=lambda stack: stack.ends.velocity))
 
 
 # Elements with closed-form tangents use them; for the others autodiff perturbs by retraction, R exp(θ̃).

@@ -13,7 +13,7 @@ from lgsens._validate import suggestion
 from lgsens.dynamics import AbstractRedundantSystem, AbstractSparseSystem, Tangents, least_norm
 from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew, turn
 from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, chosen
-from lgsens.model._constraints import AbstractRows, AbstractVelocityConstraint
+from lgsens.model._constraints import AbstractRows
 from lgsens.model._frames import BODY_DIM, ROTATION
 from lgsens.model._loads import AbstractLoad
 from lgsens.model._parts import Parts
@@ -67,8 +67,6 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
 
     @property
     def elimination(self):
-        if self.num_velocity_rows:  # their rows of S are not those of B T
-            return None
         return self.topology.elimination(self.linear_solver)
 
     @property
@@ -265,17 +263,12 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         return added(forces, self.group.dim, v.dtype)
 
     @property
-    def _num_positions(self) -> int:
-        """How many stacks of constraints are of position level; they come first."""
-        return sum(not isinstance(stack.elements, AbstractVelocityConstraint) for stack in self.constraints)
-
-    @property
     def num_velocity_rows(self):
-        return sum(int((rows >= 0).sum()) for rows in self.topology.rows[self._num_positions :])
+        return self.topology.num_velocity_rows
 
     @_traced_once
     def constraint(self, q, t):
-        q, stacks = self._placed(q), self.constraints[: self._num_positions]
+        q, stacks = self._placed(q), self.constraints[: self.topology.num_positions]
         values = [
             (stack.map(lambda e, a, b, t: e.value(a, b, t), ends, (t,)), rows)
             for stack, ends, rows in zip(stacks, at_ends(stacks, q), self.topology.rows)
@@ -284,10 +277,10 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
 
     @_traced_once
     def velocity_constraint(self, q, v, t):
-        stacks, first = self.constraints[self._num_positions :], self.topology.num_constraints - self.num_velocity_rows
-        rows = [np.where(own < 0, own, own - first) for own in self.topology.rows[self._num_positions :]]
+        of, first = self.topology, self.topology.num_constraints - self.num_velocity_rows
+        stacks, rows = self.constraints[of.num_positions :], of.rows[of.num_positions :]
         values = [
-            (stack.map(lambda e, *args: e.rate(*args), ends, (t,)), own)
+            (stack.map(lambda e, *args: e.rate(*args), ends, (t,)), np.where(own < 0, own, own - first))
             for stack, ends, own in zip(stacks, at_ends(stacks, self._placed(q), self.twists(v)), rows)
         ]
         return added(values, self.num_velocity_rows, self.mass.dtype)
@@ -340,26 +333,16 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
 
         The `measure` of its load if it has one, else its generalized force.
         """
-        found = [(stack, i) for stack in self.loads for i, owner in enumerate(stack.owners) if owner == force]
+        found = [stack.only(i) for stack in self.loads for i, owner in enumerate(stack.owners) if owner == force]
         if not found:
             known = {owner for stack in self.loads for owner in stack.owners}
             raise ValueError(f"`force`: {suggestion(force, known)}.")
         if len(found) > 1:
             raise ValueError(f"`force`: {force!r} acts on {len(found)} bodies and has no single value.")
-        stack, i = found[0]
-        load = jax.tree.map(lambda leaf: leaf[i], stack.elements)
-        single = Stack(
-            elements=jax.tree.map(lambda leaf: leaf[None], load),
-            a=None if stack.a is None else (stack.a[i],),
-            b=None if stack.b is None else (stack.b[i],),
-            owners=(force,),
-            kept=((),),
-            places=(0,),
-        )
 
         def at_time(q, v, t):
             evaluate = lambda e, *args: getattr(e, "measure", e.force)(*args)
-            (ends,) = at_ends([single], self._placed(q), self.twists(v))
-            return single.map(evaluate, ends, (t,))
+            (ends,) = at_ends(found, self._placed(q), self.twists(v))
+            return found[0].map(evaluate, ends, (t,))
 
         return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(at_time)(q, v, t))

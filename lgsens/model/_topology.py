@@ -20,6 +20,7 @@ class Ends(NamedTuple):
     relative: bool = False  # of constraints, as in `AbstractConstraint`
     coupled: tuple[tuple[int, ...], ...] = ()  # likewise
     acts_on: tuple[int, ...] = ALL  # likewise, and of loads
+    velocity: bool = False  # of constraints, whether their rows have velocity level only
 
     @property
     def slots(self) -> np.ndarray:
@@ -45,6 +46,8 @@ class Topology:
             self.rows.append(np.where(kept, start + np.cumsum(kept).reshape(kept.shape) - 1, -1).astype(np.int32))
             start += int(kept.sum())
         self.num_constraints = start
+        self.num_velocity_rows = sum(int(np.sum(ends.kept)) for ends in constraints if ends.velocity)
+        self.num_positions = sum(not ends.velocity for ends in constraints)  # stacks; they come first
         self.mass = Pattern(index, index)
         self.gyroscopic = Pattern(index[:, ROTATION], index[:, ROTATION])
         self.loads = [self._square(ends) for ends in loads]
@@ -103,8 +106,8 @@ class Topology:
 
     def elimination(self, solver: AbstractLinearSolver | None) -> Elimination | None:
         """The plan of the linear solver, made once; None: a dense one. `solver` None: the cheaper one."""
-        if solver not in self._plans:
-            self._plans[solver] = elimination(solver, self._graph)
+        if solver not in self._plans:  # rows of velocity level are not those of B T in S, as plans take them to be
+            self._plans[solver] = None if self.num_velocity_rows else elimination(solver, self._graph)
         return self._plans[solver]
 
 

@@ -114,7 +114,7 @@ def _final_conditions(functional: Functional, p, system: AbstractSystem, point: 
     q_rate, v_rate, t_rate = direction
     at = (state.q, state.v, state.vdot, state.lam, t)
     df_m, df_lam = jax.jvp(partials, at, (q_rate, v_rate, vddot, lam_rate, t_rate))[1]
-    jacobian_rate = along(system.constraint_jacobian, system, state)
+    jacobian_rate = along(lambda q: system.constraint_jacobian(q, t), system, state)
     force = f.v + g.w + of_velocity + c_tT @ mu - df_m.T
     _, minus_eta2 = constrained_solve(mass, jacobian, force, -jacobian_rate @ mu - df_lam.T)
     eta2 = -minus_eta2

@@ -11,6 +11,8 @@ from lgsens.model import (
     AbstractClosedFormConstraint,
     AbstractConstraint,
     AbstractJoint,
+    AbstractRows,
+    AbstractVelocityConstraint,
     RigidBody,
     constraint_force,
     constraint_jacobian,
@@ -24,7 +26,7 @@ RANK = 1e-8  # singular values below this share of the largest are zero: the squ
 
 
 def check_joint(
-    joint: AbstractJoint | AbstractConstraint,
+    joint: AbstractJoint | AbstractRows,
     *,
     bodies: Mapping[str, RigidBody] | None = None,
     length: float = 1.0,
@@ -39,11 +41,11 @@ def check_joint(
     at random poses that need not satisfy it: B and K by autodiff under the retraction R exp(θ̃) and by differences; of a
     constraint in closed form, `jacobian`, `force` and `geometric_stiffness` against autodiff; of any, that B and K are
     zero outside of what it `acts_on` and what is `coupled`. Φ, Bᵀλ and K by every number of it, as
-    `check_sensitivities` does. Of a joint, in the reference configuration: Φ = 0 if it says `assembled`, and B of full
-    rank, so that its equations are independent.
+    `check_sensitivities` does. Of rows A v + b of velocity level A in place of B, the same at any v. Of a joint, in the
+    reference configuration: Φ = 0 if it says `assembled`, and B of full rank, so that its equations are independent.
 
     Arguments:
-        joint: an `AbstractJoint` or an `AbstractConstraint`.
+        joint: an `AbstractJoint`, an `AbstractConstraint` or an `AbstractVelocityConstraint`.
         bodies: the bodies that a joint names, in its reference configuration; None: bodies at random poses.
         length: size of the scene [m], shape (): random poses and steps of differences are in proportion.
         t: the time at which what is prescribed is taken [s].
@@ -58,35 +60,37 @@ def check_joint(
     bodies = scene.bodies([name for name in names if name is not None]) if bodies is None else bodies
     (a, b), free = scene.ends(*names, bodies)
 
-    def elements_of(joint) -> tuple[AbstractConstraint, ...]:
+    def elements_of(joint) -> tuple[AbstractRows, ...]:
         return joint.constraints(a, b) if is_joint else (joint,)
 
     elements = elements_of(joint)
     labels = [f"{i + 1} {type(e).__name__}: " for i, e in enumerate(elements)] if is_joint else [""]
     multipliers = []
     for label, element in zip(labels, elements):
-        rows = jax.eval_shape(element.value, a, b, time).shape
+        rows = jax.eval_shape(_said, element, a, b, jnp.zeros(DIM, scene.dtype), time).shape
         if rows != (element.num_rows,):
             raise ValueError(
-                f"{label or f'{type(element).__name__}: '}`value` has shape {rows}, `num_rows` is {element.num_rows}."
+                f"{label or f'{type(element).__name__}: '}`value` or `rate` has shape {rows}, `num_rows` is "
+                f"{element.num_rows}."
             )
         multipliers.append(jnp.asarray(scene.rng.standard_normal(rows), scene.dtype))
-    starts = [scene.displacement(free) for _ in range(poses)]
+    starts, velocity = [scene.displacement(free) for _ in range(poses)], scene.displacement(free)
 
     checks: list[Check] = list(_reference(joint, scene, a, b, time, free)) if is_joint else []
     for label, element, lam in zip(labels, elements, multipliers):
-        program = _program(element, lam, time, free)
+        program = _program(element, lam, velocity, time, free)
         for start in starts:
             first, second = displaced(a, b, start)
             found = scene.sampled(program(scene.points(free), first, second), free)
-            given = isinstance(element, AbstractClosedFormConstraint) or len(element.acts_on) < DIM
-            checks += _compared(label, given, found)
+            own = isinstance(element, AbstractClosedFormConstraint | AbstractVelocityConstraint)
+            given = own or len(element.acts_on) < DIM
+            checks += _compared(label, given, isinstance(element, AbstractConstraint), found)
 
     def numbers(joint):
         frames = displaced(a, b, starts[0])
         return [
             (
-                e.value(*frames, time),
+                _said(e, *frames, velocity, time),
                 constraint_force(e, *frames, lam, time),
                 constraint_stiffness(e, *frames, lam, time),
             )
@@ -98,7 +102,16 @@ def check_joint(
     return Report(f"{type(joint).__name__}, {poses} poses", worst(checks))
 
 
-def _program(element: AbstractConstraint, lam, t, free):
+def _said(element: AbstractRows, a, b, velocity, t):
+    """Φ, or A v + b at a velocity."""
+    if isinstance(element, AbstractConstraint):
+        return element.value(a, b, t)
+    assert isinstance(element, AbstractVelocityConstraint)
+    va, vb = jnp.split(velocity, 2)
+    return element.rate(a, b, va, vb, t)
+
+
+def _program(element: AbstractRows, lam, velocity, t, free):
     """What a constraint says, and what follows from its value, at displacements x of two frames."""
     zero = jnp.zeros(DIM, lam.dtype)
     acts = np.isin(np.arange(DIM), element.acts_on)  # what is taken of B
@@ -107,13 +120,15 @@ def _program(element: AbstractConstraint, lam, t, free):
         coupled[np.ix_(places, places)] = True
 
     def jacobian(a, b):
-        return jax.jacfwd(lambda y: element.value(*displaced(a, b, y), t))(zero)
+        if isinstance(element, AbstractVelocityConstraint):
+            return jax.jacfwd(lambda v: _said(element, a, b, v, t))(velocity)
+        return jax.jacfwd(lambda y: _said(element, *displaced(a, b, y), velocity, t))(zero)
 
     def quantities(x, a, b):
         a, b = displaced(a, b, x)
         force = lambda y: lam @ jacobian(*displaced(a, b, y))
         return {
-            "Φ": element.value(a, b, t),
+            "Φ": _said(element, a, b, velocity, t),
             "B": jnp.where(acts, constraint_jacobian(element, a, b, t), 0.0)[:, free],
             "B by autodiff": jacobian(a, b)[:, free],
             "force": jnp.where(acts, constraint_force(element, a, b, lam, t), 0.0)[free],
@@ -125,13 +140,14 @@ def _program(element: AbstractConstraint, lam, t, free):
     return jax.jit(jax.vmap(quantities, in_axes=(0, None, None)))
 
 
-def _compared(label: str, given: bool, found) -> Iterator[Check]:
+def _compared(label: str, given: bool, of_positions: bool, found) -> Iterator[Check]:
     stiffness = f"{label}K = ∂(Bᵀλ)/∂x"
     if given:
         yield same(f"{label}B", found["B"], found["B by autodiff"])
         yield same(f"{label}Bᵀλ", found["force"], found["force by autodiff"])
     yield same(stiffness, found["K"], found["K by autodiff"])
-    yield slope(f"{label}B", found["B by autodiff"], found["Φ"])
+    if of_positions:
+        yield slope(f"{label}B", found["B by autodiff"], found["Φ"])
     yield slope(stiffness, found["K by autodiff"], found["force by autodiff"])
 
 
@@ -143,8 +159,9 @@ def _reference(joint: AbstractJoint, scene: Poses, a, b, t, free) -> Iterator[Ch
     def at(x):
         frames = displaced(a, b, x)
         elements = joint.constraints(*frames)
+        still = jnp.zeros(DIM, frames[0].position.dtype)
         return {
-            "Φ": jnp.concatenate([element.value(*frames, t) for element in elements]),
+            "Φ": jnp.concatenate([_said(element, *frames, still, t) for element in elements]),
             "B": jnp.concatenate([constraint_jacobian(element, *frames, t) for element in elements])[:, free],
         }
 

@@ -1,0 +1,143 @@
+"""Rolling without slip, a joint with equations of position and of velocity level.
+
+A thin disc of radius ρ with its centre C and unit axle e rolls on a plane through P with the unit normal n. Its lowest
+point is C + r,
+
+    r = −ρ u/|u|,     u = n − (n·e) e,
+
+as u is what the plane of the disc has of n. With n·u = |u|² the height of that point over the plane is
+
+    Φ = n·(C − P) − ρ |u|,
+
+a holonomic row. The material points of disc and ground there have the same velocity, w = ẋ_b + ω_b × (C + r − x_b) −
+(ẋ_a + ω_a × (C + r − x_a)) = 0. Its component along n is dΦ/dt (the lowest point moves on the disc along the plane), so
+two rows remain, which no function of the configuration has as its rate,
+
+    f·w = 0,     l·w = 0,     f = e × n/|u|,     l = n × f,
+
+forward and along the projected axle. Source: Neimark & Fufaev, Dynamics of Nonholonomic Systems (1972), ch. 1.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lgsens._validate import as_float, require
+from lgsens.liegroups import cross
+from lgsens.model._constraints import AbstractConstraint, AbstractVelocityConstraint
+from lgsens.model._frames import ROTATION, Frame
+from lgsens.model._joints import AbstractJoint
+
+
+class _Contact(eqx.Module):
+    """The numbers of the formulas above; P and n in a, C and e in b."""
+
+    point_a: Float[Array, "3"]
+    normal_a: Float[Array, "3"]
+    point_b: Float[Array, "3"]
+    axle_b: Float[Array, "3"]
+    radius: Float[Array, ""]
+
+
+def _upright(n, e) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+    """u and its length."""
+    u = n - jnp.sum(n * e) * e
+    return u, jnp.sqrt(jnp.sum(u * u))
+
+
+class ContactHeight(AbstractConstraint):
+    """The lowest point of a disc is on a plane: Φ = n·(C − P) − ρ |u|; λ is the force of b on a along n [N]."""
+
+    contact: _Contact
+
+    @property
+    def num_rows(self):
+        return 1
+
+    @property
+    def point_b(self):
+        return self.contact.point_b
+
+    def value(self, a, b, t):
+        at = self.contact
+        n = a.axis(at.normal_a)
+        _, length = _upright(n, b.axis(at.axle_b))
+        return (jnp.sum(n * (b.point(at.point_b) - a.point(at.point_a))) - at.radius * length)[None]
+
+
+class Slip(AbstractVelocityConstraint):
+    """The lowest point of a disc does not slip, f·w = 0 and l·w = 0; λ is the force of b on a along f and l [N]."""
+
+    contact: _Contact
+
+    @property
+    def num_rows(self):
+        return 2
+
+    def rate(self, a, b, va, vb, t):
+        at = self.contact
+        n, e = a.axis(at.normal_a), b.axis(at.axle_b)
+        u, length = _upright(n, e)
+        place = b.point(at.point_b) - at.radius * u / length
+        material = lambda frame, v: v[: ROTATION.start] + cross(frame.axis(v[ROTATION]), place - frame.position)
+        w = material(b, vb) - material(a, va)
+        forward = cross(e, n) / length
+        return jnp.stack([jnp.sum(forward * w), jnp.sum(cross(n, forward) * w)])
+
+
+class Rolling(AbstractJoint):
+    """A disc or wheel that rolls without slip on a plane; 3 equations.
+
+    Of these one is holonomic, the height of the lowest point over the plane, and two are nonholonomic: its velocity
+    along the plane is zero, forward and sideways. The contact is bilateral: it does not lift.
+
+    Arguments:
+        wheel: name of the body that rolls.
+        ground: name of the body with the plane; None: the ground.
+        at: the centre of the wheel in the reference configuration [m], inertial frame, shape (3,).
+        axis: direction of its axle there, inertial frame, shape (3,), any length > 0.
+        radius: its radius [m], shape (), positive.
+        normal: normal of the plane, upwards, inertial frame, shape (3,), any length > 0.
+        point: a point of the plane [m], inertial frame, shape (3,); None: the lowest point of the wheel. With a point
+            the mechanism is assembled before it moves.
+
+    The multipliers are the force of the wheel on the ground along the normal, forward (axis × normal) and sideways
+    [N]; the first is negative where it presses. Equations are solved by dense matrices. Raises `ValueError` for a
+    wrong shape, a zero direction, a radius ≤ 0, or a wheel that lies flat.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str = eqx.field(static=True)
+    at: Float[Array, "3"]
+    axis: Float[Array, "3"]
+    radius: Float[Array, ""]
+    normal: Float[Array, "3"]
+    point: Float[Array, "3"] | None
+
+    def __init__(self, wheel: str, ground: str | None = None, *, at, axis, radius, normal=(0.0, 0.0, 1.0), point=None):
+        self.a, self.b = ground, wheel
+        self.at = as_float(at, (3,), "Rolling: `at`")
+        self.axis, self.normal = as_float(axis, (3,), "Rolling: `axis`"), as_float(normal, (3,), "Rolling: `normal`")
+        self.radius = as_float(radius, (), "Rolling: `radius`")
+        self.point = None if point is None else as_float(point, (3,), "Rolling: `point`")
+        require(lambda radius: radius > 0, f"Rolling: `radius` must be positive, got {self.radius} m.", self.radius)
+        require(
+            lambda n, e: np.linalg.norm(np.cross(n, e)) > 1e-6 * np.linalg.norm(n) * np.linalg.norm(e) > 0,
+            f"Rolling: `axis` {self.axis} and `normal` {self.normal} are parallel or zero: the wheel lies flat and has "
+            "no lowest point; turn one of them.",
+            self.normal,
+            self.axis,
+        )
+
+    @property
+    def assembled(self):
+        return self.point is None
+
+    def constraints(self, a: Frame, b: Frame):
+        n, e = (x / jnp.sqrt(jnp.sum(x * x)) for x in (self.normal, self.axis))
+        u, length = _upright(n, e)
+        point = self.at - self.radius * u / length if self.point is None else self.point
+        ends = a.local_point(point), a.local_axis(n), b.local_point(self.at), b.local_axis(e)
+        contact = _Contact(*ends, self.radius)
+        return ContactHeight(contact), Slip(contact)
