@@ -47,16 +47,14 @@ from jaxtyping import Array, Bool, Float, Int
 from lgsens._validate import as_count
 from lgsens.dynamics import (
     RESULTS,
-    AbstractSystem,
     ConstrainedInertia,
     Inertia,
     State,
-    constraint_velocity,
     equations_of_motion,
     factorized_accelerations,
-    full_jacobian,
 )
 from lgsens.integrate._explicit_linearized import ExplicitLinearizedStep, Inner
+from lgsens.integrate._explicit_projection import drift, of_position, of_velocity, projection
 from lgsens.integrate._grid import earlier, later, with_first
 from lgsens.integrate._scheme import AbstractScheme, Stages, Start, Stats
 
@@ -83,46 +81,6 @@ class Coefficients(NamedTuple):
     a: np.ndarray
     b: np.ndarray
     c: np.ndarray
-
-
-class Projection(NamedTuple):
-    """The unknowns of P and R, and q⁺."""
-
-    y: Float[Array, " k"]
-    mu: Float[Array, " m"]
-    d: Float[Array, " k"]
-    nu: Float[Array, " m"]
-    q: Any
-
-
-def drift(system: AbstractSystem, q, t) -> Float[Array, " m"]:
-    """Φ, and zero in the rows of velocity level."""
-    violation = system.constraint(q, t)
-    return jnp.concatenate([violation, jnp.zeros(system.num_velocity_rows, violation.dtype)])
-
-
-def projection(inertia: Inertia, system: AbstractSystem, q, v, t) -> Projection:
-    """One step of Newton's iteration for q, then v, with one factorization."""
-    still = jnp.zeros_like(v)
-    if not system.constraint_names:
-        return Projection(still, still[:0], still, still[:0], q)
-    kkt = ConstrainedInertia.of(inertia, system, q, t)
-    y, mu = kkt.solve(still, -drift(system, q, t))
-    projected = system.group.retract(q, y)
-    return Projection(y, mu, *kkt.solve(still, -constraint_velocity(system, projected, v, t)), projected)
-
-
-def _position(system: AbstractSystem, q, t, found: Inner):
-    """P, its two rows."""
-    jacobian = full_jacobian(system, q, t)
-    return system.mass_matrix() @ found.y + found.mu @ jacobian, jacobian @ found.y + drift(system, q, t)
-
-
-def _velocity(system: AbstractSystem, q, t, found: Inner, projected, u):
-    """R, its two rows."""
-    jacobian = full_jacobian(system, q, t)
-    rate = constraint_velocity(system, projected, u, t)
-    return system.mass_matrix() @ found.d + found.nu @ jacobian, jacobian @ found.d + rate
 
 
 def _followed(rest, last):
@@ -295,8 +253,8 @@ class IndexReducedODE(AbstractScheme):
         q = system.group.retract(previous.q, x)
         inner = Inner(
             *(found.x - stages[0], found.v - stages[1], *earlier(motion)),
-            *_position(system, q, node.t, found),
-            *_velocity(system, q, node.t, found, state.q, u),
+            *of_position(system, q, node.t, found),
+            *of_velocity(system, q, node.t, found, state.q, u),
         )
         vdot, lam = (rows[-1] for rows in motion)
         return State(system.group.retract(q, found.y), state.v - (u + found.d), vdot, lam, state.a - state.vdot, inner)
@@ -340,7 +298,7 @@ class IndexReducedODE(AbstractScheme):
             return jax.linearize(function, previous.q, x, v)[1]
 
         a, b, _ = (node.h * each for each in self._arrays(node.h.dtype))
-        velocity = lambda q, *end: _velocity(system, q, node.t, found, *end)
+        velocity = lambda q, *end: of_velocity(system, q, node.t, found, *end)
         return ExplicitLinearizedStep(
             group=group,
             inertia=shared,
@@ -353,7 +311,7 @@ class IndexReducedODE(AbstractScheme):
             kinematics=jax.vmap(kinematics)(found.x, found.v),
             to_end=jax.linearize(group.retract, previous.q, x)[1],
             corrected=jax.linearize(group.retract, q, found.y)[1],
-            position=jax.linearize(lambda q: _position(system, q, node.t, found), q)[1],
+            position=jax.linearize(lambda q: of_position(system, q, node.t, found), q)[1],
             velocity=jax.linearize(velocity, q, state.q, u)[1],
         )
 
