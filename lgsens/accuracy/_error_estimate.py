@@ -43,7 +43,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lgsens._validate import require
+from lgsens._validate import is_concrete, require
 from lgsens.dynamics import AbstractSystem, State, full_jacobian, kkt_solve, split_velocity
 from lgsens.integrate import EqualGrid, GeneralizedAlpha, Variation
 from lgsens.sensitivity import Parameters, direct_sweep
@@ -68,7 +68,7 @@ def error_estimate(trajectory: Trajectory, integrator: GeneralizedAlpha = Genera
     steps. The configuration and the velocity at t0 count as exact.
 
     Returns a `StateError` on the times of the trajectory; `corrected` adds it. Raises `ValueError` for a trajectory by
-    another integrator, or with too few steps.
+    another integrator, in unequal steps, or with too few steps; under a trace the first two give NaN.
     """
     if trajectory.error is not None:
         return trajectory.error
@@ -83,20 +83,24 @@ def error_estimate(trajectory: Trajectory, integrator: GeneralizedAlpha = Genera
 
     def is_by_scheme(t, a, vdot):
         """Whether the steps are equal and eq. (29) holds, up to round-off and to what is NaN after a failure."""
+        xp = np if isinstance(t, np.ndarray) else jnp
         left = (1.0 - scheme.alpha_m) * a[1:] + scheme.alpha_m * a[:-1]
         right = (1.0 - scheme.alpha_f) * vdot[1:] + scheme.alpha_f * vdot[:-1]
-        h = np.diff(t)
-        equal = np.ptp(h) <= 1e-6 * h.mean() + 16 * np.spacing(np.abs(t).max())
-        return equal and not np.any(np.abs(left - right) > 1e3 * eps * np.nanmax(np.abs(a), initial=0.0))
+        h = xp.diff(t)
+        equal = xp.ptp(h) <= 1e-6 * h.mean() + 16 * eps * xp.abs(t).max()
+        return equal & ~xp.any(xp.abs(left - right) > 1e3 * eps * xp.nanmax(xp.abs(a), initial=0.0))
 
+    given = jax.lax.stop_gradient((trajectory.t, states.a, states.vdot))
     require(
         is_by_scheme,
         f"`integrator`: the trajectory is not one of {integrator!r} in equal steps; give the one that it is from.",
-        trajectory.t,
-        states.a,
-        states.vdot,
+        *given,
     )
-    return _estimated(scheme, trajectory)
+    found = _estimated(scheme, trajectory)
+    if is_concrete(*given):
+        return found
+    valid = is_by_scheme(*given)
+    return jax.tree.map(lambda leaf: jnp.where(valid, leaf, jnp.nan), found)
 
 
 @eqx.filter_jit

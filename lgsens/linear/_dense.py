@@ -70,7 +70,8 @@ def _substituted(lu, rhs, of_lower: bool, transposed: bool):
         later = places > j if downwards else places < j
         return jnp.where(places == j, known, x - jnp.where(later, column, jnp.zeros_like(column)) * known)
 
-    return lax.fori_loop(0, size, eliminate, rhs)
+    # of no rows, which block elimination may leave, none can be traced
+    return lax.fori_loop(0, size, eliminate, rhs) if size else rhs
 
 
 def _permutation(pivots: Int[Array, " n"], *, inverse: bool = False) -> Int[Array, " n"]:
@@ -87,7 +88,7 @@ def _permutation(pivots: Int[Array, " n"], *, inverse: bool = False) -> Int[Arra
         second = pivots[first]
         return jnp.where(places == first, rows[second], jnp.where(places == second, rows[first], rows))
 
-    return lax.fori_loop(0, size, exchange, places)
+    return lax.fori_loop(0, size, exchange, places) if size else places
 
 
 class Inverse(eqx.Module):

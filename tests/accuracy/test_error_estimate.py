@@ -115,6 +115,19 @@ def test_bad_input():
         error_estimate(lg.simulate(build(P), t1=T1, num_steps=2))
 
 
+def test_what_is_not_by_the_scheme_is_nan_under_jit():
+    def trajectory(sizes):
+        return lg.simulate(build(P), t1=T1, num_steps=4, integrator=lg.GivenSteps(jnp.asarray(sizes)))
+
+    equal, uneven = trajectory([1.0, 1.0, 1.0, 1.0]), trajectory([2.0, 3.0, 2.0, 3.0])
+    traced = jax.jit(error_estimate)
+    for found, expected in zip(jax.tree.leaves(traced(equal)), jax.tree.leaves(error_estimate(equal))):
+        np.testing.assert_allclose(found, expected, rtol=1e-12)  # the same operations, fused otherwise
+    assert all(jnp.isnan(leaf).all() for leaf in jax.tree.leaves(traced(uneven)))
+    with pytest.raises(ValueError, match="in equal steps"):
+        error_estimate(uneven)
+
+
 @pytest.mark.slow  # derivatives of a linearization, in both modes
 def test_it_is_traced_like_everything_else():
     """jit, vmap, and a derivative in both modes: of what is estimated, by the stiffness."""

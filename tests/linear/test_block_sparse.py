@@ -13,7 +13,7 @@ from helpers import equations
 import lgsens as lg
 from lgsens.dynamics import initial_state, is_redundant, tangents, times_tangent_operator
 from lgsens.dynamics._matrices import ConstrainedMass
-from lgsens.examples import QuarterCar, four_bar, spatial_chain
+from lgsens.examples import QuarterCar, four_bar, spatial_chain, spinning_top
 from lgsens.integrate import factorize_iteration_matrix
 from lgsens.linear import LU, Elimination, Factors, Inverse
 from lgsens.linear._ordering import levels, of_one_shape
@@ -217,6 +217,24 @@ def test_gradient_of_every_number(name, body):
     largest = max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(wanted) if leaf.size)
     for actual, leaf in zip(jax.tree.leaves(gradient), jax.tree.leaves(wanted)):
         np.testing.assert_allclose(actual, leaf, rtol=1e-7, atol=1e-8 * largest)
+
+
+def test_one_body():
+    """Its only level leaves nothing for the LU of the rest."""
+    top = spinning_top(0.7).system()
+    body = top.body_names[0]
+
+    def psi(system):
+        trajectory = lg.simulate(system, t1=0.02, num_steps=4)
+        return trajectory.body(body).position[-1, 2], trajectory.states.q
+
+    found, expected = (
+        eqx.filter_jit(eqx.filter_value_and_grad(psi, has_aux=True))(dataclasses.replace(top, linear_solver=solver))
+        for solver in (lg.BlockSparse(), lg.DenseLU())
+    )
+    for actual, leaf in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        # round-off of forces, 1e-16/βh² = 1e-11 times h², and sums of gradients with terms below a hundred
+        np.testing.assert_allclose(actual, leaf, rtol=1e-9, atol=1e-11)
 
 
 @pytest.mark.slow
