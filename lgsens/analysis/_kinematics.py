@@ -10,10 +10,8 @@ from jaxtyping import Array, Float, Int
 
 from lgsens._validate import as_float, suggestion
 from lgsens.dynamics import RESULTS, AbstractDrive, State, forces_of_motion, positions
-from lgsens.model import Distance, DistanceJoint, Model, MultibodySystem, RotationDriver, TranslationDriver
+from lgsens.model import Model, MultibodySystem
 from lgsens.simulation import AbstractMotion, throw_if_failed
-
-_DRIVERS = (TranslationDriver, RotationDriver, DistanceJoint)
 
 
 class Kinematics(AbstractMotion):
@@ -46,13 +44,9 @@ class _Drive(AbstractDrive):
     def at(self, values):
         system = self.system
         for (stack, element), value in zip(self.where, values):
-            leaf = lambda s, stack=stack: _driven_leaf(s.constraints[stack].elements)
+            leaf = lambda s, stack=stack: s.constraints[stack].elements.driven
             system = eqx.tree_at(leaf, system, leaf(system).at[element].set(value))
         return system
-
-
-def _driven_leaf(element) -> Any:
-    return element.length if isinstance(element, Distance) else element.prescribed
 
 
 def kinematics(
@@ -89,12 +83,13 @@ def kinematics(
     """
     if not isinstance(model, Model):
         raise ValueError(f"`model` must be a Model, got {type(model).__name__}.")
-    known = [name for name, joint in model.joints.items() if isinstance(joint, _DRIVERS)]
+    system = model.system()
+    where = _drivers(system)
     if not driven:
-        raise ValueError(f"`driven` is empty; give values for drivers of the model, some of {sorted(known)}.")
+        raise ValueError(f"`driven` is empty; give values for drivers of the model, some of {sorted(where)}.")
     for name in (*driven, *(rates or ())):
-        if name not in known:
-            raise ValueError(f"`driven`: {suggestion(name, known)}, the drivers and distance joints of the model.")
+        if name not in where:
+            raise ValueError(f"`driven`: {suggestion(name, where)}, the drivers and distance joints of the model.")
     names = sorted(driven)
     columns = [as_float(driven[name], None, f"`driven[{name!r}]`") for name in names]
     if any(column.ndim != 1 or column.shape != columns[0].shape or column.size == 0 for column in columns):
@@ -106,7 +101,6 @@ def kinematics(
         raise ValueError(f"`rates` must have shape () or {columns[0].shape}, got {[speed.shape for speed in speeds]}.")
     if set(rates or ()) - set(names):
         raise ValueError(f"`rates`: {sorted(set(rates or ()) - set(names))} are not among the driven joints {names}.")
-    system = model.system()
     unknowns, equations = system.group.dim, len(system.constraint_names)
     if unknowns != equations:
         raise ValueError(
@@ -118,7 +112,7 @@ def kinematics(
                 else "Drive fewer coordinates, or remove joints that repeat each other."
             )
         )
-    drive = _Drive(system, tuple(_place(system, name) for name in names))
+    drive = _Drive(system, tuple(where[name] for name in names))
     values = jnp.stack(columns, axis=1)
     speed = jnp.stack([jnp.broadcast_to(speed, columns[0].shape) for speed in speeds], axis=1)
     (t, states, result), details = _kinematics_jit(drive, values, speed, as_float(t0, (), "`t0`"))
@@ -139,6 +133,7 @@ def _kinematics_jit(drive: _Drive, values, rates, t0):
     return (t, states, result), jax.lax.stop_gradient(details)
 
 
-def _place(system: MultibodySystem, name: str) -> tuple[int, int]:
-    """The stack of constraints and the element in it that belong to a driver."""
-    return next((i, stack.owners.index(name)) for i, stack in enumerate(system.constraints) if name in stack.owners)
+def _drivers(system: MultibodySystem) -> dict[str, tuple[int, int]]:
+    """By the name of each driver the stack of constraints and the element in it with its number."""
+    stacks = [(k, stack) for k, stack in enumerate(system.constraints) if stack.elements.driven is not None]
+    return {owner: (k, i) for k, stack in stacks for i, owner in enumerate(stack.owners)}

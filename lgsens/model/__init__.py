@@ -15,6 +15,7 @@ from lgsens.model._drivers import (
     RotationDriver as RotationDriver,
     TranslationDriver as TranslationDriver,
 )
+from lgsens.model._elements import AbstractElement as AbstractElement, body_fixed as body_fixed
 from lgsens.model._forces import (
     AbstractForce as AbstractForce,
     AppliedForce as AppliedForce,

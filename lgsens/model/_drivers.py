@@ -6,7 +6,8 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import axis_field, number_field, point_field
 from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint, InPlane
-from lgsens.model._frames import Frame
+from lgsens.model._elements import body_fixed
+from lgsens.model._frames import TURNING_A, TURNING_B, Frame
 from lgsens.model._joints import AbstractJoint, _normals
 
 
@@ -22,6 +23,10 @@ class Displacement(AbstractClosedFormConstraint):
     @property
     def num_rows(self):
         return 1
+
+    @property
+    def driven(self):
+        return self.prescribed
 
     def value(self, a, b):
         return self.line.value(a, b) - self.prescribed
@@ -47,14 +52,22 @@ class Angle(AbstractConstraint):
     turn, and ∂Φ/∂s = −1.
     """
 
-    first_a: Float[Array, "3"]
-    second_a: Float[Array, "3"]
-    first_b: Float[Array, "3"]
+    first_a: Float[Array, "3"] = body_fixed("axis", "a")
+    second_a: Float[Array, "3"] = body_fixed("axis", "a")
+    first_b: Float[Array, "3"] = body_fixed("axis", "b")
     prescribed: Float[Array, ""]
 
     @property
     def num_rows(self):
         return 1
+
+    @property
+    def acts_on(self):
+        return TURNING_A + TURNING_B
+
+    @property
+    def driven(self):
+        return self.prescribed
 
     def value(self, a, b):
         beta = a.local_axis(b.axis(self.first_b))

@@ -1,6 +1,7 @@
 """Force elements as the user writes them: by the names of bodies, in the reference configuration."""
 
 import abc
+import dataclasses
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -31,12 +32,26 @@ class Attached(NamedTuple):
 
 
 class AbstractForce(eqx.Module):
-    """A force element. One of one's own has leaves for its numbers and these two methods."""
+    """A force element. One of one's own has leaves for its numbers, and `bodies` and `loads`."""
 
     @property
     @abc.abstractmethod
     def bodies(self) -> tuple[str | None, ...]:
         """The bodies that it names; None is the ground."""
+
+    @property
+    def on_merged(self) -> bool:
+        """Whether its loads on bodies that fixed joints merge are one load on what they are merged to."""
+        return False
+
+    @property
+    def preload_shape(self) -> tuple[int, ...] | None:
+        """The shape of its `preload`, in which its force is linear, for `static_preload`; None: it has none."""
+        return None
+
+    def with_preload(self, preload) -> "AbstractForce":
+        """The same element with this preload in the reference configuration."""
+        return dataclasses.replace(self, preload=preload)
 
     @abc.abstractmethod
     def loads(self, bodies: Mapping[str, RigidBody]) -> tuple[Attached, ...]:
@@ -72,6 +87,10 @@ class Gravity(AbstractForce):
     @property
     def bodies(self):
         return ()
+
+    @property
+    def on_merged(self):
+        return True  # the weights of the parts of a body are a weight at its centre of mass
 
     def loads(self, bodies):
         return tuple(Attached(self._weight(body), None, name) for name, body in bodies.items())
@@ -120,6 +139,13 @@ class SpringDamper(AbstractForce):
     def bodies(self):
         return (self.a, self.b)
 
+    @property
+    def preload_shape(self):
+        return ()
+
+    def with_preload(self, preload):
+        return dataclasses.replace(self, preload=preload, free_length=None)
+
     def loads(self, bodies):
         dtype = self.stiffness.dtype
         free_length = _distance(self.at_a, self.at_b) if self.free_length is None else self.free_length
@@ -161,6 +187,10 @@ class Bushing(AbstractForce):
     @property
     def bodies(self):
         return (self.a, self.b)
+
+    @property
+    def preload_shape(self):
+        return (3,)
 
     def loads(self, bodies):
         a, b = (_frame(bodies, name, self.at.dtype) for name in (self.a, self.b))
@@ -209,6 +239,13 @@ class TyreSpring(AbstractForce):
     @property
     def bodies(self):
         return (self.body,)
+
+    @property
+    def preload_shape(self):
+        return ()
+
+    def with_preload(self, preload):
+        return dataclasses.replace(self, preload=preload, free_radius=None)
 
     def loads(self, bodies):
         load = TyreLoad(

@@ -6,6 +6,7 @@ respect to `at` is the gradient with respect to geometry. Reference: Haug (1989)
 """
 
 import abc
+from collections.abc import Sequence, Set
 
 import equinox as eqx
 import jax
@@ -23,6 +24,7 @@ from lgsens.model._constraints import (
     Orthogonality,
 )
 from lgsens.model._frames import Frame
+from lgsens.model._free import single_rotation
 
 
 def _normals(axis: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
@@ -63,6 +65,21 @@ class AbstractJoint(eqx.Module):
     @abc.abstractmethod
     def assembled(self) -> bool:
         """Whether the reference configuration satisfies the joint by construction."""
+
+    @property
+    def rigid(self) -> bool:
+        """Whether its bodies move as one: `Model(merge_fixed=True)` makes them one."""
+        return False
+
+    @property
+    def hinge(self) -> Float[Array, "3"] | None:
+        """The axis about which its bodies turn in each other, inertial frame, if about no other; None: it says nothing.
+        Of bodies with one rotation it must be that of the rotation."""
+        return None
+
+    def violable(self, constraints: Sequence[AbstractConstraint], free: Set[str]) -> Sequence[tuple[bool, ...]]:
+        """Which equations of each of its constraints its bodies could violate, as in `AbstractConstraint.violable`."""
+        return [constraint.violable(free) for constraint in constraints]
 
     @abc.abstractmethod
     def constraints(self, a: Frame, b: Frame) -> tuple[AbstractConstraint, ...]:
@@ -111,6 +128,13 @@ class RevoluteJoint(AbstractJoint):
     @property
     def assembled(self):
         return True
+
+    @property
+    def hinge(self):
+        return self.axis
+
+    def violable(self, constraints, free):
+        return constraints[0].violable(free), (False,), (False,)  # the one rotation is about the hinge
 
     def constraints(self, a, b):
         unit, first, second = _normals(self.axis)
@@ -237,6 +261,15 @@ class FixedJoint(AbstractJoint):
     @property
     def assembled(self):
         return True
+
+    @property
+    def rigid(self):
+        return True
+
+    def violable(self, constraints, free):
+        # of the orthogonalities x·y, y·z, z·x only that of the two axes other than that of the one rotation changes
+        axis = single_rotation(free)
+        return constraints[0].violable(free), *(((i + 2) % 3 == axis,) for i in range(3))
 
     def constraints(self, a, b):
         eye = jnp.eye(3, dtype=self.at.dtype)

@@ -3,52 +3,44 @@
 from collections.abc import Sequence
 
 from lgsens._validate import require
-from lgsens.model._constraints import AbstractConstraint, Coincidence, Orthogonality
-from lgsens.model._free import ROTATIONS, TRANSLATIONS, Free, is_along, single_rotation
-from lgsens.model._joints import AbstractJoint, FixedJoint, RevoluteJoint
+from lgsens.model._body import RigidBody
+from lgsens.model._constraints import AbstractConstraint
+from lgsens.model._free import ROTATIONS, is_along, single_rotation
+from lgsens.model._joints import AbstractJoint
 
 
 def needed(
-    name: str, joint: AbstractJoint, constraints: Sequence[AbstractConstraint], free_a: Free, free_b: Free
-) -> list[tuple[bool, ...]]:
-    """Which equations of each of a joint's basic constraints its bodies could violate; the ground has `free` = ().
+    name: str, joint: AbstractJoint, constraints: Sequence[AbstractConstraint], bodies: Sequence[RigidBody]
+) -> Sequence[tuple[bool, ...]]:
+    """Which equations of each of a joint's basic constraints its bodies, one or two, could violate.
 
     The others hold in every configuration as they do in the reference, so their rows of B are zero on the free
-    coordinates: with them the constraints would be redundant, and without them nothing is lost. Let the rotations
-    of the two bodies be about one inertial axis e at most.
+    coordinates: with them the constraints would be redundant, and without them nothing is lost. Joints and constraints
+    say which, for bodies that turn about one inertial axis at most. All equations are kept where bodies turn otherwise,
+    and those of a joint that the reference configuration need not satisfy.
 
-      - A component of x_b + R_b X_b − x_a − R_a X_a along e changes by translation along e only; another
-        one by any rotation too.
-      - R_a e_a · R_b e_b is constant without rotations. With the one about e it is constant in a hinge about e; of
-        the three orthogonalities of a triad x·y, y·z, z·x only that of the two axes other than e changes.
-
-    A joint that the reference configuration need not satisfy keeps all its equations.
-
-    Raises `ValueError` for a hinge about another axis than the one rotation that its bodies have.
+    Raises `ValueError` for a hinge about another axis than the one rotation that its bodies have, and for a joint that
+    holds the orientation of a point mass.
     """
-    free = {*free_a, *free_b}
-    rotations = free & set(ROTATIONS)
+    free = {name for body in bodies for name in body.free}
     axis = single_rotation(free)
-    keep_all = [(True,) * constraint.num_rows for constraint in constraints]
-    if not joint.assembled or (rotations and axis is None):
-        return keep_all
-    if axis is not None and isinstance(joint, RevoluteJoint):
+    hinge = joint.hinge if axis is not None and joint.assembled else None
+    if hinge is not None:
         require(
             lambda direction: is_along(direction, axis),
-            f"Joint {name!r}: `axis` {joint.axis} must be that of {ROTATIONS[axis]!r}, the only rotation that "
+            f"Joint {name!r}: `axis` {hinge} must be that of {ROTATIONS[axis]!r}, the only rotation that "
             f"{joint.a!r} and {joint.b!r} have; turn the axis, or free all rotations of one of them.",
-            joint.axis,
+            hinge,
         )
-    kept = []
-    for constraint, default in zip(constraints, keep_all):
-        if isinstance(constraint, Coincidence):
-            kept.append(tuple(TRANSLATIONS[i] in free or bool(rotations - {ROTATIONS[i]}) for i in range(3)))
-        elif isinstance(constraint, Orthogonality) and (not rotations or isinstance(joint, RevoluteJoint)):
-            kept.append((False,))
-        elif isinstance(constraint, Orthogonality) and isinstance(joint, FixedJoint):
-            # the i-th of the triad is between axes i and i + 1
-            orthogonality = sum(isinstance(before, Orthogonality) for before in constraints[: len(kept)])
-            kept.append((axis == (orthogonality + 2) % 3,))
-        else:
-            kept.append(default)
+    if not joint.assembled or (axis is None and free & {*ROTATIONS}):
+        kept = [(True,) * constraint.num_rows for constraint in constraints]
+    else:
+        kept = joint.violable(constraints, free)
+    holds_orientation = any(constraint.turning and any(own) for constraint, own in zip(constraints, kept))
+    if holds_orientation and any(body.inertia is None for body in bodies):
+        raise ValueError(
+            f"Joint {name!r}: a {type(joint).__name__} between {joint.a!r} and {joint.b!r} holds the orientation of a "
+            "point mass, which has none; use a SphericalJoint or a DistanceJoint at the point, or give the body an "
+            "`inertia`."
+        )
     return kept

@@ -12,7 +12,7 @@ import numpy as np
 
 from lgsens._validate import as_count
 from lgsens.analysis import Kinematics
-from lgsens.model import Angle, MultibodySystem
+from lgsens.model import MultibodySystem
 from lgsens.plotting._mechanism import VIEW, draw, frame
 from lgsens.plotting._shapes import Mark, Shapes, placed, shapes, stretched
 from lgsens.plotting._style import ROAD, ROLES, figure
@@ -115,7 +115,7 @@ def film(motion: Trajectory | Kinematics, speed: float, max_frames: int) -> Film
         (label, values), *_ = motion.values.items()
         values = np.asarray(values)
         clock = np.linspace(0.0, SWEEP, len(values)) / speed
-        turns = any(isinstance(stack.elements, Angle) and label in stack.owners for stack in system.constraints)
+        turns = all(stack.elements.turning for stack in system.constraints if label in stack.owners)
         unit = "rad" if turns else "m"
     else:
         label, unit, values = "t", "s", np.asarray(motion.t)
