@@ -31,8 +31,8 @@ class AbstractElement(eqx.Module):
 
     @property
     def drawn(self) -> str | None:
-        """What is drawn from its first point to its last: a "joint" or "link" that holds bodies, a "spring", a "damper",
-        or a "wheel" on its `road`; None: nothing."""
+        """What is drawn from its first point to its last: a "joint" or "link" that holds bodies, a "spring", "damper"
+        or "wheel" on its `road`; None: nothing."""
         return "joint"
 
     def fixed(self, kind: str, bodies: str = "ab") -> list[Array]:
