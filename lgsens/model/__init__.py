@@ -1,6 +1,6 @@
 """Rigid bodies, joints and forces: one implementation of the abstract system (paper, §3 and §9)."""
 
-from lgsens.model._body import RigidBody as RigidBody
+from lgsens.model._body import RigidBody as RigidBody, lumped as lumped
 from lgsens.model._constraints import (
     AbstractClosedFormConstraint as AbstractClosedFormConstraint,
     AbstractConstraint as AbstractConstraint,

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -179,6 +180,15 @@ class RigidBody(eqx.Module):
         if self.pivot is None:
             return self.inertia_matrix
         return self.inertia_matrix + self.mass * parallel_axis(self.centre)
+
+
+def lumped(
+    masses: Float[Array, " n"], places: Float[Array, "n 3"]
+) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
+    """Point masses as one body: m = Σ m_i, x = Σ m_i x_i/m and, by d_i = x_i − x, J = Σ m_i (|d_i|² I − d_i d_iᵀ)."""
+    mass = jnp.sum(masses)
+    position = masses @ places / mass
+    return mass, position, jnp.sum(masses[:, None, None] * jax.vmap(parallel_axis)(places - position[None]), axis=0)
 
 
 def parallel_axis(arm: Float[Array, "3"]) -> Float[Array, "3 3"]:

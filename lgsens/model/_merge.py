@@ -18,11 +18,10 @@ two steps: orthogonal in the metric of kinetic energy, first on the fixed joints
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens.model._body import RigidBody, parallel_axis
+from lgsens.model._body import RigidBody, lumped, parallel_axis
 from lgsens.model._frames import Frame, ground_frame
 from lgsens.model._free import ALL_FREE, ROTATIONS, TRANSLATIONS, Free, single_rotation
 from lgsens.model._joints import AbstractJoint
@@ -161,11 +160,9 @@ def _as_one(group: Group, bodies: Mapping[str, RigidBody]) -> RigidBody:
     spins, momenta = of_parts(lambda p: p.angular_velocity), masses[:, None] * of_parts(_velocity)
     axes, turns = lead.orientation, lead.orientation.T[None] @ of_parts(lambda p: p.orientation)
 
-    mass = jnp.sum(masses)
-    position = masses @ centres / mass
+    mass, position, shifted = lumped(masses, centres)
     arms = (centres - position[None]) @ axes
-    shifted = jnp.sum(masses[:, None, None] * jax.vmap(parallel_axis)(arms), axis=0)
-    inertia = jnp.einsum("pij,pjk,plk->il", turns, own, turns) + shifted
+    inertia = jnp.einsum("pij,pjk,plk->il", turns, own, turns) + axes.T @ shifted @ axes
 
     pivot = lead.frame.position if group.turns else None
     to_centre = jnp.zeros_like(position) if pivot is None else (position - pivot) @ axes
