@@ -27,11 +27,15 @@ _SEEN = {
 }
 
 
-def carried(element: AbstractElement, a: Frame | None, b: Frame | None) -> Any:
-    """A constraint or load between two parts as one between their bodies; `a`, `b`: the poses of the parts there."""
+def carried(element: AbstractElement, a: Frame | None, b: Frame | None, *, by_frames: bool = False) -> Any:
+    """A constraint or load between two parts as one between their bodies; `a`, `b`: the poses of the parts there.
+
+    `by_frames`: by the frames of the parts, whatever the element says of its numbers.
+    """
     if a is None and b is None:
         return element
-    if not (fields := fixed_fields(element)):
+    fields = fixed_fields(element)
+    if by_frames or not fields:
         return (_CarriedConstraint if isinstance(element, AbstractConstraint) else _CarriedLoad)(element, a, b)
     parts = {"a": a, "b": b}
     known = [(name, kind, part) for name, (kind, body) in fields.items() if (part := parts[body]) is not None]

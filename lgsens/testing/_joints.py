@@ -11,6 +11,7 @@ from lgsens.model import (
     AbstractConstraint,
     AbstractJoint,
     RigidBody,
+    carried,
     constraint_force,
     constraint_jacobian,
     constraint_stiffness,
@@ -36,7 +37,8 @@ def check_joint(
 
     at random poses that need not satisfy it: B and K by autodiff under the retraction R exp(θ̃) and by differences; of a
     constraint in closed form, `jacobian`, `force` and `geometric_stiffness` against autodiff; of any, that B and K are
-    zero outside of what it `acts_on` and what is `coupled`. Φ, Bᵀλ and K by every number of it, as
+    zero outside of what it `acts_on` and what is `coupled`, and that Φ on a part of a merged body is that in the frame
+    of the part, if it says what of it is fixed to bodies (`body_fixed`). Φ, Bᵀλ and K by every number of it, as
     `check_sensitivities` does. Of a joint, in the reference configuration: Φ = 0 if it says `assembled`, and B of full
     rank, so that its equations are independent.
 
@@ -69,10 +71,11 @@ def check_joint(
             )
         multipliers.append(jnp.asarray(scene.rng.standard_normal(rows), scene.dtype))
     starts = [scene.displacement(free) for _ in range(poses)]
+    (part,) = Poses(seed + 1, length).frames(1)
 
     checks: list[Check] = list(_reference(joint, scene, a, b, free)) if is_joint else []
     for label, element, lam in zip(labels, elements, multipliers):
-        program = _program(element, lam, free)
+        program = _program(element, lam, free, part)
         for start in starts:
             first, second = displaced(a, b, start)
             found = scene.sampled(program(scene.points(free), first, second), free)
@@ -91,7 +94,7 @@ def check_joint(
     return Report(f"{type(joint).__name__}, {poses} poses", worst(checks))
 
 
-def _program(element: AbstractConstraint, lam, free):
+def _program(element: AbstractConstraint, lam, free, part):
     """What a constraint says, and what follows from its value, at displacements x of two frames."""
     zero = jnp.zeros(DIM, lam.dtype)
     acts = np.isin(np.arange(DIM), element.acts_on)  # what is taken of B
@@ -107,6 +110,8 @@ def _program(element: AbstractConstraint, lam, free):
         force = lambda y: lam @ jacobian(*displaced(a, b, y))
         return {
             "Φ": element.value(a, b),
+            "Φ on a part": carried(element, part, part).value(a, b)
+            - carried(element, part, part, by_frames=True).value(a, b),
             "B": jnp.where(acts, constraint_jacobian(element, a, b), 0.0)[:, free],
             "B by autodiff": jacobian(a, b)[:, free],
             "force": jnp.where(acts, constraint_force(element, a, b, lam), 0.0)[free],
@@ -120,6 +125,7 @@ def _program(element: AbstractConstraint, lam, free):
 
 def _compared(label: str, given: bool, found) -> Iterator[Check]:
     stiffness = f"{label}K = ∂(Bᵀλ)/∂x"
+    yield vanishes(f"{label}Φ", "on a part, in its frame", found["Φ on a part"], float(np.abs(found["Φ"].value).max()))
     if given:
         yield same(f"{label}B", found["B"], found["B by autodiff"])
         yield same(f"{label}Bᵀλ", found["force"], found["force by autodiff"])

@@ -5,31 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import close, random_rotation
+from helpers import close
 
 import lgsens as lg
-from lgsens.model import (
-    AbstractConstraint,
-    AbstractForce,
-    AbstractJoint,
-    AbstractLoad,
-    Angle,
-    Attached,
-    BushingLoad,
-    Coincidence,
-    Distance,
-    Frame,
-    InPlane,
-    Orthogonality,
-    SpringDamperLoad,
-    TyreLoad,
-    body_fixed,
-    constraint_jacobian,
-    load_tangents,
-)
-from lgsens.model._carried import _CarriedConstraint, _CarriedLoad, carried
-from lgsens.model._loads import PointForce
+from lgsens.model import AbstractConstraint, AbstractForce, AbstractJoint, AbstractLoad, Attached, body_fixed
 from lgsens.plotting._shapes import shapes
+from lgsens.testing import check_force, check_joint
 
 WEIGHT = 4.0 * 9.81
 TURNED = ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
@@ -155,57 +136,25 @@ def test_a_spring_of_ones_own_has_a_preload(plain, merge):
     close(loaded.forces["strap"].preload, WEIGHT, ulps=100)
 
 
-def point(rng):
-    return jnp.asarray(rng.standard_normal(3))
+class Half(AbstractConstraint):
+    """A level that says of one of its points only that it is fixed to a body."""
+
+    here: jax.Array = body_fixed("point", "a")
+    there: jax.Array
+
+    @property
+    def num_rows(self):
+        return 1
+
+    def value(self, a, b):
+        return (b.point(self.there) - a.point(self.here))[2:]
 
 
-def pose(rng):
-    return Frame(point(rng), jnp.asarray(random_rotation(rng)))
-
-
-@pytest.mark.parametrize("body", ["a", "b"])
-def test_on_a_part_as_in_its_frame(body):
-    """Elements that declare what is fixed to bodies are rewritten for merged ones; others see the frame of the part."""
-    rng = np.random.default_rng(0)
-    a, b, part = pose(rng), pose(rng), pose(rng)
-    parts = (part, None) if body == "a" else (None, part)
-    va, vb = (jnp.asarray(rng.standard_normal(6)) for _ in "ab")
-    matrix = jnp.diag(jnp.array([1.0, 2.0, 3.0]))
-    constraints = [
-        InPlane(point(rng), point(rng), point(rng)),
-        Coincidence(point(rng), point(rng)),
-        Orthogonality(point(rng), point(rng)),
-        Distance(point(rng), point(rng), jnp.asarray(1.0)),
-        Angle(*jnp.eye(3)[:2], jnp.eye(3)[0], jnp.asarray(0.3)),
-        Level(point(rng), point(rng)),
-    ]
-    loads = [
-        BushingLoad(point(rng), point(rng), matrix, 0.1 * matrix, point(rng)),
-        SpringDamperLoad(point(rng), point(rng), *jnp.arange(1.0, 5.0)),
-        TyreLoad(point(rng), *jnp.arange(1.0, 4.0), lg.FlatRoad()),
-        PointForce(point(rng), point(rng), point(rng), lg.FlatRoad(height=1.0)),
-        StrapLoad(point(rng), point(rng), *jnp.arange(1.0, 4.0)),
-    ]
-
-    @jax.jit
-    def both(constraints, loads):
-        rewritten = [carried(e, *parts) for e in (*constraints, *loads)]
-        seen = [_CarriedConstraint(e, *parts) for e in constraints] + [_CarriedLoad(e, *parts) for e in loads]
-        n = len(constraints)
-        return [
-            [
-                *((e.value(a, b), constraint_jacobian(e, a, b)) for e in elements[:n]),
-                *((e.force(a, b, va, vb, 0.0), *load_tangents(e, a, b, va, vb, 0.0)) for e in elements[n:]),
-            ]
-            for elements in (rewritten, seen)
-        ]
-
-    rewritten, seen = both(constraints, loads)
-    for element, one, other in zip((*constraints, *loads), rewritten, seen):
-        assert type(carried(element, *parts)) is type(element)
-        for x, y in zip(one, other):
-            x = 0.0 if x is None else x  # tangents that are zero
-            np.testing.assert_allclose(x, y, atol=1e-12, err_msg=type(element).__name__)  # tens of terms of order 1
+def test_what_an_element_says_of_its_numbers_is_checked():
+    """On a part of a merged body a declared element is rewritten; others see the frame of the part."""
+    check_joint(Level(TIP, -TIP)).raise_if_failed()
+    check_force(StrapLoad(TIP, -TIP, *jnp.arange(1.0, 4.0))).raise_if_failed()
+    assert {failure.compared for failure in check_joint(Half(TIP, -TIP)).failures} == {"on a part, in its frame"}
 
 
 def reduced(free, plain=False) -> lg.Model:
