@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from lgsens.examples._arrays import vector
+from lgsens.examples._arrays import number, vector
 from lgsens.model import (
     Gravity,
     Model,
@@ -93,9 +93,9 @@ def four_bar(
                 "coupler",
                 at_a=point(px, py),
                 at_b=(pin_b + pin_c) / 2,
-                stiffness=k,
-                damping=cd,
-                free_length=l0,
+                stiffness=number(k),
+                damping=number(cd),
+                free_length=number(l0),
             ),
         },
     )

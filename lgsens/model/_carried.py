@@ -36,7 +36,8 @@ def carried(element: AbstractElement, a: Frame | None, b: Frame | None, *, by_fr
         return element
     fields = fixed_fields(element)
     if by_frames or not fields:
-        return (_CarriedConstraint if isinstance(element, AbstractConstraint) else _CarriedLoad)(element, a, b)
+        kind: Any = _CarriedConstraint if isinstance(element, AbstractConstraint) else _CarriedLoad
+        return kind(element, a, b)
     parts = {"a": a, "b": b}
     known = [(name, kind, part) for name, (kind, body) in fields.items() if (part := parts[body]) is not None]
     return dataclasses.replace(

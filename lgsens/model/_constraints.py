@@ -11,6 +11,7 @@ An element holds numbers only (no names): elements of one type are stacked and e
 import abc
 from collections.abc import Set
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -90,8 +91,8 @@ class AbstractClosedFormConstraint(AbstractConstraint):
 class Coincidence(AbstractClosedFormConstraint):
     """Two body-fixed points coincide: Φ = x_b + R_b X_b − x_a − R_a X_a; λ is the force of b on a [N]."""
 
-    point_a: Float[Array, "3"] = body_fixed("point", "a")
-    point_b: Float[Array, "3"] = body_fixed("point", "b")
+    point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
 
     @property
     def num_rows(self):
@@ -130,8 +131,8 @@ class Orthogonality(AbstractClosedFormConstraint):
     λ [[ẽ_a (R_aᵀβ)~, −ẽ_a R_aᵀR_b ẽ_b], [−ẽ_b R_bᵀR_a ẽ_a, ẽ_b (R_bᵀα)~]] on the rotations.
     """
 
-    axis_a: Float[Array, "3"] = body_fixed("axis", "a")
-    axis_b: Float[Array, "3"] = body_fixed("axis", "b")
+    axis_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
+    axis_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
 
     @property
     def num_rows(self):
@@ -192,9 +193,9 @@ class InPlane(AbstractClosedFormConstraint):
     D_q(Bᵀλ) = λ (ẽ_a (R_aᵀd)~ + (∂α)ᵀD + Dᵀ(∂α) + D_q(Dᵀα)|_α), the first term on (δθ_a, δθ_a).
     """
 
-    point_a: Float[Array, "3"] = body_fixed("point", "a")
-    point_b: Float[Array, "3"] = body_fixed("point", "b")
-    axis_a: Float[Array, "3"] = body_fixed("axis", "a")
+    point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
+    axis_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
 
     @property
     def num_rows(self):
@@ -240,8 +241,8 @@ class Distance(AbstractClosedFormConstraint):
     With n = d/|d|: B = nᵀD and D_q(Bᵀλ) = λ (Dᵀ (I − n nᵀ)/|d| D + D_q(Dᵀn)|_n).
     """
 
-    point_a: Float[Array, "3"] = body_fixed("point", "a")
-    point_b: Float[Array, "3"] = body_fixed("point", "b")
+    point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
     length: Float[Array, ""]
 
     @property

@@ -52,9 +52,9 @@ class Angle(AbstractConstraint):
     turn, and ∂Φ/∂s = −1.
     """
 
-    first_a: Float[Array, "3"] = body_fixed("axis", "a")
-    second_a: Float[Array, "3"] = body_fixed("axis", "a")
-    first_b: Float[Array, "3"] = body_fixed("axis", "b")
+    first_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
+    second_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
+    first_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
     prescribed: Float[Array, ""]
 
     @property

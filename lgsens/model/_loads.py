@@ -8,6 +8,7 @@ f(q, v, t) of eq. (16) is −Q, and K_t, C_t receive −∂Q/∂q, −∂Q/∂v.
 import abc
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -104,8 +105,8 @@ class SpringDamperLoad(AbstractClosedFormLoad):
     with k d all the same, so F/|d| is continued by k: f = (F/|d|) d has the tangent k D at d = 0 and not zero.
     """
 
-    point_a: Float[Array, "3"] = body_fixed("point", "a")
-    point_b: Float[Array, "3"] = body_fixed("point", "b")
+    point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
     stiffness: Float[Array, ""]
     damping: Float[Array, ""]
     free_length: Float[Array, ""]
@@ -182,11 +183,11 @@ class BushingLoad(AbstractClosedFormLoad):
         ∂Q/∂q = −Uᵀ (K U + C ∂u̇/∂q) − D_q(Uᵀ g),     ∂Q/∂v = −Uᵀ C U.
     """
 
-    point_a: Float[Array, "3"] = body_fixed("point", "a")
-    point_b: Float[Array, "3"] = body_fixed("point", "b")
-    stiffness: Float[Array, "3 3"] = body_fixed("tensor", "a")
-    damping: Float[Array, "3 3"] = body_fixed("tensor", "a")
-    preload: Float[Array, "3"] = body_fixed("axis", "a")
+    point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
+    stiffness: Float[Array, "3 3"] = eqx.field(metadata=body_fixed("tensor", "a"))
+    damping: Float[Array, "3 3"] = eqx.field(metadata=body_fixed("tensor", "a"))
+    preload: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
 
     @property
     def balanced(self):
@@ -241,7 +242,7 @@ class TyreLoad(AbstractClosedFormLoad):
     ∂Q/∂q = −k D_bᵀ e_z e_zᵀ D_b + D_q(Dᵀ f)|_{f = F_z e_z}.
     """
 
-    point_b: Float[Array, "3"] = body_fixed("point", "b")
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
     stiffness: Float[Array, ""]
     free_radius: Float[Array, ""]
     preload: Float[Array, ""]
@@ -274,9 +275,9 @@ class PointForce(AbstractClosedFormLoad):
     Q_b = s [f, X̃ R^T f + m];  ∂Q/∂q = s D_q(Dᵀ f).
     """
 
-    point_b: Float[Array, "3"] = body_fixed("point", "b")
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
     vector: Float[Array, "3"]
-    moment: Float[Array, "3"] = body_fixed("axis", "b")
+    moment: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
     signal: AbstractSignal
 
     def force(self, a, b, va, vb, t):

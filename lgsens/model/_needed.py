@@ -24,8 +24,7 @@ def needed(
     """
     free = {name for body in bodies for name in body.free}
     axis = single_rotation(free)
-    hinge = joint.hinge if axis is not None and joint.assembled else None
-    if hinge is not None:
+    if axis is not None and joint.assembled and (hinge := joint.hinge) is not None:
         require(
             lambda direction: is_along(direction, axis),
             f"Joint {name!r}: `axis` {hinge} must be that of {ROTATIONS[axis]!r}, the only rotation that "

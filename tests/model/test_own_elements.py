@@ -20,8 +20,8 @@ TIP = jnp.array([0.5, 0.0, 0.0])
 class Level(AbstractConstraint):
     """Two points are at the same height."""
 
-    here: jax.Array = body_fixed("point", "a")
-    there: jax.Array = body_fixed("point", "b")
+    here: jax.Array = eqx.field(metadata=body_fixed("point", "a"))
+    there: jax.Array = eqx.field(metadata=body_fixed("point", "b"))
 
     @property
     def num_rows(self):
@@ -64,8 +64,8 @@ class Table(AbstractJoint):
 class StrapLoad(AbstractLoad):
     """A force along the line between two points that grows by k per metre."""
 
-    here: jax.Array = body_fixed("point", "a")
-    there: jax.Array = body_fixed("point", "b")
+    here: jax.Array = eqx.field(metadata=body_fixed("point", "a"))
+    there: jax.Array = eqx.field(metadata=body_fixed("point", "b"))
     stiffness: jax.Array
     length: jax.Array
     tension: jax.Array
@@ -139,7 +139,7 @@ def test_a_spring_of_ones_own_has_a_preload(plain, merge):
 class Half(AbstractConstraint):
     """A level that says of one of its points only that it is fixed to a body."""
 
-    here: jax.Array = body_fixed("point", "a")
+    here: jax.Array = eqx.field(metadata=body_fixed("point", "a"))
     there: jax.Array
 
     @property
