@@ -97,10 +97,6 @@ class _CarriedLoad(AbstractLoad):
     a: Frame | None
     b: Frame | None
 
-    @property
-    def balanced(self):
-        return self.element.balanced
-
     def _of_parts(self, a, b, va, vb):
         return _frame(a, self.a), _frame(b, self.b), _velocity(a, va, self.a), _velocity(b, vb, self.b)
 

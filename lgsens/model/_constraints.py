@@ -150,9 +150,7 @@ class Orthogonality(AbstractClosedFormConstraint):
     def coupled(self):
         return (self.acts_on,)
 
-    @property
-    def drawn(self):
-        return None
+    drawn = None
 
     def violable(self, free):
         return (bool(free & {*ROTATIONS}),)
@@ -205,9 +203,7 @@ class InPlane(AbstractClosedFormConstraint):
     def relative(self):
         return True
 
-    @property
-    def drawn(self):
-        return None
+    drawn = None
 
     def value(self, a, b):
         return jnp.sum(a.axis(self.axis_a) * (b.point(self.point_b) - a.point(self.point_a)))[None]
@@ -253,9 +249,7 @@ class Distance(AbstractClosedFormConstraint):
     def relative(self):
         return True
 
-    @property
-    def drawn(self):
-        return "link"
+    drawn = "link"
 
     @property
     def driven(self):

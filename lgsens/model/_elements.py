@@ -4,7 +4,7 @@ What the rest of the library wants to know of an element is asked of the element
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 from jaxtyping import Array
@@ -23,19 +23,19 @@ def body_fixed(kind: str, body: str) -> dict[str, Any]:
 
 
 class AbstractElement(eqx.Module):
-    """A law between the frames of two bodies a and b, and numbers for it; no names, so that elements can be stacked."""
+    """A law between the frames of two bodies a and b, and numbers for it; no names, so that elements can be stacked.
+
+    `drawn` is what is drawn from its first point to its last: a "joint" or "link" that holds bodies, a "spring", a
+    "damper", or a "wheel" on its `road`; None: nothing.
+    """
+
+    drawn: ClassVar[Any] = "joint"
 
     @property
     def acts_on(self) -> tuple[int, ...]:
         """The coordinates 0 … 11, [x_a, θ_a, x_b, θ_b], that it acts on: B has no other columns, and the generalized
         force no other entries. Of a constraint, which then depends on no others, all of them or the six rotations."""
         return ALL
-
-    @property
-    def drawn(self) -> str | None:
-        """What is drawn from its first point to its last: a "joint" or "link" that holds bodies, a "spring", "damper"
-        or "wheel" on its `road`; None: nothing."""
-        return "joint"
 
     def fixed(self, kind: str, bodies: str = "ab") -> list[Array]:
         """Its points, axes or tensors, in the frames of these bodies."""

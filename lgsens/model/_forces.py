@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -32,22 +32,19 @@ class Attached(NamedTuple):
 
 
 class AbstractForce(eqx.Module):
-    """A force element. One of one's own has leaves for its numbers, and `bodies` and `loads`."""
+    """A force element. One of one's own has leaves for its numbers, and `bodies` and `loads`.
+
+    `preload_shape` is that of its `preload`, in which its force is linear, for `static_preload`; None: it has none.
+    `on_merged` says whether its loads on bodies that fixed joints merge are one load on what they are merged to.
+    """
+
+    preload_shape: ClassVar[tuple[int, ...] | None] = None
+    on_merged: ClassVar[bool] = False
 
     @property
     @abc.abstractmethod
     def bodies(self) -> tuple[str | None, ...]:
         """The bodies that it names; None is the ground."""
-
-    @property
-    def on_merged(self) -> bool:
-        """Whether its loads on bodies that fixed joints merge are one load on what they are merged to."""
-        return False
-
-    @property
-    def preload_shape(self) -> tuple[int, ...] | None:
-        """The shape of its `preload`, in which its force is linear, for `static_preload`; None: it has none."""
-        return None
 
     def with_preload(self, preload) -> "AbstractForce":
         """The same element with this preload in the reference configuration."""
@@ -88,9 +85,7 @@ class Gravity(AbstractForce):
     def bodies(self):
         return ()
 
-    @property
-    def on_merged(self):
-        return True  # the weights of the parts of a body are a weight at its centre of mass
+    on_merged = True  # the weights of the parts of a body are a weight at its centre of mass
 
     def loads(self, bodies):
         return tuple(Attached(self._weight(body), None, name) for name, body in bodies.items())
@@ -139,9 +134,7 @@ class SpringDamper(AbstractForce):
     def bodies(self):
         return (self.a, self.b)
 
-    @property
-    def preload_shape(self):
-        return ()
+    preload_shape = ()
 
     def with_preload(self, preload):
         return dataclasses.replace(self, preload=preload, free_length=None)
@@ -188,9 +181,7 @@ class Bushing(AbstractForce):
     def bodies(self):
         return (self.a, self.b)
 
-    @property
-    def preload_shape(self):
-        return (3,)
+    preload_shape = (3,)
 
     def loads(self, bodies):
         a, b = (_frame(bodies, name, self.at.dtype) for name in (self.a, self.b))
@@ -240,9 +231,7 @@ class TyreSpring(AbstractForce):
     def bodies(self):
         return (self.body,)
 
-    @property
-    def preload_shape(self):
-        return ()
+    preload_shape = ()
 
     def with_preload(self, preload):
         return dataclasses.replace(self, preload=preload, free_radius=None)

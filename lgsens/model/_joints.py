@@ -7,6 +7,7 @@ respect to `at` is the gradient with respect to geometry. Reference: Haug (1989)
 
 import abc
 from collections.abc import Sequence, Set
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -55,21 +56,15 @@ def _in_plane(a: Frame, b: Frame, at, axis) -> InPlane:
 class AbstractJoint(eqx.Module):
     """A joint between bodies `a` and `b`; None is the ground.
 
-    A joint of one's own has these two names, leaves for its numbers, and `constraints`.
+    A joint of one's own has these two names, leaves for its numbers, and `constraints`. It is `assembled` if the
+    reference configuration satisfies it by construction; others are assembled before the motion starts. It is `rigid` if
+    its bodies move as one, which `Model(merge_fixed=True)` makes of them.
     """
 
     a: eqx.AbstractVar[str | None]
     b: eqx.AbstractVar[str | None]
-
-    @property
-    @abc.abstractmethod
-    def assembled(self) -> bool:
-        """Whether the reference configuration satisfies the joint by construction."""
-
-    @property
-    def rigid(self) -> bool:
-        """Whether its bodies move as one: `Model(merge_fixed=True)` makes them one."""
-        return False
+    assembled: ClassVar[Any] = False
+    rigid: ClassVar[bool] = False
 
     @property
     def hinge(self) -> Float[Array, "3"] | None:
@@ -101,9 +96,7 @@ class SphericalJoint(AbstractJoint):
     b: str | None = eqx.field(static=True)
     at: Float[Array, "3"] = point_field("at")
 
-    @property
-    def assembled(self):
-        return True
+    assembled = True
 
     def constraints(self, a, b):
         return (_coincidence(a, b, self.at),)
@@ -125,9 +118,7 @@ class RevoluteJoint(AbstractJoint):
     at: Float[Array, "3"] = point_field("at")
     axis: Float[Array, "3"] = axis_field("axis")
 
-    @property
-    def assembled(self):
-        return True
+    assembled = True
 
     @property
     def hinge(self):
@@ -173,9 +164,7 @@ class UniversalJoint(AbstractJoint):
             self.axis_b,
         )
 
-    @property
-    def assembled(self):
-        return True
+    assembled = True
 
     def constraints(self, a, b):
         arm_a = self.axis_a / jnp.linalg.norm(self.axis_a)
@@ -200,9 +189,7 @@ class PrismaticJoint(AbstractJoint):
     at: Float[Array, "3"] = point_field("at")
     axis: Float[Array, "3"] = axis_field("axis")
 
-    @property
-    def assembled(self):
-        return True
+    assembled = True
 
     def constraints(self, a, b):
         unit, first, second = _normals(self.axis)
@@ -229,9 +216,7 @@ class CylindricalJoint(AbstractJoint):
     at: Float[Array, "3"] = point_field("at")
     axis: Float[Array, "3"] = axis_field("axis")
 
-    @property
-    def assembled(self):
-        return True
+    assembled = True
 
     def constraints(self, a, b):
         unit, first, second = _normals(self.axis)
@@ -258,13 +243,8 @@ class FixedJoint(AbstractJoint):
     b: str | None = eqx.field(static=True)
     at: Float[Array, "3"] = point_field("at")
 
-    @property
-    def assembled(self):
-        return True
-
-    @property
-    def rigid(self):
-        return True
+    assembled = True
+    rigid = True
 
     def violable(self, constraints, free):
         # of the orthogonalities x·y, y·z, z·x only that of the two axes other than that of the one rotation changes

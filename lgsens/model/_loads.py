@@ -6,7 +6,7 @@ f(q, v, t) of eq. (16) is −Q, and K_t, C_t receive −∂Q/∂q, −∂Q/∂v.
 """
 
 import abc
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -38,16 +38,13 @@ class LoadTangents(NamedTuple):
 
 
 class AbstractLoad(AbstractElement):
-    """A force between the frames of two bodies; its tangents come from autodiff."""
+    """A force between the frames of two bodies; its tangents come from autodiff.
 
-    @property
-    def balanced(self) -> bool:
-        """Whether action equals reaction, so that it does nothing between two parts of one body."""
-        return False
+    `balanced` says whether action equals reaction, so that it does nothing between two parts of one body.
+    """
 
-    @property
-    def drawn(self):
-        return "spring"
+    balanced: ClassVar[bool] = False
+    drawn = "spring"
 
     @abc.abstractmethod
     def force(self, a: Frame, b: Frame, va, vb, t) -> Float[Array, "12"]:
@@ -112,9 +109,7 @@ class SpringDamperLoad(AbstractClosedFormLoad):
     free_length: Float[Array, ""]
     preload: Float[Array, ""]
 
-    @property
-    def balanced(self):
-        return True
+    balanced = True
 
     @property
     def drawn(self):
@@ -189,13 +184,8 @@ class BushingLoad(AbstractClosedFormLoad):
     damping: Float[Array, "3 3"] = eqx.field(metadata=body_fixed("tensor", "a"))
     preload: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
 
-    @property
-    def balanced(self):
-        return True
-
-    @property
-    def drawn(self):
-        return "joint"
+    balanced = True
+    drawn = "joint"
 
     def _gradient(self, a, b):
         """r and U."""
@@ -248,9 +238,7 @@ class TyreLoad(AbstractClosedFormLoad):
     preload: Float[Array, ""]
     road: AbstractSignal
 
-    @property
-    def drawn(self):
-        return "wheel"
+    drawn = "wheel"
 
     def measure(self, a, b, va, vb, t) -> Float[Array, ""]:
         return self.preload + self.stiffness * (self.road(t) + self.free_radius - b.point(self.point_b)[2])

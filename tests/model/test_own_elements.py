@@ -102,9 +102,7 @@ class Strap(AbstractForce):
     def bodies(self):
         return (self.a, self.b)
 
-    @property
-    def preload_shape(self):
-        return ()
+    preload_shape = ()
 
     def loads(self, bodies):
         here, there = (
