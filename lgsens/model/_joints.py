@@ -57,8 +57,8 @@ class AbstractJoint(eqx.Module):
     """A joint between bodies `a` and `b`; None is the ground.
 
     A joint of one's own has these two names, leaves for its numbers, and `constraints`. It is `assembled` if the
-    reference configuration satisfies it by construction; others are assembled before the motion starts. It is `rigid` if
-    its bodies move as one, which `Model(merge_fixed=True)` makes of them.
+    reference configuration satisfies it by construction; others are assembled before the motion starts. It is `rigid`
+    if its bodies move as one, which `Model(merge_fixed=True)` makes of them.
     """
 
     a: eqx.AbstractVar[str | None]
