@@ -1,7 +1,6 @@
 """Rigid bodies, joints and forces: one implementation of the abstract system (paper, §3 and §9)."""
 
 from lgsens.model._body import RigidBody as RigidBody, lumped as lumped
-from lgsens.model._carried import carried as carried
 from lgsens.model._constraints import (
     AbstractClosedFormConstraint as AbstractClosedFormConstraint,
     AbstractConstraint as AbstractConstraint,
@@ -48,6 +47,7 @@ from lgsens.model._loads import (
     TyreLoad as TyreLoad,
 )
 from lgsens.model._model import Model as Model
+from lgsens.model._on_merged_bodies import carried as carried
 from lgsens.model._roads import (
     AbstractSignal as AbstractSignal,
     BumpRoad as BumpRoad,

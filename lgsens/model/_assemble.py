@@ -9,16 +9,16 @@ import jax.numpy as jnp
 
 from lgsens.liegroups import Pose
 from lgsens.model._body import RigidBody
-from lgsens.model._carried import carried
+from lgsens.model._evaluate_by_kind import Row, evaluated, joined, stacked
 from lgsens.model._forces import AbstractForce
 from lgsens.model._frames import Frame, ground_frame
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._merge import Group, Place, Places, merged
-from lgsens.model._needed import needed
-from lgsens.model._parts import Parts
-from lgsens.model._rows import Row, evaluated, joined, stacked
+from lgsens.model._merged_parts import Parts
+from lgsens.model._on_merged_bodies import carried
 from lgsens.model._stack import Placed, stack
 from lgsens.model._system import MultibodySystem
+from lgsens.model._violable_rows import violable_rows
 
 
 def assemble(
@@ -89,7 +89,7 @@ def _assemble(
         a, b = (number[end.body] for end in ends)
         own = [moving[end.body] for end in ends if end.body is not None]
         single = [jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), of) for of in row.of]
-        for i, (of, kept) in enumerate(zip(row.of, needed(name, joint, single, own))):
+        for i, (of, kept) in enumerate(zip(row.of, violable_rows(name, joint, single, own))):
             if any(kept):
                 constraints.append(Placed(Row(of, row.index), a, b, name, kept, i))
     loads = []

@@ -16,7 +16,7 @@ from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, cho
 from lgsens.model._constraints import AbstractConstraint
 from lgsens.model._frames import BODY_DIM, ROTATION
 from lgsens.model._loads import AbstractLoad
-from lgsens.model._parts import Parts
+from lgsens.model._merged_parts import Parts
 from lgsens.model._stack import (
     Stack,
     at_ends,

@@ -9,7 +9,7 @@ from lgsens.model._free import ROTATIONS, is_along, single_rotation
 from lgsens.model._joints import AbstractJoint
 
 
-def needed(
+def violable_rows(
     name: str, joint: AbstractJoint, constraints: Sequence[AbstractConstraint], bodies: Sequence[RigidBody]
 ) -> Sequence[tuple[bool, ...]]:
     """Which equations of each of a joint's basic constraints its bodies, one or two, could violate.
