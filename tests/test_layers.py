@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import lgsens
+from lgsens.model import AbstractElement, AbstractForce, AbstractJoint
 
 ROOT = Path(lgsens.__file__).parent
 # The packages from the ground up: each may import those of earlier ranks. `_validate` is below all of them.
@@ -143,6 +144,47 @@ def test_config_is_recognized():
 
 def test_the_library_never_touches_jaxs_config():
     assert not [name for name in FILES if layer(name) != "cli" and touches_config(TREES[name])]
+
+
+def element_types(base: type) -> dict[str, str]:
+    """The library's final types under an abstract one by name, and the modules that define them."""
+    own = {base.__name__: base.__module__} if not base.__name__.startswith("Abstract") else {}
+    found = [own, *map(element_types, base.__subclasses__())]
+    return {name: module for types in found for name, module in types.items() if module in FILES}
+
+
+def asks_for(tree, types: set[str]) -> set[str]:
+    """Those of the types for which `isinstance` or `issubclass` asks, or which are compared, also by another name."""
+    names = lambda node: {getattr(part, "id", getattr(part, "attr", None)) for part in ast.walk(node)}
+    known = {name: {name} for name in types}
+    for node in tree.body:
+        if isinstance(node, ast.Assign):
+            mentioned = set().union(*(known.get(name, set()) for name in names(node.value)))
+            known |= {name: mentioned for target in node.targets for name in names(target)}
+    found = set()
+    for node in ast.walk(tree):
+        called = names(node.func) if isinstance(node, ast.Call) else set()
+        compared = names(node) if isinstance(node, ast.Compare) else set()
+        if called & {"isinstance", "issubclass"} or "type" in compared:
+            found |= names(node)
+    return set().union(*(known.get(name, set()) for name in found))
+
+
+def test_types_of_elements_are_asked_for_in_their_own_file_only():
+    """What others want to know of a joint, a force, a constraint or a load, it says itself."""
+    types = {}
+    for base in (AbstractJoint, AbstractForce, AbstractElement):
+        types |= element_types(base)
+    assert {"RevoluteJoint", "Coincidence", "SpringDamperLoad", "Gravity", "Angle"} <= set(types)
+    for source in (
+        "SPRINGS = (Coil, lg.Bushing)\nisinstance(force, SPRINGS)",
+        "if isinstance(a, lg.Bushing | Other): pass",
+        "x = type(force) is Bushing",
+    ):
+        assert asks_for(ast.parse(source), set(types)) == {"Bushing"}
+    for name, tree in TREES.items():
+        foreign = {kind for kind in asks_for(tree, set(types)) if types[kind] != name}
+        assert not foreign, f"{name} asks whether an element is a {sorted(foreign)}; let the element declare it"
 
 
 def test_import_creates_no_arrays():

@@ -1,7 +1,6 @@
 """`kinematics`: the motion that joints and prescribed coordinates alone determine."""
 
-import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -11,18 +10,8 @@ from jaxtyping import Array, Float, Int
 
 from lgsens._validate import as_float, suggestion
 from lgsens.dynamics import RESULTS, AbstractDrive, State, forces_of_motion, positions
-from lgsens.model import (
-    AbstractSignal,
-    Distance,
-    DistanceJoint,
-    Model,
-    MultibodySystem,
-    RotationDriver,
-    TranslationDriver,
-)
+from lgsens.model import AbstractSignal, Model, MultibodySystem
 from lgsens.simulation import AbstractMotion, throw_if_failed
-
-_DRIVERS = (TranslationDriver, RotationDriver, DistanceJoint)
 
 
 class Kinematics(AbstractMotion):
@@ -55,13 +44,9 @@ class _Drive(AbstractDrive):
     def at(self, values):
         system = self.system
         for (stack, element), value in zip(self.where, values):
-            leaf = lambda s, stack=stack: _driven_leaf(s.constraints[stack].elements)
+            leaf = lambda s, stack=stack: s.constraints[stack].elements.driven
             system = eqx.tree_at(leaf, system, leaf(system).at[element].set(value))
         return system
-
-
-def _driven_leaf(element) -> Any:
-    return element.length if isinstance(element, Distance) else element.prescribed
 
 
 def kinematics(
@@ -102,15 +87,16 @@ def kinematics(
     """
     if not isinstance(model, Model):
         raise ValueError(f"`model` must be a Model, got {type(model).__name__}.")
-    driven, known = dict(driven or {}), [name for name, joint in model.joints.items() if isinstance(joint, _DRIVERS)]
+    driven, start = dict(driven or {}), as_float(t0, (), "`t0`")
+    where = _drivers(_with_numbers(model, start).system())
     if not driven and t is None:
         raise ValueError(
-            f"`driven` is empty; give values for drivers of the model, some of {sorted(known)}, or the times `t` at "
+            f"`driven` is empty; give values for drivers of the model, some of {sorted(where)}, or the times `t` at "
             "which their signals are taken."
         )
     for name in (*driven, *(rates or ())):
-        if name not in known:
-            raise ValueError(f"`driven`: {suggestion(name, known)}, the drivers and distance joints of the model.")
+        if name not in where:
+            raise ValueError(f"`driven`: {suggestion(name, where)}, the drivers and distance joints of the model.")
     names = sorted(driven)
     columns = [as_float(driven[name], None, f"`driven[{name!r}]`") for name in names]
     times = [] if t is None else [as_float(t, None, "`t`")]
@@ -124,8 +110,7 @@ def kinematics(
         raise ValueError(f"`rates` must have shape () or {shape}, got {[speed.shape for speed in speeds]}.")
     if set(rates or ()) - set(names):
         raise ValueError(f"`rates`: {sorted(set(rates or ()) - set(names))} are not among the driven joints {names}.")
-    start = as_float(t0, (), "`t0`")
-    system = _with_numbers(model, names, start).system()
+    system = _with_numbers(model, start, names).system()
     if system.num_velocity_rows:
         rolling = sorted(set(system.constraint_names[-system.num_velocity_rows :]))
         raise ValueError(
@@ -136,14 +121,15 @@ def kinematics(
     if unknowns != equations:
         raise ValueError(
             f"`driven`: the mechanism has {unknowns} coordinates and {equations} equations, those of the drivers "
-            f"{names or sorted(known)} included; kinematics needs as many. "
+            f"{names or sorted(where)} included; kinematics needs as many. "
             + (
                 "Drive more coordinates, hold bodies by `free`, or lock joints."
                 if unknowns > equations
                 else "Drive fewer coordinates, or remove joints that repeat each other."
             )
         )
-    drive = _Drive(system, tuple(_place(system, name) for name in names))
+    where = _drivers(system)
+    drive = _Drive(system, tuple(where[name] for name in names))
     table = lambda rows: jnp.stack([jnp.zeros(shape, start.dtype), *rows], axis=1)[:, 1:]
     values, speed = table(columns), table([jnp.broadcast_to(speed, shape) for speed in speeds])
     time = jnp.broadcast_to(start, shape) if t is None else times[0]
@@ -166,17 +152,18 @@ def _kinematics_jit(drive: _Drive, driven, rates):
     return (states, result), jax.lax.stop_gradient(details)
 
 
-def _with_numbers(model: Model, names: list[str], t) -> Model:
-    """The model with a number in place of the signal of each joint that is driven."""
-    joints = dict(model.joints)
-    for name in names:
-        field = "length" if isinstance(joints[name], DistanceJoint) else "value"
-        signal = getattr(joints[name], field)
-        if isinstance(signal, AbstractSignal):
-            joints[name] = dataclasses.replace(joints[name], **{field: signal(t)})
+def _with_numbers(model: Model, t, names: Sequence[str] | None = None) -> Model:
+    """The model with numbers in place of the signals of these joints; None: of all."""
+    is_signal = lambda leaf: isinstance(leaf, AbstractSignal)
+    number = lambda leaf: leaf(t) if is_signal(leaf) else leaf
+    joints = {
+        name: jax.tree.map(number, joint, is_leaf=is_signal) if names is None or name in names else joint
+        for name, joint in model.joints.items()
+    }
     return eqx.tree_at(lambda model: model.joints, model, joints)
 
 
-def _place(system: MultibodySystem, name: str) -> tuple[int, int]:
-    """The stack of constraints and the element in it that belong to a driver."""
-    return next((i, stack.owners.index(name)) for i, stack in enumerate(system.constraints) if name in stack.owners)
+def _drivers(system: MultibodySystem) -> dict[str, tuple[int, int]]:
+    """By the name of each driver the stack of constraints and the element in it with its number."""
+    stacks = [(k, stack) for k, stack in enumerate(system.constraints) if stack.elements.driven is not None]
+    return {owner: (k, i) for k, stack in stacks for i, owner in enumerate(stack.owners)}

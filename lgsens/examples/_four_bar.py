@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 
+from lgsens.examples._arrays import number, vector
 from lgsens.model import (
     Gravity,
     Model,
@@ -45,11 +46,7 @@ def four_bar(
     revolute joints would be redundant. Source: a standard mechanism; reference numbers by index-1 integration in
     natural coordinates, `four_bar_spring.json`.
     """
-    zero = jnp.zeros_like(jnp.asarray(a * 1.0))
-
-    def point(x, y):
-        return jnp.stack([x + zero, y + zero, zero])
-
+    point = lambda x, y: vector(x, y, 0.0)
     pin_a, pin_d = point(0.0, 0.0), point(d, 0.0)
     pin_b = point(a * jnp.cos(th0), a * jnp.sin(th0))
     span = pin_d - pin_b
@@ -63,6 +60,7 @@ def four_bar(
     def turned(vector):  # e_z × vector
         return point(-vector[1], vector[0])
 
+    e_z = vector(0.0, 0.0, 1.0)
     # w3, w4 from ẋ_B + w3 e_z × (C − B) = w4 e_z × (C − D)
     vel_b = w0 * turned(pin_b - pin_a)
     matrix = jnp.stack([turned(pin_c - pin_b)[:2], -turned(pin_c - pin_d)[:2]], axis=1)
@@ -74,10 +72,8 @@ def four_bar(
         along = jnp.outer(x, x)
         inertia = transverse * (_AXIAL * along + jnp.eye(3, dtype=x.dtype) - along)
         middle = velocity + rate * turned(end - start) / 2
-        spin = jnp.stack([zero, zero, rate + zero])
-        return RigidBody(mass, inertia, (start + end) / 2, velocity=middle, angular_velocity=spin)
+        return RigidBody(mass, inertia, (start + end) / 2, velocity=middle, angular_velocity=rate * e_z)
 
-    e_z = point(0.0, 0.0).at[2].set(1.0)
     return Model(
         bodies={
             "crank": rod(m2, pin_a, pin_b, point(0.0, 0.0), w0),
@@ -97,9 +93,9 @@ def four_bar(
                 "coupler",
                 at_a=point(px, py),
                 at_b=(pin_b + pin_c) / 2,
-                stiffness=k + zero,
-                damping=cd + zero,
-                free_length=l0 + zero,
+                stiffness=number(k),
+                damping=number(cd),
+                free_length=number(l0),
             ),
         },
     )

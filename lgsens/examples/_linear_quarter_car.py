@@ -18,10 +18,9 @@ def linear_quarter_car(ms=400.0, mu=40.0, ks=20000.0, cs=1500.0, kt=200000.0, hb
     Source: a standard model; reference numbers by the matrix exponential in `quarter_car_linear.json`.
     """
     origin, e_z = vector(0.0, 0.0, 0.0), vector(0.0, 0.0, 1.0)
-    inertia = (1.0, 1.0, 1.0)  # the bodies do not turn
     bump = BumpRoad(height=number(hb), duration=number(Tb))
     return Model(
-        bodies={"sprung": RigidBody(mass=ms, inertia=inertia), "unsprung": RigidBody(mass=mu, inertia=inertia)},
+        bodies={"sprung": RigidBody(mass=ms, inertia=None), "unsprung": RigidBody(mass=mu, inertia=None)},
         joints={
             "heave": PrismaticJoint(None, "sprung", at=origin, axis=e_z),
             "hop": PrismaticJoint(None, "unsprung", at=origin, axis=e_z),

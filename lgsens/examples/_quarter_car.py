@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 from lgsens._validate import require, suggestion
 from lgsens.analysis import Kinematics, kinematics
 from lgsens.examples._hardpoint_file import Reader, read
-from lgsens.examples._point_masses import with_point_masses
 from lgsens.examples._suspension_curves import SuspensionCurves, suspension_curves
 from lgsens.model import (
     ALL_FREE,
@@ -30,6 +29,7 @@ from lgsens.model import (
     TranslationDriver,
     TyreSpring,
     UniversalJoint,
+    lumped,
     static_preload,
 )
 
@@ -278,7 +278,9 @@ def _body(part: Part, points: Sequence[tuple[Array, Array]] = (), free: str | Se
     """A part with point masses, pairs of a mass and a place, fixed to it."""
     mass, inertia, centre = part.mass, part.inertia, part.centre
     if points:
-        mass, inertia, centre = with_point_masses(mass, inertia, centre, points)
+        masses, places = zip((mass, centre), *points)
+        mass, centre, shifted = lumped(jnp.stack(masses), jnp.stack(places))
+        inertia = jnp.diag(inertia) + shifted
     return RigidBody(mass=mass, inertia=inertia, position=centre, free=free)
 
 

@@ -10,14 +10,12 @@ def simple_pendulum(m=1.0, l=1.0, g=9.81) -> Model:
     Arguments:
         m: mass [kg]. l: length of the rod from the origin [m]. g: gravity along −y [m/s²].
 
-    The rod holds the centre of mass, so the body does not turn and its moments of inertia do not matter.
     Source: Library of Computational Benchmark Problems, IFToMM Technical Committee for Multibody Dynamics, A01;
     reference numbers from elliptic functions in `simple_pendulum_A01.json`.
     """
     start = vector(-l, 0.0, 0.0)
-    moment = m * l**2
     return Model(
-        bodies={"mass": RigidBody(mass=m, inertia=(moment, moment, moment), position=start)},
+        bodies={"mass": RigidBody(mass=m, inertia=None, position=start)},
         joints={"rod": DistanceJoint(None, "mass", at_a=vector(0.0, 0.0, 0.0), at_b=start)},
         forces={"gravity": Gravity((0.0, -g, 0.0))},
     )

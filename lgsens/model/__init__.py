@@ -1,6 +1,6 @@
 """Rigid bodies, joints and forces: one implementation of the abstract system (paper, §3 and §9)."""
 
-from lgsens.model._body import RigidBody as RigidBody
+from lgsens.model._body import RigidBody as RigidBody, lumped as lumped
 from lgsens.model._constraints import (
     AbstractClosedFormConstraint as AbstractClosedFormConstraint,
     AbstractConstraint as AbstractConstraint,
@@ -17,6 +17,7 @@ from lgsens.model._drivers import (
     RotationDriver as RotationDriver,
     TranslationDriver as TranslationDriver,
 )
+from lgsens.model._elements import AbstractElement as AbstractElement, body_fixed as body_fixed
 from lgsens.model._forces import (
     AbstractForce as AbstractForce,
     AppliedForce as AppliedForce,
@@ -48,6 +49,7 @@ from lgsens.model._loads import (
     TyreLoad as TyreLoad,
 )
 from lgsens.model._model import Model as Model
+from lgsens.model._on_merged_bodies import carried as carried
 from lgsens.model._roads import BumpRoad as BumpRoad, FlatRoad as FlatRoad, SampledRoad as SampledRoad
 from lgsens.model._rolling import Rolling as Rolling
 from lgsens.model._signals import (

@@ -9,17 +9,16 @@ import jax.numpy as jnp
 
 from lgsens.liegroups import Pose
 from lgsens.model._body import RigidBody
-from lgsens.model._carried import carried_constraint, carried_load
-from lgsens.model._forces import AbstractForce, Gravity
+from lgsens.model._evaluate_by_kind import Row, evaluated, joined, stacked
+from lgsens.model._forces import AbstractForce
 from lgsens.model._frames import Frame, ground_frame
 from lgsens.model._joints import AbstractJoint
-from lgsens.model._loads import SpringDamperLoad
 from lgsens.model._merge import Group, Place, Places, merged
-from lgsens.model._needed import needed
-from lgsens.model._parts import Parts
-from lgsens.model._rows import Row, evaluated, joined, stacked
+from lgsens.model._merged_parts import Parts
+from lgsens.model._on_merged_bodies import carried
 from lgsens.model._stack import Placed, stack
 from lgsens.model._system import MultibodySystem
+from lgsens.model._violable_rows import violable_rows
 
 
 def assemble(
@@ -88,19 +87,21 @@ def _assemble(
     for (name, joint), row in zip(between, evaluated(_constraints, members, kinds)):
         ends = places[joint.a], places[joint.b]
         a, b = (number[end.body] for end in ends)
-        free = [() if end.body is None else moving[end.body].free for end in ends]
+        own = [moving[end.body] for end in ends if end.body is not None]
         single = [jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), of) for of in row.of]
-        for i, (of, kept) in enumerate(zip(row.of, needed(name, joint, single, *free))):
+        for i, (of, kept) in enumerate(zip(row.of, violable_rows(name, joint, single, own))):
             if any(kept):
                 constraints.append(Placed(Row(of, row.index), a, b, name, kept, i))
     loads = []
     for name, force in sorted(forces.items()):
-        # the weights of the parts of a body are a weight at its centre of mass
-        for load, *ends in force.loads(moving if isinstance(force, Gravity) else bodies):
+        for load, *ends in force.loads(moving if force.on_merged else bodies):
             a, b = (places[end] for end in ends)
-            if a.body != b.body or (a.body is not None and not isinstance(load, SpringDamperLoad)):
-                loads.append(Placed(carried_load(load, a.offset, b.offset), number[a.body], number[b.body], name))
-    kinds = [(body.inertia.ndim, body.pivot is None, body.mass.dtype) for body in ordered]
+            if a.body != b.body or (a.body is not None and not load.balanced):
+                loads.append(Placed(carried(load, a.offset, b.offset), number[a.body], number[b.body], name))
+    kinds = [
+        (jnp.shape(body.inertia) if body.inertia is not None else None, body.pivot is None, body.mass.dtype)
+        for body in ordered
+    ]
     inertia, centre = joined(evaluated(_inertia, [(body,) for body in ordered], kinds))
     if moving is not bodies:
         frames = joined([body.frame for body in ordered])
@@ -132,7 +133,7 @@ def _constraints(joint: AbstractJoint, a: Frame | None, b: Frame | None, part_a:
     """The constraints of a joint between its bodies; `part_a`, `part_b`: the poses of merged parts there."""
     ground = ground_frame(next(end.position.dtype for end in (a, b) if end is not None))
     elements = joint.constraints(ground if a is None else a, ground if b is None else b)
-    return tuple(carried_constraint(element, part_a, part_b) for element in elements)
+    return tuple(carried(element, part_a, part_b) for element in elements)
 
 
 def _inertia(body: RigidBody):

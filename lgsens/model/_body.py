@@ -3,13 +3,14 @@
 from collections.abc import Iterable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, require
 from lgsens.model._frames import Frame
-from lgsens.model._free import ALL_FREE, Free, as_free, is_along, places, single_rotation
+from lgsens.model._free import ALL_FREE, ROTATIONS, TRANSLATIONS, Free, as_free, is_along, places, single_rotation
 
 
 class RigidBody(eqx.Module):
@@ -22,7 +23,7 @@ class RigidBody(eqx.Module):
         mass: mass m [kg], shape (), positive.
         inertia: about the centre of mass, body frame [kg m²]: principal moments, shape (3,), or the full
             matrix J, shape (3, 3), symmetric and positive definite. Its principal moments satisfy the
-            triangle inequality.
+            triangle inequality. None: a point mass, which has no rotations.
         position: centre of mass [m], inertial frame, shape (3,).
         orientation: rotation matrix R, body to inertial frame, shape (3, 3).
         velocity: velocity of the centre of mass [m/s], inertial frame, shape (3,).
@@ -30,11 +31,16 @@ class RigidBody(eqx.Module):
         free: the degrees of freedom that the body has, names among "x", "y", "z" (translation of the centre of
             mass along the axes of the inertial frame) and "rx", "ry", "rz" (rotation about the body axes), in a tuple
             or in one string: `free="z"` heaves only, `free="x y rz"` moves in the plane, `free=()` is held. The
-            others are no unknowns, and joints lose the equations that can no longer be violated. Default: all six.
+            others are no unknowns, and joints lose the equations that can no longer be violated. Default: all six, of a
+            point mass the translations.
         pivot: a fixed point about which the body turns [m], inertial frame, shape (3,), for a body with
             rotations only: `free="rx ry rz", pivot=…` is a body on a ball joint, `free="ry", pivot=…` one on
             a hinge. Its velocity is then that of its rotation: leave out `velocity`. None: the body turns about its
             centre of mass.
+
+    What is attached beside the centre of mass of a body without rotations translates with it. Attach joints to a point
+    mass at the point, by a `SphericalJoint` or a `DistanceJoint`; those that hold its orientation against a body that
+    turns raise `ValueError`.
 
     The initial velocities are projected on those that the joints allow (`initial_state`).
 
@@ -43,13 +49,13 @@ class RigidBody(eqx.Module):
     `orientation` are those of a turn about that axis.
 
     Raises `ValueError` for wrong shapes, a mass that is not positive, an inertia that no body can
-    have, an orientation that is not a rotation; an unknown degree of freedom, two rotations (which are no group), one
-    about an axis that is not an inertial one, a pivot with translations, or an initial velocity that is not free.
-    Source: Sonneville & Brüls (2014), §3.2.
+    have, an orientation that is not a rotation; an unknown degree of freedom, a rotation of a point mass, two rotations
+    (which are no group), one about an axis that is not an inertial one, a pivot with translations, or an initial
+    velocity that is not free. Source: Sonneville & Brüls (2014), §3.2.
     """
 
     mass: Float[Array, ""]
-    inertia: Float[Array, "3"] | Float[Array, "3 3"]
+    inertia: Float[Array, "3"] | Float[Array, "3 3"] | None
     position: Float[Array, "3"]
     orientation: Float[Array, "3 3"]
     velocity: Float[Array, "3"]
@@ -66,18 +72,19 @@ class RigidBody(eqx.Module):
         velocity=(0.0, 0.0, 0.0),
         angular_velocity=(0.0, 0.0, 0.0),
         *,
-        free: str | Iterable[str] = ALL_FREE,
+        free: str | Iterable[str] | None = None,
         pivot=None,
     ):
         self.mass = as_float(mass, (), "RigidBody: `mass`")
-        self.inertia = as_float(inertia, None, "RigidBody: `inertia`")
+        self.inertia = None if inertia is None else as_float(inertia, None, "RigidBody: `inertia`")
         self.position = as_float(position, (3,), "RigidBody: `position`")
         self.orientation = as_float(orientation, (3, 3), "RigidBody: `orientation`")
         self.velocity = as_float(velocity, (3,), "RigidBody: `velocity`")
         self.angular_velocity = as_float(angular_velocity, (3,), "RigidBody: `angular_velocity`")
-        self.free = as_free(free, "RigidBody: `free`")
+        all_free = TRANSLATIONS if self.inertia is None else ALL_FREE
+        self.free = all_free if free is None else as_free(free, "RigidBody: `free`")
         self.pivot = None if pivot is None else as_float(pivot, (3,), "RigidBody: `pivot`")
-        if self.inertia.shape not in ((3,), (3, 3)):
+        if self.inertia is not None and self.inertia.shape not in ((3,), (3, 3)):
             raise ValueError(
                 "RigidBody: `inertia` must be three principal moments, shape (3,), or the matrix about the "
                 f"centre of mass, shape (3, 3), got shape {self.inertia.shape}."
@@ -87,13 +94,14 @@ class RigidBody(eqx.Module):
             f"RigidBody: `mass` must be positive, got {self.mass} kg.",
             self.mass,
         )
-        require(
-            _is_physical,
-            f"RigidBody: `inertia` {self.inertia} kg m² is not the inertia of a body: it must be symmetric and "
-            "positive definite, and each principal moment at most the sum of the other two (check units, "
-            "axes and the centre of mass).",
-            self.inertia,
-        )
+        if self.inertia is not None:
+            require(
+                _is_physical,
+                f"RigidBody: `inertia` {self.inertia} kg m² is not the inertia of a body: it must be symmetric and "
+                "positive definite, and each principal moment at most the sum of the other two (check units, "
+                "axes and the centre of mass).",
+                self.inertia,
+            )
         require(
             _is_rotation,
             "RigidBody: `orientation` must be a rotation matrix (RᵀR = I, det R = 1); its columns are the "
@@ -104,6 +112,11 @@ class RigidBody(eqx.Module):
         self._check_free()
 
     def _check_free(self) -> None:
+        if self.inertia is None and {*self.free} & {*ROTATIONS}:
+            raise ValueError(
+                f"RigidBody: a point mass (`inertia` = None) has no rotations, got `free` = {self.free!r}; leave them "
+                "out, or give an `inertia`."
+            )
         axis = single_rotation(self.free)
         if axis is not None:
             name = self.free[-1]
@@ -121,11 +134,12 @@ class RigidBody(eqx.Module):
             )
         if self.free == ALL_FREE:
             return
+        remedy = "free the others too" if self.inertia is not None else "give an `inertia` to what turns"
         rest = "" if self.pivot is None else " (that of the centre of mass follows from the rotation about `pivot`)"
         require(
             lambda given: not np.delete(given, np.asarray(self.coordinates, int)).any(),
             f"RigidBody: `velocity` {self.velocity} and `angular_velocity` {self.angular_velocity} must vanish but for "
-            f"the degrees of freedom `free` = {self.free!r}; free the others too, or leave out their velocity{rest}.",
+            f"the degrees of freedom `free` = {self.free!r}; {remedy}, or leave out their velocity{rest}.",
             jnp.concatenate([self.velocity, self.angular_velocity]),
         )
 
@@ -154,6 +168,8 @@ class RigidBody(eqx.Module):
     @property
     def inertia_matrix(self) -> Float[Array, "3 3"]:
         """J about the centre of mass, body frame [kg m²]; the symmetric part of a full matrix."""
+        if self.inertia is None:
+            return jnp.zeros((3, 3), self.mass.dtype)
         if self.inertia.ndim == 1:
             return jnp.diag(self.inertia)
         return (self.inertia + self.inertia.T) / 2
@@ -164,6 +180,15 @@ class RigidBody(eqx.Module):
         if self.pivot is None:
             return self.inertia_matrix
         return self.inertia_matrix + self.mass * parallel_axis(self.centre)
+
+
+def lumped(
+    masses: Float[Array, " n"], places: Float[Array, "n 3"]
+) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
+    """Point masses as one body: m = Σ m_i, x = Σ m_i x_i/m and, by d_i = x_i − x, J = Σ m_i (|d_i|² I − d_i d_iᵀ)."""
+    mass = jnp.sum(masses)
+    position = masses @ places / mass
+    return mass, position, jnp.sum(masses[:, None, None] * jax.vmap(parallel_axis)(places - position[None]), axis=0)
 
 
 def parallel_axis(arm: Float[Array, "3"]) -> Float[Array, "3 3"]:

@@ -9,12 +9,14 @@ An element holds numbers only (no names): elements of one type are stacked and e
 """
 
 import abc
+from collections.abc import Set
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens.liegroups import cross, skew
+from lgsens.model._elements import AbstractElement, body_fixed
 from lgsens.model._frames import (
     ALL,
     ROTATION_A,
@@ -27,10 +29,11 @@ from lgsens.model._frames import (
     separation_force,
     separation_stiffness,
 )
-from lgsens.model._signals import Prescribed, at_time
+from lgsens.model._free import ROTATIONS, TRANSLATIONS
+from lgsens.model._signals import Prescribed, at_time, number_of
 
 
-class AbstractRows(eqx.Module):
+class AbstractRows(AbstractElement):
     """Equations between the frames of two bodies, of one level."""
 
     @property
@@ -51,9 +54,19 @@ class AbstractRows(eqx.Module):
         return (ALL,)
 
     @property
-    def acts_on(self) -> tuple[int, ...]:
-        """The coordinates 0 … 11 that Φ depends on, all of them or the six rotations: B has no other columns."""
-        return ALL
+    def turning(self) -> bool:
+        """Whether it is about orientations only."""
+        return {*self.acts_on} <= {*TURNING_A, *TURNING_B}
+
+    @property
+    def driven(self) -> Float[Array, ""] | None:
+        """The number that `kinematics` prescribes, a leaf with ∂Φ/∂s = −1; None: there is none."""
+        return None
+
+    def violable(self, free: Set[str]) -> tuple[bool, ...]:
+        """Which of its equations change where its bodies have these degrees of freedom, one rotation at most, and the
+        reference configuration satisfies them all. The others are left out: their rows of B would be zero."""
+        return (True,) * self.num_rows
 
 
 class AbstractConstraint(AbstractRows):
@@ -91,8 +104,8 @@ class AbstractClosedFormConstraint(AbstractConstraint):
 class Coincidence(AbstractClosedFormConstraint):
     """Two body-fixed points coincide: Φ = x_b + R_b X_b − x_a − R_a X_a; λ is the force of b on a [N]."""
 
-    point_a: Float[Array, "3"]
-    point_b: Float[Array, "3"]
+    point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
 
     @property
     def num_rows(self):
@@ -105,6 +118,10 @@ class Coincidence(AbstractClosedFormConstraint):
     @property
     def coupled(self):
         return (TURNING_A, TURNING_B)
+
+    def violable(self, free):
+        # x_b + R_b X_b − x_a − R_a X_a changes along the axis of a rotation by translation only
+        return tuple(TRANSLATIONS[i] in free or bool(free & {*ROTATIONS} - {ROTATIONS[i]}) for i in range(3))
 
     def value(self, a, b, t):
         return b.point(self.point_b) - a.point(self.point_a)
@@ -127,8 +144,8 @@ class Orthogonality(AbstractClosedFormConstraint):
     λ [[ẽ_a (R_aᵀβ)~, −ẽ_a R_aᵀR_b ẽ_b], [−ẽ_b R_bᵀR_a ẽ_a, ẽ_b (R_bᵀα)~]] on the rotations.
     """
 
-    axis_a: Float[Array, "3"]
-    axis_b: Float[Array, "3"]
+    axis_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
+    axis_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
 
     @property
     def num_rows(self):
@@ -145,6 +162,11 @@ class Orthogonality(AbstractClosedFormConstraint):
     @property
     def coupled(self):
         return (self.acts_on,)
+
+    drawn = None
+
+    def violable(self, free):
+        return (bool(free & {*ROTATIONS}),)
 
     def value(self, a, b, t):
         return jnp.sum(a.axis(self.axis_a) * b.axis(self.axis_b))[None]
@@ -182,9 +204,9 @@ class InPlane(AbstractClosedFormConstraint):
     D_q(Bᵀλ) = λ (ẽ_a (R_aᵀd)~ + (∂α)ᵀD + Dᵀ(∂α) + D_q(Dᵀα)|_α), the first term on (δθ_a, δθ_a).
     """
 
-    point_a: Float[Array, "3"]
-    point_b: Float[Array, "3"]
-    axis_a: Float[Array, "3"]
+    point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
+    axis_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
 
     @property
     def num_rows(self):
@@ -193,6 +215,8 @@ class InPlane(AbstractClosedFormConstraint):
     @property
     def relative(self):
         return True
+
+    drawn = None
 
     def value(self, a, b, t):
         return jnp.sum(a.axis(self.axis_a) * (b.point(self.point_b) - a.point(self.point_a)))[None]
@@ -226,8 +250,8 @@ class Distance(AbstractClosedFormConstraint):
     With n = d/|d|: B = nᵀD and D_q(Bᵀλ) = λ (Dᵀ (I − n nᵀ)/|d| D + D_q(Dᵀn)|_n).
     """
 
-    point_a: Float[Array, "3"]
-    point_b: Float[Array, "3"]
+    point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
     length: Prescribed
 
     @property
@@ -237,6 +261,12 @@ class Distance(AbstractClosedFormConstraint):
     @property
     def relative(self):
         return True
+
+    drawn = "link"
+
+    @property
+    def driven(self):
+        return number_of(self.length)
 
     def value(self, a, b, t):
         d = b.point(self.point_b) - a.point(self.point_a)

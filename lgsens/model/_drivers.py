@@ -6,9 +6,10 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import axis_field, point_field
 from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint, InPlane
-from lgsens.model._frames import Frame
+from lgsens.model._elements import body_fixed
+from lgsens.model._frames import TURNING_A, TURNING_B, Frame
 from lgsens.model._joints import AbstractJoint, _normals
-from lgsens.model._signals import Prescribed, at_time, prepared, prescribed_field
+from lgsens.model._signals import Prescribed, at_time, number_of, prepared, prescribed_field
 
 
 class Displacement(AbstractClosedFormConstraint):
@@ -23,6 +24,10 @@ class Displacement(AbstractClosedFormConstraint):
     @property
     def num_rows(self):
         return 1
+
+    @property
+    def driven(self):
+        return number_of(self.prescribed)
 
     def value(self, a, b, t):
         return self.line.value(a, b, t) - at_time(self.prescribed, t)
@@ -48,14 +53,22 @@ class Angle(AbstractConstraint):
     turn, and ∂Φ/∂s = −1.
     """
 
-    first_a: Float[Array, "3"]
-    second_a: Float[Array, "3"]
-    first_b: Float[Array, "3"]
+    first_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
+    second_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
+    first_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
     prescribed: Prescribed
 
     @property
     def num_rows(self):
         return 1
+
+    @property
+    def acts_on(self):
+        return TURNING_A + TURNING_B
+
+    @property
+    def driven(self):
+        return number_of(self.prescribed)
 
     def value(self, a, b, t):
         beta = a.local_axis(b.axis(self.first_b))

@@ -1,8 +1,9 @@
 """Force elements as the user writes them: by the names of bodies, in the reference configuration."""
 
 import abc
+import dataclasses
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -32,12 +33,23 @@ class Attached(NamedTuple):
 
 
 class AbstractForce(eqx.Module):
-    """A force element. One of one's own has leaves for its numbers and these two methods."""
+    """A force element. One of one's own has leaves for its numbers, and `bodies` and `loads`.
+
+    `preload_shape` is that of its `preload`, in which its force is linear, for `static_preload`; None: it has none.
+    `on_merged` says whether its loads on bodies that fixed joints merge are one load on what they are merged to.
+    """
+
+    preload_shape: ClassVar[tuple[int, ...] | None] = None
+    on_merged: ClassVar[bool] = False
 
     @property
     @abc.abstractmethod
     def bodies(self) -> tuple[str | None, ...]:
         """The bodies that it names; None is the ground."""
+
+    def with_preload(self, preload) -> "AbstractForce":
+        """The same element with this preload in the reference configuration."""
+        return dataclasses.replace(self, preload=preload)
 
     @abc.abstractmethod
     def loads(self, bodies: Mapping[str, RigidBody]) -> tuple[Attached, ...]:
@@ -73,6 +85,8 @@ class Gravity(AbstractForce):
     @property
     def bodies(self):
         return ()
+
+    on_merged = True  # the weights of the parts of a body are a weight at its centre of mass
 
     def loads(self, bodies):
         return tuple(Attached(self._weight(body), None, name) for name, body in bodies.items())
@@ -121,6 +135,11 @@ class SpringDamper(AbstractForce):
     def bodies(self):
         return (self.a, self.b)
 
+    preload_shape = ()
+
+    def with_preload(self, preload):
+        return dataclasses.replace(self, preload=preload, free_length=None)
+
     def loads(self, bodies):
         dtype = self.stiffness.dtype
         free_length = _distance(self.at_a, self.at_b) if self.free_length is None else self.free_length
@@ -162,6 +181,8 @@ class Bushing(AbstractForce):
     @property
     def bodies(self):
         return (self.a, self.b)
+
+    preload_shape = (3,)
 
     def loads(self, bodies):
         a, b = (_frame(bodies, name, self.at.dtype) for name in (self.a, self.b))
@@ -210,6 +231,11 @@ class TyreSpring(AbstractForce):
     @property
     def bodies(self):
         return (self.body,)
+
+    preload_shape = ()
+
+    def with_preload(self, preload):
+        return dataclasses.replace(self, preload=preload, free_radius=None)
 
     def loads(self, bodies):
         load = TyreLoad(

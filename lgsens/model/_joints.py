@@ -6,6 +6,8 @@ respect to `at` is the gradient with respect to geometry. Reference: Haug (1989)
 """
 
 import abc
+from collections.abc import Sequence, Set
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -23,6 +25,7 @@ from lgsens.model._constraints import (
     Orthogonality,
 )
 from lgsens.model._frames import Frame
+from lgsens.model._free import single_rotation
 from lgsens.model._signals import Prescribed, prepared, prescribed_field
 
 
@@ -54,16 +57,30 @@ def _in_plane(a: Frame, b: Frame, at, axis) -> InPlane:
 class AbstractJoint(eqx.Module):
     """A joint between bodies `a` and `b`; None is the ground.
 
-    A joint of one's own has these two names, leaves for its numbers, and `constraints`.
+    A joint of one's own has these two names, leaves for its numbers, and `constraints`. It is `assembled` if the
+    reference configuration satisfies it by construction; others are assembled before the motion starts. It is `rigid`
+    if its bodies move as one, which `Model(merge_fixed=True)` makes of them.
     """
 
     a: eqx.AbstractVar[str | None]
     b: eqx.AbstractVar[str | None]
+    assembled: ClassVar[Any] = False
+    rigid: ClassVar[bool] = False
 
     @property
-    @abc.abstractmethod
-    def assembled(self) -> bool:
-        """Whether the reference configuration satisfies the joint by construction."""
+    def hinge(self) -> Float[Array, "3"] | None:
+        """The axis about which its bodies turn in each other, inertial frame, if about no other; None: it says nothing.
+        Of bodies with one rotation it must be that of the rotation."""
+        return None
+
+    def violable(self, constraints: Sequence[AbstractRows], free: Set[str]) -> Sequence[tuple[bool, ...]]:
+        """Which equations of each of its constraints its bodies could violate, as in `AbstractConstraint.violable`."""
+        return [constraint.violable(free) for constraint in constraints]
+
+    def violable_about(self, name: str, free: Set[str], axis: int) -> Sequence[tuple[bool, ...]] | None:
+        """The same where its bodies turn about one inertial axis (0, 1, 2) and the joint, `name` in messages, knows
+        more than its constraints; None: it does not."""
+        return None
 
     @abc.abstractmethod
     def constraints(self, a: Frame, b: Frame) -> tuple[AbstractRows, ...]:
@@ -85,9 +102,7 @@ class SphericalJoint(AbstractJoint):
     b: str | None = eqx.field(static=True)
     at: Float[Array, "3"] = point_field("at")
 
-    @property
-    def assembled(self):
-        return True
+    assembled = True
 
     def constraints(self, a, b):
         return (_coincidence(a, b, self.at),)
@@ -109,9 +124,14 @@ class RevoluteJoint(AbstractJoint):
     at: Float[Array, "3"] = point_field("at")
     axis: Float[Array, "3"] = axis_field("axis")
 
+    assembled = True
+
     @property
-    def assembled(self):
-        return True
+    def hinge(self):
+        return self.axis
+
+    def violable(self, constraints, free):
+        return constraints[0].violable(free), (False,), (False,)  # the one rotation is about the hinge
 
     def constraints(self, a, b):
         unit, first, second = _normals(self.axis)
@@ -150,9 +170,7 @@ class UniversalJoint(AbstractJoint):
             self.axis_b,
         )
 
-    @property
-    def assembled(self):
-        return True
+    assembled = True
 
     def constraints(self, a, b):
         arm_a = self.axis_a / jnp.linalg.norm(self.axis_a)
@@ -177,9 +195,7 @@ class PrismaticJoint(AbstractJoint):
     at: Float[Array, "3"] = point_field("at")
     axis: Float[Array, "3"] = axis_field("axis")
 
-    @property
-    def assembled(self):
-        return True
+    assembled = True
 
     def constraints(self, a, b):
         unit, first, second = _normals(self.axis)
@@ -206,9 +222,7 @@ class CylindricalJoint(AbstractJoint):
     at: Float[Array, "3"] = point_field("at")
     axis: Float[Array, "3"] = axis_field("axis")
 
-    @property
-    def assembled(self):
-        return True
+    assembled = True
 
     def constraints(self, a, b):
         unit, first, second = _normals(self.axis)
@@ -235,9 +249,13 @@ class FixedJoint(AbstractJoint):
     b: str | None = eqx.field(static=True)
     at: Float[Array, "3"] = point_field("at")
 
-    @property
-    def assembled(self):
-        return True
+    assembled = True
+    rigid = True
+
+    def violable(self, constraints, free):
+        # of the orthogonalities x·y, y·z, z·x only that of the two axes other than that of the one rotation changes
+        axis = single_rotation(free)
+        return constraints[0].violable(free), *(((i + 2) % 3 == axis,) for i in range(3))
 
     def constraints(self, a, b):
         eye = jnp.eye(3, dtype=self.at.dtype)

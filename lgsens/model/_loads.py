@@ -6,15 +6,15 @@ f(q, v, t) of eq. (16) is −Q, and K_t, C_t receive −∂Q/∂q, −∂Q/∂v.
 """
 
 import abc
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens.liegroups import cross, skew
+from lgsens.model._elements import AbstractElement, body_fixed
 from lgsens.model._frames import (
-    ALL,
     BODY_B,
     ROTATION,
     ROTATION_A,
@@ -37,17 +37,22 @@ class LoadTangents(NamedTuple):
     velocity: Float[Array, "12 12"] | None
 
 
-class AbstractLoad(eqx.Module):
-    """A force between the frames of two bodies; its tangents come from autodiff."""
+class AbstractLoad(AbstractElement):
+    """A force between the frames of two bodies; its tangents come from autodiff.
 
-    @property
-    def acts_on(self) -> tuple[int, ...]:
-        """The entries 0 … 11 of Q that may be other than zero: no others are added to the residual."""
-        return ALL
+    `balanced` says whether action equals reaction, so that it does nothing between two parts of one body.
+    """
+
+    balanced: ClassVar[bool] = False
+    drawn = "spring"
 
     @abc.abstractmethod
     def force(self, a: Frame, b: Frame, va, vb, t) -> Float[Array, "12"]:
         """Q at the given poses, velocities [ẋ, Ω] of shape (6,) each, and time [s]."""
+
+    def measure(self, a: Frame, b: Frame, va, vb, t) -> Any:
+        """What `Trajectory.force` shows of it."""
+        return self.force(a, b, va, vb, t)
 
 
 class AbstractClosedFormLoad(AbstractLoad):
@@ -97,12 +102,18 @@ class SpringDamperLoad(AbstractClosedFormLoad):
     with k d all the same, so F/|d| is continued by k: f = (F/|d|) d has the tangent k D at d = 0 and not zero.
     """
 
-    point_a: Float[Array, "3"]
-    point_b: Float[Array, "3"]
+    point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
     stiffness: Float[Array, ""]
     damping: Float[Array, ""]
     free_length: Float[Array, ""]
     preload: Float[Array, ""]
+
+    balanced = True
+
+    @property
+    def drawn(self):
+        return "spring" if float(self.stiffness) > 0 else "damper"
 
     def _line(self, a, b):
         """n, |d|, and |d| or 1 to divide by."""
@@ -167,11 +178,14 @@ class BushingLoad(AbstractClosedFormLoad):
         ∂Q/∂q = −Uᵀ (K U + C ∂u̇/∂q) − D_q(Uᵀ g),     ∂Q/∂v = −Uᵀ C U.
     """
 
-    point_a: Float[Array, "3"]
-    point_b: Float[Array, "3"]
-    stiffness: Float[Array, "3 3"]
-    damping: Float[Array, "3 3"]
-    preload: Float[Array, "3"]
+    point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
+    stiffness: Float[Array, "3 3"] = eqx.field(metadata=body_fixed("tensor", "a"))
+    damping: Float[Array, "3 3"] = eqx.field(metadata=body_fixed("tensor", "a"))
+    preload: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
+
+    balanced = True
+    drawn = "joint"
 
     def _gradient(self, a, b):
         """r and U."""
@@ -218,11 +232,13 @@ class TyreLoad(AbstractClosedFormLoad):
     ∂Q/∂q = −k D_bᵀ e_z e_zᵀ D_b + D_q(Dᵀ f)|_{f = F_z e_z}.
     """
 
-    point_b: Float[Array, "3"]
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
     stiffness: Float[Array, ""]
     free_radius: Float[Array, ""]
     preload: Float[Array, ""]
     road: AbstractSignal
+
+    drawn = "wheel"
 
     def measure(self, a, b, va, vb, t) -> Float[Array, ""]:
         return self.preload + self.stiffness * (self.road(t) + self.free_radius - b.point(self.point_b)[2])
@@ -247,9 +263,9 @@ class PointForce(AbstractClosedFormLoad):
     Q_b = s [f, X̃ R^T f + m];  ∂Q/∂q = s D_q(Dᵀ f).
     """
 
-    point_b: Float[Array, "3"]
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
     vector: Float[Array, "3"]
-    moment: Float[Array, "3"]
+    moment: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
     signal: AbstractSignal
 
     def force(self, a, b, va, vb, t):

@@ -18,14 +18,13 @@ two steps: orthogonal in the metric of kinetic energy, first on the fixed joints
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens.model._body import RigidBody, parallel_axis
+from lgsens.model._body import RigidBody, lumped, parallel_axis
 from lgsens.model._frames import Frame, ground_frame
 from lgsens.model._free import ALL_FREE, ROTATIONS, TRANSLATIONS, Free, single_rotation
-from lgsens.model._joints import AbstractJoint, FixedJoint
+from lgsens.model._joints import AbstractJoint
 
 
 class Group(NamedTuple):
@@ -76,7 +75,7 @@ def groups(bodies: Mapping[str, RigidBody], joints: Mapping[str, AbstractJoint])
     held = {None} | {name for name, body in bodies.items() if not body.free}
     for name in held:
         join(None, name)
-    fixed = sorted(name for name, joint in joints.items() if isinstance(joint, FixedJoint))
+    fixed = sorted(name for name, joint in joints.items() if joint.rigid)
     for name in [*fixed, *sorted(set(joints) - set(fixed))]:
         joint = joints[name]
         if find(joint.a) != find(joint.b):
@@ -161,11 +160,9 @@ def _as_one(group: Group, bodies: Mapping[str, RigidBody]) -> RigidBody:
     spins, momenta = of_parts(lambda p: p.angular_velocity), masses[:, None] * of_parts(_velocity)
     axes, turns = lead.orientation, lead.orientation.T[None] @ of_parts(lambda p: p.orientation)
 
-    mass = jnp.sum(masses)
-    position = masses @ centres / mass
+    mass, position, shifted = lumped(masses, centres)
     arms = (centres - position[None]) @ axes
-    shifted = jnp.sum(masses[:, None, None] * jax.vmap(parallel_axis)(arms), axis=0)
-    inertia = jnp.einsum("pij,pjk,plk->il", turns, own, turns) + shifted
+    inertia = jnp.einsum("pij,pjk,plk->il", turns, own, turns) + axes.T @ shifted @ axes
 
     pivot = lead.frame.position if group.turns else None
     to_centre = jnp.zeros_like(position) if pivot is None else (position - pivot) @ axes
@@ -174,7 +171,9 @@ def _as_one(group: Group, bodies: Mapping[str, RigidBody]) -> RigidBody:
     spin = _spin(inertia + mass * parallel_axis(to_centre), momentum, group.free)
     moves = jnp.asarray([name in group.free for name in TRANSLATIONS])
     velocity = jnp.where(moves, jnp.sum(momenta, axis=0) / mass, 0.0)
-    return RigidBody(mass, inertia, position, axes, velocity, spin, free=group.free, pivot=pivot)
+    points = all(part.inertia is None for part in parts)  # they translate
+    whole = None if points else inertia
+    return RigidBody(mass, whole, position, axes, velocity, spin, free=group.free, pivot=pivot)
 
 
 def _velocity(part: RigidBody) -> Float[Array, "3"]:

@@ -14,11 +14,11 @@ from lgsens.liegroups import nearest_rotation
 from lgsens.linear import AbstractLinearSolver
 from lgsens.model._assemble import assemble, assemble_merged
 from lgsens.model._body import RigidBody
+from lgsens.model._evaluate_by_kind import stacked
 from lgsens.model._forces import AbstractForce
 from lgsens.model._frames import Frame
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._merge import Group, groups
-from lgsens.model._rows import stacked
 from lgsens.model._summary import Summary, summarize
 from lgsens.model._system import MultibodySystem
 

@@ -27,6 +27,7 @@ from lgsens._validate import as_float, require
 from lgsens.liegroups import cross
 from lgsens.model._constraints import AbstractConstraint, AbstractVelocityConstraint
 from lgsens.model._frames import ROTATION, Frame
+from lgsens.model._free import ROTATIONS, TRANSLATIONS, is_along
 from lgsens.model._joints import AbstractJoint
 
 
@@ -55,9 +56,11 @@ class ContactHeight(AbstractConstraint):
     def num_rows(self):
         return 1
 
-    @property
-    def point_b(self):
-        return self.contact.point_b
+    drawn = None
+
+    def fixed(self, kind, bodies="ab"):
+        points = {"a": self.contact.point_a, "b": self.contact.point_b}
+        return [points[body] for body in bodies] if kind == "point" else []
 
     def value(self, a, b, t):
         at = self.contact
@@ -70,6 +73,7 @@ class Slip(AbstractVelocityConstraint):
     """The lowest point of a disc does not slip, f·w = 0 and l·w = 0; λ is the force of b on a along f and l [N]."""
 
     contact: _Contact
+    drawn = None
 
     @property
     def num_rows(self):
@@ -141,3 +145,22 @@ class Rolling(AbstractJoint):
         ends = a.local_point(point), a.local_axis(n), b.local_point(self.at), b.local_axis(e)
         contact = _Contact(*ends, self.radius)
         return ContactHeight(contact), Slip(contact)
+
+    def violable_about(self, name, free, axis):
+        """Of a wheel that turns about one inertial axis: its height; forward and sideways."""
+        require(
+            lambda axle: is_along(axle, axis),
+            f"Joint {name!r}: `axis` {self.axis} must be that of {ROTATIONS[axis]!r}, the only rotation that "
+            f"{self.b!r} has; turn the axle, or free all rotations.",
+            self.axis,
+        )
+        line = [i for i, translation in enumerate(TRANSLATIONS) if i != axis and translation in free]
+        lifts = len(line) > 1 or not self.assembled
+        if not lifts and line:
+            require(
+                lambda normal: is_along(normal, 3 - axis - line[0]),
+                f"Joint {name!r}: {self.b!r} moves along {TRANSLATIONS[line[0]]!r} only, out of the plane with the "
+                f"`normal` {self.normal}; free another translation.",
+                self.normal,
+            )
+        return [(lifts,), (True, TRANSLATIONS[axis] in free)]

@@ -209,6 +209,11 @@ def at_time(value: Prescribed, t) -> Float[Array, ""]:
     return value(t) if isinstance(value, AbstractSignal) else value
 
 
+def number_of(value: Prescribed) -> Float[Array, ""] | None:
+    """A number; None: a signal."""
+    return None if isinstance(value, AbstractSignal) else value
+
+
 def prescribed_field(name: str) -> Any:
     """A keyword-only scalar leaf or signal of an element, None by default."""
 

@@ -21,9 +21,9 @@ from lgsens.model._constraints import (
     AbstractRows,
     AbstractVelocityConstraint,
 )
+from lgsens.model._evaluate_by_kind import Row, joined
 from lgsens.model._frames import ALL, BODY_A, BODY_B, TURNING_A, TURNING_B, Frame, ground_frame
 from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, LoadTangents
-from lgsens.model._rows import Row, joined
 from lgsens.model._topology import Ends
 
 Element = TypeVar("Element", AbstractRows, AbstractLoad)

@@ -16,7 +16,7 @@ from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, cho
 from lgsens.model._constraints import AbstractRows
 from lgsens.model._frames import BODY_DIM, ROTATION
 from lgsens.model._loads import AbstractLoad
-from lgsens.model._parts import Parts
+from lgsens.model._merged_parts import Parts
 from lgsens.model._stack import (
     Stack,
     at_ends,
@@ -202,8 +202,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         # The scene's length: the extent of the centres of mass, or the largest arm of an attachment.
         extents = [jnp.ptp(self.pose.position, axis=0)]
         for stack in (*self.constraints, *self.loads):
-            arms = (getattr(stack.elements, name, None) for name in ("point_a", "point_b"))
-            extents += [jnp.abs(arm).max(axis=0) for arm in arms if arm is not None]
+            extents += [jnp.abs(arm).max(axis=0) for arm in stack.elements.fixed("point")]
         length = jnp.max(jnp.stack(extents))
         body = jnp.ones(BODY_DIM, length.dtype)
         scale = body.at[: ROTATION.start].set(jnp.where(length > 0, length, 1.0))
@@ -329,10 +328,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         return Tangents(self._square(stiffness), self._square(damping), self.sparse_constraint_jacobian(q, t))
 
     def measure(self, force: str, q, v, t):
-        """What the force element `force` measures at each of the stacked poses, velocities and times.
-
-        The `measure` of its load if it has one, else its generalized force.
-        """
+        """The `measure` of the load of the force element `force` at each of the stacked poses, velocities and times."""
         found = [stack.only(i) for stack in self.loads for i, owner in enumerate(stack.owners) if owner == force]
         if not found:
             known = {owner for stack in self.loads for owner in stack.owners}
@@ -341,8 +337,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             raise ValueError(f"`force`: {force!r} acts on {len(found)} bodies and has no single value.")
 
         def at_time(q, v, t):
-            evaluate = lambda e, *args: getattr(e, "measure", e.force)(*args)
             (ends,) = at_ends(found, self._placed(q), self.twists(v))
-            return found[0].map(evaluate, ends, (t,))
+            return found[0].map(lambda e, *args: e.measure(*args), ends, (t,))
 
         return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(at_time)(q, v, t))

@@ -12,9 +12,9 @@ import numpy as np
 
 from lgsens._validate import as_count
 from lgsens.analysis import Kinematics
-from lgsens.model import Angle, MultibodySystem
+from lgsens.model import MultibodySystem
 from lgsens.plotting._mechanism import VIEW, draw, frame
-from lgsens.plotting._shapes import Mark, Shapes, placed, shapes, stretched
+from lgsens.plotting._shapes import Shapes, placed, shapes, stretched
 from lgsens.plotting._style import ROAD, ROLES, figure
 from lgsens.simulation import Trajectory
 
@@ -115,7 +115,7 @@ def film(motion: Trajectory | Kinematics, speed: float, max_frames: int) -> Film
         (label, values), *_ = motion.values.items()
         values = np.asarray(values)
         clock = np.linspace(0.0, SWEEP, len(values)) / speed
-        turns = any(isinstance(stack.elements, Angle) and label in stack.owners for stack in system.constraints)
+        turns = all(stack.elements.turning for stack in system.constraints if label in stack.owners)
         unit = "rad" if turns else "m"
     else:
         label, unit, values = "t", "s", np.asarray(motion.t)
@@ -168,7 +168,7 @@ def page(film: Film, title: str, points: np.ndarray, view: tuple[float, float]) 
     radius = float(np.linalg.norm(high - low) / 2) or 1.0
     digits = max(0, 6 - int(np.floor(np.log10(radius))))
     rounded = lambda array, digits=digits: np.round(np.asarray(array, float), digits).tolist()
-    outline = lambda o: o._asdict() | {"points": rounded(o.points)}
+    plain = lambda shape: {k: rounded(v) if isinstance(v, np.ndarray) else v for k, v in shape._asdict().items()}
     data = {
         "label": film.label,
         "unit": film.unit,
@@ -181,21 +181,15 @@ def page(film: Film, title: str, points: np.ndarray, view: tuple[float, float]) 
         "colours": ROLES | {"road": ROAD},
         "position": rounded(film.position),
         "orientation": rounded(film.orientation.reshape(*film.orientation.shape[:2], 9), 6),
-        "outlines": [outline(o) for o in film.shapes.outlines],
-        "struts": [s._asdict() | {"at_a": rounded(s.at_a), "at_b": rounded(s.at_b)} for s in film.shapes.struts],
-        "joints": [_mark(mark, rounded) for mark in film.shapes.joints],
-        "tyres": [
-            _mark(tyre.centre, rounded) | {"road": rounded(film.road[:, i])} for i, tyre in enumerate(film.shapes.tyres)
-        ],
+        "outlines": [plain(outline) for outline in film.shapes.outlines],
+        "struts": [plain(strut) for strut in film.shapes.struts],
+        "joints": [plain(mark) for mark in film.shapes.joints],
+        "tyres": [plain(tyre.centre) | {"road": rounded(film.road[:, i])} for i, tyre in enumerate(film.shapes.tyres)],
     }
     # "</" would end the script element that holds the data.
     text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("</", "<\\/")
     template = (resources.files("lgsens.plotting") / "player.html").read_text(encoding="utf-8")
     return template.replace("__TITLE__", html.escape(title or "lgsens")).replace("__DATA__", text)
-
-
-def _mark(mark: Mark, rounded) -> dict[str, Any]:
-    return {"body": mark.body, "at": rounded(mark.at)}
 
 
 def _writer(path: Path, clock: np.ndarray) -> Any:

@@ -43,7 +43,7 @@ def errors(panels: Sequence[ErrorPanel], title: str = "") -> "Figure":
     """
     rows = 1 if len(panels) < 4 else 2
     columns = -(-len(panels) // rows)
-    fig = figure(1.6 + 4.6 * columns, 1.0 + 4.2 * rows)
+    fig = figure(1.6 + 4.6 * columns, 1.0 + 4.2 * rows, title)
     all_axes = fig.subplots(rows, columns, squeeze=False).ravel()
     for axes in all_axes[len(panels) :]:
         axes.remove()
@@ -60,8 +60,6 @@ def errors(panels: Sequence[ErrorPanel], title: str = "") -> "Figure":
             _slope(axes, panel, panel.order)
     style = {"ncols": -(-len(names) // 2) if len(names) > 3 else len(names), "frameon": False, "handlelength": 3.5}
     fig.legend(handles=list(handles.values()), loc="outside lower center", **style)
-    if title:
-        fig.suptitle(title)
     return fig
 
 
@@ -168,7 +166,7 @@ def work_precision_panels(
     A curve connects the settings of a method of which no other is both cheaper and better; the others are pale. Raises
     `ValueError` for costs that are not positive, `ImportError` without matplotlib.
     """
-    fig = figure(1.6 + 4.8 * len(panels), 5.6)
+    fig = figure(1.6 + 4.8 * len(panels), 5.6, title)
     all_axes = fig.subplots(1, len(panels), squeeze=False, sharey=True).ravel()
     names = list(dict.fromkeys(name for methods in panels.values() for name in methods))
     handles: dict[str, Any] = {}
@@ -190,8 +188,6 @@ def work_precision_panels(
         plain(axes)
     style = {"ncols": 2 if len(names) > 3 else max(len(names), 1), "frameon": False, "handlelength": 3.5}
     fig.legend(handles=list(handles.values()), loc="outside lower center", **style)
-    if title:
-        fig.suptitle(title)
     return fig
 
 

@@ -35,7 +35,7 @@ def time_histories(t, panels: Sequence[Panel], title: str = "") -> "Figure":
 
     Raises `ImportError` without matplotlib.
     """
-    fig = figure(8.0, 1.2 + 2.3 * len(panels))
+    fig = figure(8.0, 1.2 + 2.3 * len(panels), title)
     all_axes = fig.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     t = np.asarray(t)
     for axes, panel in zip(all_axes, panels):
@@ -61,8 +61,6 @@ def time_histories(t, panels: Sequence[Panel], title: str = "") -> "Figure":
     all_axes[-1].set_xlabel("time [s]")
     handles, labels = all_axes[0].get_legend_handles_labels()
     all_axes[0].legend(handles, labels, frameon=False, ncols=len(labels), loc="upper right")
-    if title:
-        fig.suptitle(title)
     return fig
 
 

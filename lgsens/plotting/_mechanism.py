@@ -29,7 +29,7 @@ def mechanism(models: Mapping[str, Model], title: str = "", view: tuple[float, f
 
     Raises `ImportError` without matplotlib.
     """
-    fig = figure(8.0, 7.0)
+    fig = figure(8.0, 7.0, title)
     axes: Any = fig.add_subplot(projection="3d")
     points, handles = [], []
     for name, model in models.items():
@@ -49,8 +49,6 @@ def mechanism(models: Mapping[str, Model], title: str = "", view: tuple[float, f
     frame(axes, np.concatenate(points), view)
     if handles:
         axes.legend(handles=handles, frameon=False, loc="upper center", ncols=len(handles), columnspacing=1.2)
-    if title:
-        fig.suptitle(title)
     return fig
 
 

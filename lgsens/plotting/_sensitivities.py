@@ -69,9 +69,9 @@ def sensitivities(
     by_body = {"w": np.asarray(system.twists(w)), "v": np.asarray(system.twists(change.v))}
     t = np.asarray(trajectory.t)
 
-    fig = figure(13.0, 0.8 + 2.3 * rows)
-    grid: Any = fig.subplots(rows, COLUMNS, sharex=True, squeeze=False)
     per = parameter.partition(" [")
+    fig = figure(13.0, 0.8 + 2.3 * rows, title or f"Sensitivities with respect to {per[0]}")
+    grid: Any = fig.subplots(rows, COLUMNS, sharex=True, squeeze=False)
     unit = f" per {per[2].rstrip(']')}" if per[2] else ""
 
     def panel(axes, name: str, label: str, values, names) -> None:
@@ -99,5 +99,4 @@ def sensitivities(
         for axes in [axes for axes in column if axes.figure is not None][-1:]:  # the lowest, if there is one
             axes.set_xlabel("time [s]")
             axes.tick_params(labelbottom=True)
-    fig.suptitle(title or f"Sensitivities with respect to {per[0]}")
     return fig

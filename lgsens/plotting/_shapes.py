@@ -1,8 +1,9 @@
 """What a mechanism looks like, in the frames of its bodies: the one description that figures and animations draw.
 
-A body is drawn from the points at which joints hold it: two make a bar, more a solid. With one point (a pendulum, a
-top) it is a bar to the centre of mass and a box, with none a box: the homogeneous cuboid of its mass and inertia. A
-body with a tyre is a wheel. Springs are coils, dampers tubes with a rod, massless rods lines.
+Elements say what they are drawn as, and where (`AbstractElement`). A body is drawn from the points at which joints
+hold it: two make a bar, more a solid. With one point (a pendulum, a top) it is a bar to the centre of mass and a box,
+with none a box: the homogeneous cuboid of its mass and inertia, of a point mass a small cube. A body with a tyre is a
+wheel. Springs are coils, dampers tubes with a rod, massless rods lines.
 """
 
 from typing import Any, NamedTuple
@@ -10,10 +11,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from lgsens.model import Coincidence, Distance, MultibodySystem, Orthogonality, SpringDamperLoad, TyreLoad
+from lgsens.model import MultibodySystem
 
 GROUND = -1
 _TURNS, _RADIUS = 6, 0.12  # of a coil; the radius as a fraction of its length in the reference configuration
+_POINT = 0.06  # side of the cube that stands for a point mass, as a fraction of the length of the scene
 
 
 class Outline(NamedTuple):
@@ -63,37 +65,31 @@ def shapes(system: MultibodySystem) -> Shapes:
     """The shapes of a system with concrete numbers."""
     position, orientation = (np.asarray(array) for array in system.pose)
     held: list[list[np.ndarray]] = [[] for _ in system.body_names]
-    struts, joints, axes = [], [], {}
-    for stack in system.constraints:
+    struts, joints, tyres, axes = [], [], [], {}
+    for stack in (*system.constraints, *system.loads):
         for i, owner in enumerate(stack.owners):
-            element, (a, b) = _element(stack, i)
-            if isinstance(element, Coincidence | Distance):
-                for body, at in ((a, element.point_a), (b, element.point_b)):
-                    if body != GROUND:
-                        held[body].append(np.asarray(at))
-            if isinstance(element, Coincidence):
-                joints.append(Mark(a, np.asarray(element.point_a)))
-            elif isinstance(element, Distance):
-                struts.append(Strut("link", a, np.asarray(element.point_a), b, np.asarray(element.point_b), 0.0))
-                joints += [Mark(a, np.asarray(element.point_a)), Mark(b, np.asarray(element.point_b))]
-            elif isinstance(element, Orthogonality):
-                axes.setdefault(owner, []).append((a, b, np.asarray(element.axis_b)))
+            element: Any = jax.tree.map(lambda leaf, i=i: leaf[i], stack.elements)
+            ends = {"a": GROUND if stack.a is None else stack.a[i], "b": GROUND if stack.b is None else stack.b[i]}
+            marks = [Mark(ends[end], np.asarray(at)) for end in ends for at in element.fixed("point", end)]
+            role = element.drawn if marks else None
+            if not marks and element.fixed("axis", "b"):
+                axes.setdefault(owner, []).append((*ends.values(), np.asarray(element.fixed("axis", "b")[0])))
+            if role in ("joint", "link"):
+                joints += marks[:1] if role == "joint" else marks
+                for mark in marks:
+                    if mark.body != GROUND:
+                        held[mark.body].append(mark.at)
+            if role in ("link", "spring", "damper") and len(marks) > 1:
+                (a, at_a), (b, at_b) = marks[0], marks[-1]
+                line = _world(position, orientation, b, at_b) - _world(position, orientation, a, at_a)
+                struts.append(Strut(role, a, at_a, b, at_b, _RADIUS * float(np.linalg.norm(line))))
+            if role == "wheel":
+                tyres.append(Tyre(marks[-1], element.road))
     if system.centre is not None:  # a body with a pivot has it in place of a joint
         for body, (own, centre) in enumerate(zip(held, np.asarray(system.centre))):
             if centre.any():
                 own.append(np.zeros(3))
                 joints.append(Mark(body, np.zeros(3)))
-    tyres = []
-    for stack in system.loads:
-        for i in range(len(stack.owners)):
-            load, (a, b) = _element(stack, i)
-            if isinstance(load, TyreLoad):
-                tyres.append(Tyre(Mark(b, np.asarray(load.point_b)), load.road))
-            elif isinstance(load, SpringDamperLoad):
-                role = "spring" if float(load.stiffness) > 0 else "damper"
-                at_a, at_b = np.asarray(load.point_a), np.asarray(load.point_b)
-                line = _world(position, orientation, b, at_b) - _world(position, orientation, a, at_a)
-                struts.append(Strut(role, a, at_a, b, at_b, _RADIUS * float(np.linalg.norm(line))))
     wheels = {tyre.centre.body: tyre.centre.at for tyre in tyres}
     outlines = []
     for body, points in enumerate(held):
@@ -103,12 +99,6 @@ def shapes(system: MultibodySystem) -> Shapes:
         else:
             outlines += _solid(system, body, _distinct(points))
     return Shapes(outlines, struts, joints, tyres)
-
-
-def _element(stack, i: int) -> tuple[Any, tuple[int, int]]:
-    """The i-th element of a stack, and the numbers of its two bodies."""
-    a, b = (GROUND if side is None else side[i] for side in (stack.a, stack.b))
-    return jax.tree.map(lambda leaf: leaf[i], stack.elements), (a, b)
 
 
 def _world(position, orientation, body: int, at) -> np.ndarray:
@@ -171,6 +161,8 @@ def _box(system: MultibodySystem, body: int, centre: np.ndarray) -> list[np.ndar
     mass, inertia = float(system.mass[body]), np.asarray(system.inertia[body])
     inertia = inertia - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))  # about the centre of mass
     moments, axes = np.linalg.eigh(inertia)
+    if not inertia.any():  # a point mass: a cube
+        moments = np.full(3, mass / 6 * (_POINT * float(np.max(system.coordinate_scale()))) ** 2)
     half = np.sqrt(np.maximum(6 * (moments.sum() - 2 * moments) / mass, 0.0)) / 2
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half @ axes.T + centre
     faces = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))

@@ -25,13 +25,15 @@ NOTEBOOK_DPI = 80
 ROLES = {"link": "#1b62a5", "body": "#3a8a4d", "wheel": "#3c3c3c", "spring": "#d9822b", "damper": "#7a4b9a"}
 
 
-def figure(width: float = 7.0, height: float = 4.5) -> "Figure":
-    """An empty figure of this size [inch]. Raises `ImportError` that says what to install, if need be."""
+def figure(width: float = 7.0, height: float = 4.5, title: str = "") -> "Figure":
+    """An empty figure of this size [inch] with a title. Raises `ImportError` that says what to install, if need be."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise ImportError('Figures need matplotlib: pip install "lgsens[plot]"') from error
     fig = Figure(figsize=(width, height), layout="constrained")
+    if title:
+        fig.suptitle(title)
     # In a notebook matplotlib shows the figures of pyplot only; others show themselves if they have this method.
     vars(fig)["_repr_png_"] = functools.partial(_png, fig)
     return fig

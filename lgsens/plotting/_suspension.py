@@ -41,7 +41,7 @@ def suspension_curves(
     for name in bounds or ():
         if name not in members:
             raise ValueError(f"`bounds`: {name!r} is not one of {members}.")
-    fig = figure(11.0, 6.6)
+    fig = figure(11.0, 6.6, title)
     all_axes = fig.subplots(2, 3, sharex=True)
     colours = COLOURS if len(curves) > 1 else COLOURS[1:]
     for axes, (panel, factor, label, member) in zip(all_axes.ravel(), PANELS):
@@ -53,7 +53,7 @@ def suspension_curves(
         if bounds and member in bounds:
             travel, *ends = (np.asarray(array) for array in bounds[member])
             for end in ends:
-                axes.plot(1e3 * travel, factor * end, color=LIMIT, linestyle=(0, (5, 3)), linewidth=1.2, label="bound")
+                axes.plot(1e3 * travel, factor * end, color=LIMIT, linestyle=(0, (5, 3)), linewidth=1.2)
         plain(axes)
         axes.axvline(0.0, color="#bcbcbc", linewidth=0.8)
         axes.set(title=panel, ylabel=label)
@@ -61,13 +61,5 @@ def suspension_curves(
     for axes in all_axes[-1]:
         axes.set_xlabel("wheel travel [mm], bump +")
     if len(curves) > 1:
-        all_axes[0, 0].legend(*_of_curves(all_axes[0, 0], curves), frameon=False, loc="lower left")
-    if title:
-        fig.suptitle(title)
+        all_axes[0, 0].legend(frameon=False, loc="lower left")
     return fig
-
-
-def _of_curves(axes: Any, curves: Mapping[str, Any]) -> tuple[list[Any], list[str]]:
-    """Handles and labels without those of the bounds."""
-    handles, labels = axes.get_legend_handles_labels()
-    return handles[: len(curves)], labels[: len(curves)]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens.model import AbstractClosedFormLoad, AbstractForce, AbstractLoad, Frame, RigidBody, load_tangents
+from lgsens.model import AbstractClosedFormLoad, AbstractForce, AbstractLoad, Frame, RigidBody, carried, load_tangents
 from lgsens.testing._differences import SAFETY
 from lgsens.testing._poses import DIM, Poses, displaced, same, slope, vanishes
 from lgsens.testing._report import Check, Report, worst
@@ -32,8 +32,8 @@ def check_force(
 
     At random poses, velocities and times: ∂Q/∂q under the retraction R exp(θ̃) and ∂Q/∂v, by autodiff and by
     differences; of a load in closed form, `tangents` against autodiff, None standing for zero. That Q is zero where it
-    does not say that it `acts_on`. Q by every number of it, as `check_sensitivities` does. Between two bodies, action
-    and reaction:
+    does not say that it `acts_on`, and on a part of a merged body that in the frame of the part. Q by every number of
+    it, as `check_sensitivities` does. Between two bodies, action and reaction:
 
         F_a + F_b = 0,     x_a × F_a + R_a M_a + x_b × F_b + R_b M_b = 0
 
@@ -53,6 +53,7 @@ def check_force(
     Returns a `Report`; a row holds the worst of all poses. Raises `ValueError` for a Q of other than 12 entries.
     """
     scene = Poses(seed, length)
+    (part,) = Poses(seed + 1, length).frames(1)
     if isinstance(force, AbstractLoad):
         scene_bodies = scene.bodies("ab")
         attached = [("", "a", "b")]
@@ -69,7 +70,7 @@ def check_force(
     for i, (label, end_a, end_b) in enumerate(attached):
         (a, b), free = scene.ends(end_a, end_b, scene_bodies)
         load = load_of(force, i)
-        program = _program(load, potential, free)
+        program = _program(load, potential, free, part)
         zeros = jnp.zeros_like(scene.points(free))
         for pose in range(poses):
             first, second = displaced(a, b, scene.displacement(free))
@@ -89,7 +90,7 @@ def check_force(
     return Report(f"{type(force).__name__}, {poses} poses", worst(checks))
 
 
-def _program(load: AbstractLoad, potential: Potential | None, free):
+def _program(load: AbstractLoad, potential: Potential | None, free, part):
     """What a load says, and what follows from its force, at displacements x and velocities v + u of two frames."""
 
     def quantities(x, u, a, b, v, t):
@@ -101,6 +102,8 @@ def _program(load: AbstractLoad, potential: Potential | None, free):
         q, resting = force(zero, v), force(zero, zero)
         found = {
             "Q": q,
+            "Q on a part": carried(load, part, part).force(a, b, v[:6], v[6:], t)
+            - carried(load, part, part, by_frames=True).force(a, b, v[:6], v[6:], t),
             "Q elsewhere": q[np.setdiff1d(np.arange(DIM), load.acts_on)],
             "∂Q/∂q": position[:, free],
             "∂Q/∂v": velocity[:, free],
@@ -130,6 +133,7 @@ def _compared(label: str, closed_form: bool, balanced: bool, by_position, by_vel
             yield same(label + name, found[name], found[f"{name} by autodiff"])
         yield slope(label + name, found[f"{name} by autodiff"], found["Q"])
     size = float(np.abs(by_position["Q"].value).max(initial=0.0))
+    yield vanishes(f"{label}Q", "on a part, in its frame", by_position["Q on a part"], size)
     if by_position["Q elsewhere"].value.size:
         yield vanishes(f"{label}Q", "elsewhere, 0", by_position["Q elsewhere"], size)
     if balanced:

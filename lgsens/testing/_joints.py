@@ -14,6 +14,7 @@ from lgsens.model import (
     AbstractRows,
     AbstractVelocityConstraint,
     RigidBody,
+    carried,
     constraint_force,
     constraint_jacobian,
     constraint_stiffness,
@@ -40,7 +41,8 @@ def check_joint(
 
     at random poses that need not satisfy it: B and K by autodiff under the retraction R exp(θ̃) and by differences; of a
     constraint in closed form, `jacobian`, `force` and `geometric_stiffness` against autodiff; of any, that B and K are
-    zero outside of what it `acts_on` and what is `coupled`. Φ, Bᵀλ and K by every number of it, as
+    zero outside of what it `acts_on` and what is `coupled`, and that Φ on a part of a merged body is that in the frame
+    of the part, if it says what of it is fixed to bodies (`body_fixed`). Φ, Bᵀλ and K by every number of it, as
     `check_sensitivities` does. Of rows A v + b of velocity level A in place of B, the same at any v. Of a joint, in the
     reference configuration: Φ = 0 if it says `assembled`, and B of full rank, so that its equations are independent.
 
@@ -75,10 +77,11 @@ def check_joint(
             )
         multipliers.append(jnp.asarray(scene.rng.standard_normal(rows), scene.dtype))
     starts, velocity = [scene.displacement(free) for _ in range(poses)], scene.displacement(free)
+    (part,) = Poses(seed + 1, length).frames(1)
 
     checks: list[Check] = list(_reference(joint, scene, a, b, time, free)) if is_joint else []
     for label, element, lam in zip(labels, elements, multipliers):
-        program = _program(element, lam, velocity, time, free)
+        program = _program(element, lam, velocity, time, free, part)
         for start in starts:
             first, second = displaced(a, b, start)
             found = scene.sampled(program(scene.points(free), first, second), free)
@@ -111,7 +114,7 @@ def _said(element: AbstractRows, a, b, velocity, t):
     return element.rate(a, b, va, vb, t)
 
 
-def _program(element: AbstractRows, lam, velocity, t, free):
+def _program(element: AbstractRows, lam, velocity, t, free, part):
     """What a constraint says, and what follows from its value, at displacements x of two frames."""
     zero = jnp.zeros(DIM, lam.dtype)
     acts = np.isin(np.arange(DIM), element.acts_on)  # what is taken of B
@@ -129,6 +132,8 @@ def _program(element: AbstractRows, lam, velocity, t, free):
         force = lambda y: lam @ jacobian(*displaced(a, b, y))
         return {
             "Φ": _said(element, a, b, velocity, t),
+            "Φ on a part": _said(carried(element, part, part), a, b, velocity, t)
+            - _said(carried(element, part, part, by_frames=True), a, b, velocity, t),
             "B": jnp.where(acts, constraint_jacobian(element, a, b, t), 0.0)[:, free],
             "B by autodiff": jacobian(a, b)[:, free],
             "force": jnp.where(acts, constraint_force(element, a, b, lam, t), 0.0)[free],
@@ -142,6 +147,7 @@ def _program(element: AbstractRows, lam, velocity, t, free):
 
 def _compared(label: str, given: bool, of_positions: bool, found) -> Iterator[Check]:
     stiffness = f"{label}K = ∂(Bᵀλ)/∂x"
+    yield vanishes(f"{label}Φ", "on a part, in its frame", found["Φ on a part"], float(np.abs(found["Φ"].value).max()))
     if given:
         yield same(f"{label}B", found["B"], found["B by autodiff"])
         yield same(f"{label}Bᵀλ", found["force"], found["force by autodiff"])

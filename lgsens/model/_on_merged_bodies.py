@@ -1,62 +1,49 @@
 """Elements on a part of a body, as elements on the body itself.
 
 The frame of a part is x_p = x + R c, R_p = R C with the constant pose (c, C) of the part in its body, so a point X of
-the part is c + C X in the body, an axis e is C e. Elements made of points and axes are rewritten, and cost no more than
-on the body itself; others see the frame of the part, and what they do to it is brought back by the transpose of
+the part is c + C X in the body, an axis e is C e, a tensor K is C K Cᵀ. Elements that say what of them is fixed to
+bodies are rewritten, and cost no more than on the body itself; others see the frame of the part, and what they do to it
+is brought back by the transpose of
 
     [ẋ_p, Ω_p] = [ẋ + R (Ω × c), Cᵀ Ω],     so     [F, M] = [F_p, C M_p + c × Rᵀ F_p].
 """
 
-from typing import TypeVar
+import dataclasses
+from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 
 from lgsens.liegroups import cross, turn, turn_back
-from lgsens.model._constraints import (
-    AbstractConstraint,
-    AbstractRows,
-    AbstractVelocityConstraint,
-    Coincidence,
-    Distance,
-    InPlane,
-    Orthogonality,
-)
+from lgsens.model._constraints import AbstractConstraint, AbstractVelocityConstraint
+from lgsens.model._elements import AbstractElement, fixed_fields
 from lgsens.model._frames import BODY_A, BODY_B, ROTATION, Frame
-from lgsens.model._loads import AbstractLoad, PointForce, SpringDamperLoad, TyreLoad
+from lgsens.model._loads import AbstractLoad
 
-Element = TypeVar("Element", AbstractRows, AbstractLoad)
+# How what is fixed to a part is fixed to its body.
+_SEEN = {
+    "point": Frame.point,
+    "axis": Frame.axis,
+    "tensor": lambda part, tensor: part.orientation @ tensor @ part.orientation.T,
+}
 
 
-def carried_constraint(element: AbstractRows, a: Frame | None, b: Frame | None) -> AbstractRows:
-    """A constraint between two parts as one between their bodies; `a`, `b`: the poses of the parts there."""
+def carried(element: AbstractElement, a: Frame | None, b: Frame | None, *, by_frames: bool = False) -> Any:
+    """A constraint or load between two parts as one between their bodies; `a`, `b`: the poses of the parts there.
+
+    `by_frames`: by the frames of the parts, whatever the element says of its numbers.
+    """
     if a is None and b is None:
         return element
-    if isinstance(element, AbstractVelocityConstraint):
-        return _CarriedVelocityConstraint(element, a, b)
-    if isinstance(element, Coincidence | Distance | InPlane | Orthogonality):
-        return _rewritten(element, a, b)
-    assert isinstance(element, AbstractConstraint)
-    return _CarriedConstraint(element, a, b)
-
-
-def carried_load(element: AbstractLoad, a: Frame | None, b: Frame | None) -> AbstractLoad:
-    """The same of a load."""
-    if a is None and b is None:
-        return element
-    made_of_points = isinstance(element, PointForce | SpringDamperLoad | TyreLoad)
-    return _rewritten(element, a, b) if made_of_points else _CarriedLoad(element, a, b)
-
-
-def _rewritten(element: Element, a: Frame | None, b: Frame | None) -> Element:
-    """An element whose points and axes, and moments fixed to b, are those of the bodies."""
-    places = [(name, end, Frame.point) for name, end in (("point_a", a), ("point_b", b))]
-    places += [(name, end, Frame.axis) for name, end in (("axis_a", a), ("axis_b", b), ("moment", b))]
-    for name, end, function in places:
-        if end is not None and hasattr(element, name):
-            new = function(end, getattr(element, name))
-            element = eqx.tree_at(lambda e, name=name: getattr(e, name), element, new)
-    return element
+    fields = fixed_fields(element)
+    if by_frames or not fields:
+        kinds = {AbstractConstraint: _CarriedConstraint, AbstractVelocityConstraint: _CarriedVelocityConstraint}
+        kind: Any = next((kinds[base] for base in kinds if isinstance(element, base)), _CarriedLoad)
+        return kind(element, a, b)
+    parts = {"a": a, "b": b}
+    known = [(name, kind, part) for name, (kind, body) in fields.items() if (part := parts[body]) is not None]
+    return dataclasses.replace(
+        element, **{name: _SEEN[kind](part, getattr(element, name)) for name, kind, part in known}
+    )
 
 
 def _frame(body: Frame, part: Frame | None) -> Frame:
@@ -98,6 +85,10 @@ class _CarriedConstraint(AbstractConstraint):
     def acts_on(self):
         return self.element.acts_on
 
+    @property
+    def driven(self):
+        return self.element.driven
+
     def value(self, a, b, t):
         return self.element.value(_frame(a, self.a), _frame(b, self.b), t)
 
@@ -121,8 +112,12 @@ class _CarriedLoad(AbstractLoad):
     a: Frame | None
     b: Frame | None
 
+    def _of_parts(self, a, b, va, vb):
+        return _frame(a, self.a), _frame(b, self.b), _velocity(a, va, self.a), _velocity(b, vb, self.b)
+
     def force(self, a, b, va, vb, t):
-        of_parts = self.element.force(
-            _frame(a, self.a), _frame(b, self.b), _velocity(a, va, self.a), _velocity(b, vb, self.b), t
-        )
+        of_parts = self.element.force(*self._of_parts(a, b, va, vb), t)
         return jnp.concatenate([_force(a, of_parts[BODY_A], self.a), _force(b, of_parts[BODY_B], self.b)])
+
+    def measure(self, a, b, va, vb, t):
+        return self.element.measure(*self._of_parts(a, b, va, vb), t)

@@ -1,0 +1,48 @@
+"""What joints and forces are made of, basic constraints and loads, and what they say of themselves.
+
+What the rest of the library wants to know of an element is asked of the element, and nobody asks for its type.
+"""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import equinox as eqx
+from jaxtyping import Array
+
+from lgsens.model._frames import ALL
+
+
+def body_fixed(kind: str, body: str) -> dict[str, Any]:
+    """What a field of an element says whose number is fixed to a body, in its frame: `eqx.field(metadata=…)`.
+
+    It is a "point", an "axis" or a "tensor" of "a" or "b". Points place the element in plots and in the scale of
+    coordinates. An element that says so of one number says so of all: on a part of a merged body it becomes the same
+    element on that body, without a change of frames at every instant. `lgsens.testing` compares both.
+    """
+    return {"fixed": (kind, body)}
+
+
+class AbstractElement(eqx.Module):
+    """A law between the frames of two bodies a and b, and numbers for it; no names, so that elements can be stacked.
+
+    `drawn` is what is drawn from its first point to its last: a "joint" or "link" that holds bodies, a "spring", a
+    "damper", or a "wheel" on its `road`; None: nothing.
+    """
+
+    drawn: ClassVar[Any] = "joint"
+
+    @property
+    def acts_on(self) -> tuple[int, ...]:
+        """The coordinates 0 … 11, [x_a, θ_a, x_b, θ_b], that it acts on: B has no other columns, and the generalized
+        force no other entries. Of a constraint, which then depends on no others, all of them or the six rotations."""
+        return ALL
+
+    def fixed(self, kind: str, bodies: str = "ab") -> list[Array]:
+        """Its points, axes or tensors, in the frames of these bodies."""
+        return [getattr(self, name) for name, (of, body) in fixed_fields(self).items() if of == kind and body in bodies]
+
+
+def fixed_fields(element: AbstractElement) -> dict[str, tuple[str, str]]:
+    """Kind and body of each number of an element that is fixed to a body, by the name of its field."""
+    fields = dataclasses.fields(element)
+    return {field.name: field.metadata["fixed"] for field in fields if "fixed" in field.metadata}

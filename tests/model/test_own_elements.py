@@ -1,0 +1,177 @@
+"""A joint and a spring of one's own that say what the library asks of them: drawn, reduced, preloaded, carried over."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import close
+
+import lgsens as lg
+from lgsens.model import AbstractConstraint, AbstractForce, AbstractJoint, AbstractLoad, Attached, body_fixed
+from lgsens.plotting._shapes import shapes
+from lgsens.testing import check_force, check_joint
+
+WEIGHT = 4.0 * 9.81
+TURNED = ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+TIP = jnp.array([0.5, 0.0, 0.0])
+
+
+class Level(AbstractConstraint):
+    """Two points are at the same height."""
+
+    here: jax.Array = eqx.field(metadata=body_fixed("point", "a"))
+    there: jax.Array = eqx.field(metadata=body_fixed("point", "b"))
+
+    @property
+    def num_rows(self):
+        return 1
+
+    def violable(self, free):
+        return ("z" in free or bool(free & {"rx", "ry"}),)
+
+    def value(self, a, b, t):
+        return (b.point(self.there) - a.point(self.here))[2:]
+
+
+class Plain(AbstractConstraint):
+    """The same, which says nothing of itself."""
+
+    level: Level
+
+    @property
+    def num_rows(self):
+        return 1
+
+    def value(self, a, b, t):
+        return self.level.value(a, b, t)
+
+
+class Table(AbstractJoint):
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    plain: bool = eqx.field(static=True, default=False)
+
+    @property
+    def assembled(self):
+        return True
+
+    def constraints(self, a, b):
+        level = Level(a.local_point(TIP), b.local_point(TIP))
+        return (Plain(level) if self.plain else level,)
+
+
+class StrapLoad(AbstractLoad):
+    """A force along the line between two points that grows by k per metre."""
+
+    here: jax.Array = eqx.field(metadata=body_fixed("point", "a"))
+    there: jax.Array = eqx.field(metadata=body_fixed("point", "b"))
+    stiffness: jax.Array
+    length: jax.Array
+    tension: jax.Array
+
+    def measure(self, a, b, va, vb, t):
+        return self.tension + self.stiffness * (jnp.linalg.norm(b.point(self.there) - a.point(self.here)) - self.length)
+
+    def force(self, a, b, va, vb, t):
+        d = b.point(self.there) - a.point(self.here)
+        pull = self.measure(a, b, va, vb, t) * d / jnp.linalg.norm(d)
+        moments = jnp.cross(self.here, a.local_axis(pull)), -jnp.cross(self.there, b.local_axis(pull))
+        return jnp.concatenate([pull, moments[0], -pull, moments[1]])
+
+
+class PlainLoad(AbstractLoad):
+    strap: StrapLoad
+
+    def measure(self, *arguments):
+        return self.strap.measure(*arguments)
+
+    def force(self, *arguments):
+        return self.strap.force(*arguments)
+
+
+class Strap(AbstractForce):
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at_a: jax.Array
+    at_b: jax.Array
+    preload: jax.Array
+    plain: bool = eqx.field(static=True, default=False)
+
+    @property
+    def bodies(self):
+        return (self.a, self.b)
+
+    preload_shape = ()
+
+    def loads(self, bodies):
+        here, there = (
+            at if name is None else bodies[name].frame.local_point(at)
+            for name, at in ((self.a, self.at_a), (self.b, self.at_b))
+        )
+        length = jnp.linalg.norm(self.at_b - self.at_a)
+        load = StrapLoad(here, there, jnp.asarray(100.0), length, self.preload)
+        return (Attached(PlainLoad(load) if self.plain else load, self.a, self.b),)
+
+
+def hung(*, plain=False, merge=False, **changes) -> lg.Model:
+    """A beam with a plate fixed to it, 4 kg together, on a strap from its tip."""
+    bodies = {
+        "beam": lg.RigidBody(3.0, (0.1, 0.2, 0.2), position=(0.5, 0.0, 0.0), free="z"),
+        "plate": lg.RigidBody(1.0, (0.1, 0.2, 0.2), position=(0.6, 0.0, 0.0), orientation=TURNED),
+    }
+    strap = Strap("plate", None, TIP, TIP + jnp.array([0.0, 0.0, 1.0]), jnp.asarray(0.0), plain)
+    forces = {"gravity": lg.Gravity((0.0, 0.0, -9.81)), "strap": strap}
+    return lg.Model(bodies, {"weld": lg.FixedJoint("beam", "plate", at=TIP)}, forces, merge_fixed=merge)
+
+
+@pytest.mark.parametrize("plain", [False, True])
+@pytest.mark.parametrize("merge", [False, True])
+def test_a_spring_of_ones_own_has_a_preload(plain, merge):
+    loaded, unbalanced = lg.static_preload(hung(plain=plain, merge=merge), ("strap",))
+    assert float(unbalanced) <= 1e-12 * WEIGHT
+    # it hangs from the plate, and pulls there and at the ceiling
+    close(loaded.forces["strap"].preload, WEIGHT, ulps=100)
+
+
+class Half(AbstractConstraint):
+    """A level that says of one of its points only that it is fixed to a body."""
+
+    here: jax.Array = eqx.field(metadata=body_fixed("point", "a"))
+    there: jax.Array
+
+    @property
+    def num_rows(self):
+        return 1
+
+    def value(self, a, b, t):
+        return (b.point(self.there) - a.point(self.here))[2:]
+
+
+def test_what_an_element_says_of_its_numbers_is_checked():
+    """On a part of a merged body a declared element is rewritten; others see the frame of the part."""
+    check_joint(Level(TIP, -TIP)).raise_if_failed()
+    check_force(StrapLoad(TIP, -TIP, *jnp.arange(1.0, 4.0))).raise_if_failed()
+    assert {failure.compared for failure in check_joint(Half(TIP, -TIP)).failures} == {"on a part, in its frame"}
+
+
+def reduced(free, plain=False) -> lg.Model:
+    return lg.Model({"slab": lg.RigidBody(1.0, (1.0, 1.0, 1.0), free=free)}, {"table": Table(None, "slab", plain)})
+
+
+@pytest.mark.parametrize(("free", "rows"), [("x y rz", 0), ("x y", 0), ("x z ry", 1), ("x y z rx ry rz", 1)])
+def test_a_joint_of_ones_own_loses_what_cannot_be_violated(free, rows):
+    assert reduced(free).summary().equations == {"table": rows}
+    assert reduced(free, plain=True).summary().equations == {"table": 1}  # it says nothing
+
+
+def test_what_is_declared_is_drawn():
+    table = shapes(reduced("x z ry").system())
+    assert [mark.body for mark in table.joints] == [-1]
+    np.testing.assert_array_equal(table.joints[0].at, TIP)
+    link = [outline.points for outline in table.outlines if outline.role == "link"]
+    np.testing.assert_array_equal(link, [[TIP, np.zeros(3)]])  # from where it is held to its centre of mass
+    assert not shapes(reduced("x z ry", plain=True).system()).joints
+    (strap,) = shapes(hung().system()).struts
+    assert strap.role == "spring"
+    assert not shapes(hung(plain=True).system()).struts
