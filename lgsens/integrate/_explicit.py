@@ -54,7 +54,6 @@ from lgsens.dynamics import (
     constraint_velocity,
     equations_of_motion,
     factorized_accelerations,
-    full_jacobian,
 )
 from lgsens.integrate._explicit_linearized import ExplicitLinearizedStep, Inner
 from lgsens.integrate._grid import earlier, later, with_first
@@ -112,17 +111,18 @@ def projection(inertia: Inertia, system: AbstractSystem, q, v, t) -> Projection:
     return Projection(y, mu, *kkt.solve(still, -constraint_velocity(system, projected, v, t)), projected)
 
 
-def _position(system: AbstractSystem, q, t, found: Inner):
-    """P, its two rows."""
-    jacobian = full_jacobian(system, q, t)
-    return system.mass_matrix() @ found.y + found.mu @ jacobian, jacobian @ found.y + drift(system, q, t)
+def _corrections(system: AbstractSystem, q, t, found: Inner, projected, u):
+    """P and R, each in two rows; products with A at q* are derivatives of r and c, so no matrix is made."""
+    still = jnp.zeros_like(u)
 
+    def product(x, mu):
+        push = lambda vdot, lam: system.residual(q, still, vdot, lam, t)
+        _, force = jax.jvp(push, (still, jnp.zeros_like(mu)), (x, mu))
+        return force, jax.jvp(lambda v: constraint_velocity(system, q, v, t), (still,), (x,))[1]
 
-def _velocity(system: AbstractSystem, q, t, found: Inner, projected, u):
-    """R, its two rows."""
-    jacobian = full_jacobian(system, q, t)
-    rate = constraint_velocity(system, projected, u, t)
-    return system.mass_matrix() @ found.d + found.nu @ jacobian, jacobian @ found.d + rate
+    force, rate = jax.vmap(product)(jnp.stack([found.y, found.d]), jnp.stack([found.mu, found.nu]))
+    velocity = constraint_velocity(system, projected, u, t)
+    return (force[0], rate[0] + drift(system, q, t)), (force[1], rate[1] + velocity)
 
 
 def _followed(rest, last):
@@ -293,11 +293,8 @@ class IndexReducedODE(AbstractScheme):
         times, points = self._points(system, node, previous, state)
         motion = jax.vmap(lambda t, q, v, *rest: equations_of_motion(system, q, v, *rest, t))(times, *points)
         q = system.group.retract(previous.q, x)
-        inner = Inner(
-            *(found.x - stages[0], found.v - stages[1], *earlier(motion)),
-            *_position(system, q, node.t, found),
-            *_velocity(system, q, node.t, found, state.q, u),
-        )
+        position, velocity = _corrections(system, q, node.t, found, state.q, u)
+        inner = Inner(found.x - stages[0], found.v - stages[1], *earlier(motion), *position, *velocity)
         vdot, lam = (rows[-1] for rows in motion)
         return State(system.group.retract(q, found.y), state.v - (u + found.d), vdot, lam, state.a - state.vdot, inner)
 
@@ -340,7 +337,6 @@ class IndexReducedODE(AbstractScheme):
             return jax.linearize(function, previous.q, x, v)[1]
 
         a, b, _ = (node.h * each for each in self._arrays(node.h.dtype))
-        velocity = lambda q, *end: _velocity(system, q, node.t, found, *end)
         return ExplicitLinearizedStep(
             group=group,
             inertia=shared,
@@ -353,8 +349,8 @@ class IndexReducedODE(AbstractScheme):
             kinematics=jax.vmap(kinematics)(found.x, found.v),
             to_end=jax.linearize(group.retract, previous.q, x)[1],
             corrected=jax.linearize(group.retract, q, found.y)[1],
-            position=jax.linearize(lambda q: _position(system, q, node.t, found), q)[1],
-            velocity=jax.linearize(velocity, q, state.q, u)[1],
+            corrections=jax.linearize(lambda q: _corrections(system, q, node.t, found, state.q, u), q)[1],
+            velocity=jax.linearize(lambda q, v: constraint_velocity(system, q, v, node.t), state.q, u)[1],
         )
 
 

@@ -40,8 +40,8 @@ class ExplicitLinearizedStep(AbstractLinearizedStep):
     kinematics: Any  # (q_n', x', v') ↦ q' and (T⁻¹ v)', at the stages
     to_end: Any  # (q_n', x') ↦ q*'
     corrected: Any  # (q*', y') ↦ q⁺'
-    position: Any  # q*' ↦ P'
-    velocity: Any  # (q*', q⁺', u') ↦ R'
+    corrections: Any  # q*' ↦ P' and R'
+    velocity: Any  # (q⁺', u') ↦ c'
 
     def forward(self, previous, loads, row):
         group, row = self.group, jax.tree.map(jnp.subtract, row, loads)
@@ -66,10 +66,11 @@ class ExplicitLinearizedStep(AbstractLinearizedStep):
 
         dq, du = self.to_end(dq, self.b @ rates), previous.v + self.b @ vdots
         there = at(self.factors, -1)
-        y, mu = solve(there, (rows.y, rows.mu), self.position(dq))
+        position, (force, rate) = self.corrections(dq)
+        y, mu = solve(there, (rows.y, rows.mu), position)
         w = group.from_ambient(self.end, self.corrected(dq, y)) + row.w
         projected = group.to_ambient(self.end, w)
-        d, nu = solve(there, (rows.d, rows.nu), self.velocity(dq, projected, du))
+        d, nu = solve(there, (rows.d, rows.nu), (force, rate + self.velocity(projected, du)))
         v = du + d + row.v
         vdot, lam = solve(at(self.factors, -2), (row.vdot, row.lam), at(self.motion, -1)(projected, v))
         return Variation(w, v, vdot, lam, vdot + row.a, Inner(*stages, y, mu, d, nu))
