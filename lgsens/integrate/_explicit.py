@@ -47,7 +47,6 @@ from jaxtyping import Array, Bool, Float, Int
 from lgsens._validate import as_count
 from lgsens.dynamics import (
     RESULTS,
-    AbstractSystem,
     ConstrainedInertia,
     Inertia,
     State,
@@ -55,9 +54,9 @@ from lgsens.dynamics import (
     equations_of_motion,
     factorized_accelerations,
 )
-from lgsens.integrate._explicit_linearized import ExplicitLinearizedStep, Inner
+from lgsens.integrate._explicit_step import ExplicitLinearizedStep, Inner, corrections, ended
 from lgsens.integrate._grid import earlier, later, with_first
-from lgsens.integrate._scheme import AbstractScheme, Stages, Start, Stats
+from lgsens.integrate._scheme import AbstractScheme, Stages, Stats
 
 MODES = ("reverse", "forward")
 
@@ -82,47 +81,6 @@ class Coefficients(NamedTuple):
     a: np.ndarray
     b: np.ndarray
     c: np.ndarray
-
-
-class Projection(NamedTuple):
-    """The unknowns of P and R, and q⁺."""
-
-    y: Float[Array, " k"]
-    mu: Float[Array, " m"]
-    d: Float[Array, " k"]
-    nu: Float[Array, " m"]
-    q: Any
-
-
-def drift(system: AbstractSystem, q, t) -> Float[Array, " m"]:
-    """Φ, and zero in the rows of velocity level."""
-    violation = system.constraint(q, t)
-    return jnp.concatenate([violation, jnp.zeros(system.num_velocity_rows, violation.dtype)])
-
-
-def projection(inertia: Inertia, system: AbstractSystem, q, v, t) -> Projection:
-    """One step of Newton's iteration for q, then v, with one factorization."""
-    still = jnp.zeros_like(v)
-    if not system.constraint_names:
-        return Projection(still, still[:0], still, still[:0], q)
-    kkt = ConstrainedInertia.of(inertia, system, q, t)
-    y, mu = kkt.solve(still, -drift(system, q, t))
-    projected = system.group.retract(q, y)
-    return Projection(y, mu, *kkt.solve(still, -constraint_velocity(system, projected, v, t)), projected)
-
-
-def _corrections(system: AbstractSystem, q, t, found: Inner, projected, u):
-    """P and R, each in two rows; products with A at q* are derivatives of r and c, so no matrix is made."""
-    still = jnp.zeros_like(u)
-
-    def product(x, mu):
-        push = lambda vdot, lam: system.residual(q, still, vdot, lam, t)
-        _, force = jax.jvp(push, (still, jnp.zeros_like(mu)), (x, mu))
-        return force, jax.jvp(lambda v: constraint_velocity(system, q, v, t), (still,), (x,))[1]
-
-    force, rate = jax.vmap(product)(jnp.stack([found.y, found.d]), jnp.stack([found.mu, found.nu]))
-    velocity = constraint_velocity(system, projected, u, t)
-    return (force[0], rate[0] + drift(system, q, t)), (force[1], rate[1] + velocity)
 
 
 def _followed(rest, last):
@@ -189,14 +147,12 @@ class IndexReducedODE(AbstractScheme):
     failure = RESULTS.integration_failed
     has_stages = True
 
-    @property
-    def scheme(self):
+    def require_steps(self):
         if self.rtol is not None:
             raise ValueError(
                 f"IndexReducedODE: with `rtol` = {self.rtol!r} diffrax chooses the steps and differentiates them in "
                 "one direction only (`mode`), for `simulate` as it is. Leave `rtol` out here."
             )
-        return self
 
     @property
     def coefficients(self) -> Coefficients:
@@ -214,9 +170,6 @@ class IndexReducedODE(AbstractScheme):
         return Coefficients(*(jnp.asarray(each, dtype) for each in self.coefficients))
 
     # How a motion begins, and what is seen of it.
-
-    def start(self, system, initial, t0):
-        return Start(self.complete(system, initial.state))
 
     def resumed(self, system, state0, t0):
         """Accelerations are those of (q, v): a state of another scheme has them with its own error."""
@@ -236,6 +189,8 @@ class IndexReducedODE(AbstractScheme):
         return StepStats(stats.iterations, stats.residual, stats.converged)
 
     def stages(self, system, grid, states):
+        if self.rtol is not None:
+            return None
         retract = jax.vmap(system.group.retract, (None, 0))
         _, b, c = self._arrays(states.v.dtype)
         places = grid.places()
@@ -276,14 +231,10 @@ class IndexReducedODE(AbstractScheme):
         inputs = jnp.arange(1, len(b)), a[1:], node.begin + c[1:] * h
         (rates, vdots), stages = lax.scan(stage, slopes, inputs)
         q, u = group.retract(begun.q, h * (b @ rates)), begun.v + h * (b @ vdots)
-        *found, projected = projection(shared, system, q, u, node.t)
-        done = Inner(*stages, *found)
-        v = u + done.d
-        vdot, lam = factorized_accelerations(shared, system, projected, v, node.t)
-        state = State(projected, v, vdot, lam, vdot, done)
+        state, found, left = ended(shared, system, q, u, node.t)
+        state = dataclasses.replace(state, inner=Inner(*stages, *found))
         converged = running & jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state)]))
         state = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), state)
-        left = lax.stop_gradient(jnp.max(jnp.abs(drift(system, q, node.t)), initial=0.0))
         left = jnp.where(running, left, jnp.nan)
         return state, memory, Stats(running.astype(jnp.int32), 0.0 * h, left, converged, jnp.nan * h)
 
@@ -293,7 +244,7 @@ class IndexReducedODE(AbstractScheme):
         times, points = self._points(system, node, previous, state)
         motion = jax.vmap(lambda t, q, v, *rest: equations_of_motion(system, q, v, *rest, t))(times, *points)
         q = system.group.retract(previous.q, x)
-        position, velocity = _corrections(system, q, node.t, found, state.q, u)
+        position, velocity = corrections(system, q, node.t, found, state.q, u)
         inner = Inner(found.x - stages[0], found.v - stages[1], *earlier(motion), *position, *velocity)
         vdot, lam = (rows[-1] for rows in motion)
         return State(system.group.retract(q, found.y), state.v - (u + found.d), vdot, lam, state.a - state.vdot, inner)
@@ -349,7 +300,7 @@ class IndexReducedODE(AbstractScheme):
             kinematics=jax.vmap(kinematics)(found.x, found.v),
             to_end=jax.linearize(group.retract, previous.q, x)[1],
             corrected=jax.linearize(group.retract, q, found.y)[1],
-            corrections=jax.linearize(lambda q: _corrections(system, q, node.t, found, state.q, u), q)[1],
+            corrections=jax.linearize(lambda q: corrections(system, q, node.t, found, state.q, u), q)[1],
             velocity=jax.linearize(lambda q, v: constraint_velocity(system, q, v, node.t), state.q, u)[1],
         )
 

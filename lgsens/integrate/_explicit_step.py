@@ -1,4 +1,4 @@
-"""The linearized step of the explicit Runge–Kutta scheme: forward substitution, stage by stage (`_explicit`)."""
+"""The end of an explicit Runge–Kutta step, and the linearized step: forward substitution by stages (`_explicit`)."""
 
 from typing import Any, NamedTuple
 
@@ -8,7 +8,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import ConstrainedInertia, Inertia
+from lgsens.dynamics import (
+    AbstractSystem,
+    ConstrainedInertia,
+    Inertia,
+    State,
+    constraint_velocity,
+    factorized_accelerations,
+)
 from lgsens.integrate._linearized import AbstractLinearizedStep, Variation
 from lgsens.liegroups import AbstractLieGroup
 
@@ -24,6 +31,40 @@ class Inner(NamedTuple):
     mu: Float[Array, " m"]
     d: Float[Array, " k"]
     nu: Float[Array, " m"]
+
+
+def drift(system: AbstractSystem, q, t) -> Float[Array, " m"]:
+    """Φ, and zero in the rows of velocity level."""
+    violation = system.constraint(q, t)
+    return jnp.concatenate([violation, jnp.zeros(system.num_velocity_rows, violation.dtype)])
+
+
+def ended(inertia: Inertia, system: AbstractSystem, q, u, t):
+    """The state at the end of a step, y, μ, d and ν that lead there from q* and u, and max |Φ| before."""
+    found, projected = (jnp.zeros_like(u), u[:0]) * 2, q
+    if system.constraint_names:
+        kkt = ConstrainedInertia.of(inertia, system, q, t)
+        position = kkt.solve(found[0], -drift(system, q, t))
+        projected = system.group.retract(q, position[0])
+        found = *position, *kkt.solve(found[0], -constraint_velocity(system, projected, u, t))
+    v = u + found[2]
+    vdot, lam = factorized_accelerations(inertia, system, projected, v, t)
+    left = lax.stop_gradient(jnp.max(jnp.abs(drift(system, q, t)), initial=0.0))
+    return State(projected, v, vdot, lam, vdot), found, left
+
+
+def corrections(system: AbstractSystem, q, t, found: Inner, projected, u):
+    """P and R, each in two rows; products with A at q* are derivatives of r and c, so no matrix is made."""
+    still = jnp.zeros_like(u)
+
+    def product(x, mu):
+        push = lambda vdot, lam: system.residual(q, still, vdot, lam, t)
+        _, force = jax.jvp(push, (still, jnp.zeros_like(mu)), (x, mu))
+        return force, jax.jvp(lambda v: constraint_velocity(system, q, v, t), (still,), (x,))[1]
+
+    force, rate = jax.vmap(product)(jnp.stack([found.y, found.d]), jnp.stack([found.mu, found.nu]))
+    velocity = constraint_velocity(system, projected, u, t)
+    return (force[0], rate[0] + drift(system, q, t)), (force[1], rate[1] + velocity)
 
 
 class ExplicitLinearizedStep(AbstractLinearizedStep):
