@@ -8,10 +8,8 @@ from lgsens.integrate._adaptive import (
 from lgsens.integrate._alpha import AbstractAlpha as AbstractAlpha
 from lgsens.integrate._explicit import (
     IndexReducedODE as IndexReducedODE,
-    StepStats as StepStats,
-    drift as drift,
-    projection as projection,
 )
+from lgsens.integrate._explicit_step import ended as ended
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha as GeneralizedAlpha
 from lgsens.integrate._given import GivenSteps as GivenSteps
 from lgsens.integrate._grid import (

@@ -50,13 +50,13 @@ from lgsens.dynamics import (
     ConstrainedInertia,
     Inertia,
     State,
+    constraint_velocity,
     equations_of_motion,
     factorized_accelerations,
 )
-from lgsens.integrate._explicit_linearized import ExplicitLinearizedStep, Inner
-from lgsens.integrate._explicit_projection import drift, of_position, of_velocity, projection
+from lgsens.integrate._explicit_step import ExplicitLinearizedStep, Inner, corrections, ended
 from lgsens.integrate._grid import earlier, later, with_first
-from lgsens.integrate._scheme import AbstractScheme, Stages, Start, Stats
+from lgsens.integrate._scheme import AbstractScheme, Stages, Stats
 
 MODES = ("reverse", "forward")
 
@@ -147,14 +147,12 @@ class IndexReducedODE(AbstractScheme):
     failure = RESULTS.integration_failed
     has_stages = True
 
-    @property
-    def scheme(self):
+    def require_steps(self):
         if self.rtol is not None:
             raise ValueError(
                 f"IndexReducedODE: with `rtol` = {self.rtol!r} diffrax chooses the steps and differentiates them in "
                 "one direction only (`mode`), for `simulate` as it is. Leave `rtol` out here."
             )
-        return self
 
     @property
     def coefficients(self) -> Coefficients:
@@ -172,9 +170,6 @@ class IndexReducedODE(AbstractScheme):
         return Coefficients(*(jnp.asarray(each, dtype) for each in self.coefficients))
 
     # How a motion begins, and what is seen of it.
-
-    def start(self, system, initial, t0):
-        return Start(self.complete(system, initial.state))
 
     def resumed(self, system, state0, t0):
         """Accelerations are those of (q, v): a state of another scheme has them with its own error."""
@@ -194,6 +189,8 @@ class IndexReducedODE(AbstractScheme):
         return StepStats(stats.iterations, stats.residual, stats.converged)
 
     def stages(self, system, grid, states):
+        if self.rtol is not None:
+            return None
         retract = jax.vmap(system.group.retract, (None, 0))
         _, b, c = self._arrays(states.v.dtype)
         places = grid.places()
@@ -234,14 +231,10 @@ class IndexReducedODE(AbstractScheme):
         inputs = jnp.arange(1, len(b)), a[1:], node.begin + c[1:] * h
         (rates, vdots), stages = lax.scan(stage, slopes, inputs)
         q, u = group.retract(begun.q, h * (b @ rates)), begun.v + h * (b @ vdots)
-        *found, projected = projection(shared, system, q, u, node.t)
-        done = Inner(*stages, *found)
-        v = u + done.d
-        vdot, lam = factorized_accelerations(shared, system, projected, v, node.t)
-        state = State(projected, v, vdot, lam, vdot, done)
+        state, found, left = ended(shared, system, q, u, node.t)
+        state = dataclasses.replace(state, inner=Inner(*stages, *found))
         converged = running & jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state)]))
         state = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), state)
-        left = lax.stop_gradient(jnp.max(jnp.abs(drift(system, q, node.t)), initial=0.0))
         left = jnp.where(running, left, jnp.nan)
         return state, memory, Stats(running.astype(jnp.int32), 0.0 * h, left, converged, jnp.nan * h)
 
@@ -251,11 +244,8 @@ class IndexReducedODE(AbstractScheme):
         times, points = self._points(system, node, previous, state)
         motion = jax.vmap(lambda t, q, v, *rest: equations_of_motion(system, q, v, *rest, t))(times, *points)
         q = system.group.retract(previous.q, x)
-        inner = Inner(
-            *(found.x - stages[0], found.v - stages[1], *earlier(motion)),
-            *of_position(system, q, node.t, found),
-            *of_velocity(system, q, node.t, found, state.q, u),
-        )
+        position, velocity = corrections(system, q, node.t, found, state.q, u)
+        inner = Inner(found.x - stages[0], found.v - stages[1], *earlier(motion), *position, *velocity)
         vdot, lam = (rows[-1] for rows in motion)
         return State(system.group.retract(q, found.y), state.v - (u + found.d), vdot, lam, state.a - state.vdot, inner)
 
@@ -298,7 +288,6 @@ class IndexReducedODE(AbstractScheme):
             return jax.linearize(function, previous.q, x, v)[1]
 
         a, b, _ = (node.h * each for each in self._arrays(node.h.dtype))
-        velocity = lambda q, *end: of_velocity(system, q, node.t, found, *end)
         return ExplicitLinearizedStep(
             group=group,
             inertia=shared,
@@ -311,8 +300,8 @@ class IndexReducedODE(AbstractScheme):
             kinematics=jax.vmap(kinematics)(found.x, found.v),
             to_end=jax.linearize(group.retract, previous.q, x)[1],
             corrected=jax.linearize(group.retract, q, found.y)[1],
-            position=jax.linearize(lambda q: of_position(system, q, node.t, found), q)[1],
-            velocity=jax.linearize(velocity, q, state.q, u)[1],
+            corrections=jax.linearize(lambda q: corrections(system, q, node.t, found, state.q, u), q)[1],
+            velocity=jax.linearize(lambda q, v: constraint_velocity(system, q, v, node.t), state.q, u)[1],
         )
 
 

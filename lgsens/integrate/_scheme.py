@@ -117,7 +117,8 @@ def scheme_of(owner: str, integrator: Any) -> "AbstractScheme":
     """The scheme that an integrator is to lay steps for; `ValueError` where that is none."""
     if not isinstance(integrator, AbstractScheme):
         raise ValueError(f"{owner}: `integrator` must be a GeneralizedAlpha, got {integrator!r}.")
-    return integrator.scheme
+    integrator.require_steps()
+    return integrator
 
 
 class AbstractScheme(AbstractIntegrator):
@@ -141,6 +142,10 @@ class AbstractScheme(AbstractIntegrator):
     def scheme(self):
         return self
 
+    def require_steps(self) -> None:
+        """Raise `ValueError` where the steps are not those of a grid."""
+        return
+
     @abc.abstractmethod
     def equations(self, system: AbstractSystem, node: Node, previous: State, state: State) -> State:
         """E: the configuration that the step predicts as `q`, what is left of all other equations elsewhere.
@@ -153,7 +158,7 @@ class AbstractScheme(AbstractIntegrator):
 
     def start(self, system: AbstractSystem, initial: Initial, t0) -> Start:
         """What the scheme starts from, given consistent values."""
-        return Start(initial.state)
+        return Start(self.complete(system, initial.state))
 
     def resumed(self, system: AbstractSystem, state0: State, t0) -> State:
         """What the scheme starts from, given the state of another run."""

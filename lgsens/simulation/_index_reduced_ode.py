@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import RESULTS, AbstractSystem, Inertia, State, factorized_accelerations
-from lgsens.integrate import IndexReducedODE, StepStats, drift, projection, with_first
+from lgsens.dynamics import AbstractSystem, Inertia, State, factorized_accelerations
+from lgsens.integrate import EqualGrid, IndexReducedODE, Stats, ended, with_first
 
 
 class _Local(NamedTuple):
@@ -34,12 +34,6 @@ class _Problem(eqx.Module):
         group = self.system.group
         vdot, _ = factorized_accelerations(self.inertia, self.system, group.retract(q, local.x), local.v, t)
         return _Local(group.tangent_inv_mv(local.x, local.v), vdot)
-
-    def projected(self, q, v, t):
-        """q and v on the constraints, and the drift taken out."""
-        found = projection(self.inertia, self.system, q, v, t)
-        left = jnp.max(jnp.abs(drift(self.system, q, t)), initial=0.0)
-        return found.q, v + found.d, lax.stop_gradient(left)
 
 
 def _adaptive(settings: IndexReducedODE, problem: _Problem, q, v, t, h, running):
@@ -68,19 +62,18 @@ def _largest(tree) -> Float[Array, ""]:
     return jnp.max(jnp.stack([jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(tree)]))
 
 
-def integrate_ode(settings: IndexReducedODE, num_steps: int, system: AbstractSystem, first: State, t0, h):
-    """The states at t0 + n h, n = 0 … num_steps, stacked along a leading axis, and what happened in between.
+def integrate_ode(settings: IndexReducedODE, system: AbstractSystem, grid: EqualGrid, first: State):
+    """The states at the times of the grid, stacked along a leading axis, and what happened in between.
 
-    An interval that fails ends the simulation: its end and all after it are NaN, and `StepStats` says so.
+    An interval that fails ends the simulation: its end and all after it are NaN, and `Stats` says so.
     """
-    problem = _Problem(Inertia.of(system), system)
+    problem, t0, h = _Problem(Inertia.of(system), system), grid.t0, grid.h
 
     def interval(problem: _Problem, begin: State, n, running):
         local, finished, steps = _adaptive(settings, problem, begin.q, begin.v, t0 + n * h, h, running)
-        end = t0 + (n + 1) * h
-        q, v, left = problem.projected(problem.system.group.retract(begin.q, local.x), local.v, end)
-        vdot, lam = factorized_accelerations(problem.inertia, problem.system, q, v, end)
-        return State(q=q, v=v, vdot=vdot, lam=lam, a=vdot), left, finished, steps
+        q = problem.system.group.retract(begin.q, local.x)
+        end, _, left = ended(problem.inertia, problem.system, q, local.v, t0 + (n + 1) * h)
+        return end, left, finished, steps
 
     # In reverse mode nothing is kept of an interval but how it begins.
     interval = jax.checkpoint(interval, prevent_cse=False)
@@ -92,21 +85,8 @@ def integrate_ode(settings: IndexReducedODE, num_steps: int, system: AbstractSys
         converged = running & finished & finite
         end = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), end)
         steps = jnp.where(running, steps, 0).astype(jnp.int32)
-        return (end, converged), (end, StepStats(steps, left, converged))
+        return (end, converged), (end, Stats(steps, 0.0 * h, left, converged, jnp.nan * h))
 
-    count = jnp.arange(num_steps, dtype=h.dtype)
+    count = jnp.arange(grid.num_steps, dtype=h.dtype)
     later, stats = lax.scan(step, (first, jnp.ones((), bool)), count)[1]
     return with_first(first, later), stats
-
-
-def ode_failure(stats: StepStats, t0, h):
-    """Whether and where the integration failed: the result code, and what its message needs."""
-    failed = jnp.argmin(stats.converged)  # the first interval that failed, 0 if none did
-    result = jnp.where(jnp.all(stats.converged), RESULTS.successful, RESULTS.integration_failed)
-    details = {
-        "step": failed + 1,
-        "num_steps": jnp.asarray(stats.converged.shape[0]),
-        "begin": t0 + failed.astype(h.dtype) * h,
-        "iterations": stats.steps[failed],
-    }
-    return result, details

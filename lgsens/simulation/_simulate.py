@@ -22,7 +22,6 @@ from lgsens.dynamics import (
 from lgsens.integrate import (
     AbstractIntegrator,
     AbstractScheme,
-    EqualGrid,
     GeneralizedAlpha,
     IndexReducedODE,
     Laid,
@@ -32,7 +31,7 @@ from lgsens.integrate import (
 from lgsens.model import Model
 from lgsens.sensitivity import AbstractSensitivity, DirectDifferentiation, Parameters, saved_run
 from lgsens.simulation._errors import throw_if_failed
-from lgsens.simulation._index_reduced_ode import integrate_ode, ode_failure
+from lgsens.simulation._index_reduced_ode import integrate_ode
 from lgsens.simulation._richardson import extrapolate_runs
 from lgsens.simulation._start import Begin, begin
 from lgsens.simulation._trajectory import Instant, Saved, Trajectory
@@ -189,14 +188,15 @@ def simulate(
     system = as_system(model)
     warn_of_single_precision(system)
     num_steps = as_count(num_steps, "num_steps", " (it is static)")
-    if not _by_diffrax(integrator):
+    by_diffrax = _by_diffrax(integrator)
+    if not by_diffrax:
         check_integrator(integrator, num_steps)
     if not isinstance(sensitivity, AbstractSensitivity):
         raise ValueError(
             "`sensitivity` must be DirectDifferentiation(), AdjointVariable(), ContinuousDirect() or Autodiff(), got "
             f"{sensitivity!r}; ContinuousAdjoint() needs a Criterion, see `differentiate`."
         )
-    if _by_diffrax(integrator) and (sensitivity != DirectDifferentiation() or save is not None):
+    if by_diffrax and (sensitivity != DirectDifferentiation() or save is not None):
         raise ValueError(
             f"`sensitivity` = {sensitivity!r} and `save` need steps of the scheme. With `rtol` diffrax takes its own, "
             "and differentiates them in one direction only (`mode`): leave them out, or leave `rtol` out."
@@ -214,7 +214,7 @@ def check_integrator(integrator: Any, num_steps: int) -> None:
     """Raise `ValueError` for what is no integrator of a scheme, or none of so many steps."""
     if not isinstance(integrator, AbstractIntegrator):
         raise ValueError(f"`integrator` must be a GeneralizedAlpha or another integrator, got {integrator!r}.")
-    _ = integrator.scheme  # which may say why there is none
+    integrator.scheme.require_steps()
     integrator.check(num_steps)
 
 
@@ -232,21 +232,8 @@ def interval(t0, t1):
 @eqx.filter_jit
 def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, save):
     initial = None if state0 is not None else _initial(system, t0)
-    if _by_diffrax(integrator):
-        return _run_ode(system, state0, initial, t0, (t1 - t0) / num_steps, num_steps, integrator)
     start = begin(integrator.scheme, system, t0, state0, initial)
     return run(system, start, t0, t1, num_steps, integrator, sensitivity, save)
-
-
-def _run_ode(system: AbstractSystem, state0, initial, t0, h, num_steps: int, integrator: IndexReducedODE):
-    """`run` with the steps of diffrax."""
-    begun = begin(integrator, system, t0, state0, initial)
-    states, stats = integrate_ode(integrator, num_steps, system, integrator.physical(system, begun.start.state), t0, h)
-    result, details = ode_failure(stats, t0, h)
-    result = jnp.where(begun.result == RESULTS.successful, result, begun.result).astype(jnp.int32)
-    details = jax.lax.stop_gradient(details | {"violation": begun.violation, "jacobian": begun.jacobian})
-    t = EqualGrid(t0, h, num_steps).times()
-    return Trajectory(t, states, result, stats, system, order=integrator.order), details
 
 
 def outcome(scheme: AbstractScheme, begun: Begin, stats: Stats, turns, t, laid: Laid):
@@ -307,7 +294,10 @@ def _single_run(system, begun: Begin, t0, t1, num_steps: int, integrator: Abstra
     grid, t = laid.grid, laid.grid.times()
     state0, parameters = begun.start.at(system, grid.first_size), Parameters(system, grid)
     if save is None:
-        states, newton = sensitivity.trajectory(scheme, state0, parameters, laid.found)
+        if _by_diffrax(scheme):
+            states, newton = integrate_ode(scheme, system, grid, scheme.physical(system, state0))
+        else:
+            states, newton = sensitivity.trajectory(scheme, state0, parameters, laid.found)
         turns = jnp.diff(t) * unsteady_rate(system, states.v[1:], states.vdot[1:])
     else:
         (values, rates), final, newton = saved_run(sensitivity, _Output(save), scheme, state0, parameters)

@@ -1,4 +1,4 @@
-"""The linearized step of the explicit Runge–Kutta scheme: forward substitution, stage by stage (`_explicit`)."""
+"""The end of an explicit Runge–Kutta step, and the linearized step: forward substitution by stages (`_explicit`)."""
 
 from typing import Any, NamedTuple
 
@@ -8,7 +8,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import ConstrainedInertia, Inertia
+from lgsens.dynamics import (
+    AbstractSystem,
+    ConstrainedInertia,
+    Inertia,
+    State,
+    constraint_velocity,
+    factorized_accelerations,
+)
 from lgsens.integrate._linearized import AbstractLinearizedStep, Variation
 from lgsens.liegroups import AbstractLieGroup
 
@@ -26,6 +33,40 @@ class Inner(NamedTuple):
     nu: Float[Array, " m"]
 
 
+def drift(system: AbstractSystem, q, t) -> Float[Array, " m"]:
+    """Φ, and zero in the rows of velocity level."""
+    violation = system.constraint(q, t)
+    return jnp.concatenate([violation, jnp.zeros(system.num_velocity_rows, violation.dtype)])
+
+
+def ended(inertia: Inertia, system: AbstractSystem, q, u, t):
+    """The state at the end of a step, y, μ, d and ν that lead there from q* and u, and max |Φ| before."""
+    found, projected = (jnp.zeros_like(u), u[:0]) * 2, q
+    if system.constraint_names:
+        kkt = ConstrainedInertia.of(inertia, system, q, t)
+        position = kkt.solve(found[0], -drift(system, q, t))
+        projected = system.group.retract(q, position[0])
+        found = *position, *kkt.solve(found[0], -constraint_velocity(system, projected, u, t))
+    v = u + found[2]
+    vdot, lam = factorized_accelerations(inertia, system, projected, v, t)
+    left = lax.stop_gradient(jnp.max(jnp.abs(drift(system, q, t)), initial=0.0))
+    return State(projected, v, vdot, lam, vdot), found, left
+
+
+def corrections(system: AbstractSystem, q, t, found: Inner, projected, u):
+    """P and R, each in two rows; products with A at q* are derivatives of r and c, so no matrix is made."""
+    still = jnp.zeros_like(u)
+
+    def product(x, mu):
+        push = lambda vdot, lam: system.residual(q, still, vdot, lam, t)
+        _, force = jax.jvp(push, (still, jnp.zeros_like(mu)), (x, mu))
+        return force, jax.jvp(lambda v: constraint_velocity(system, q, v, t), (still,), (x,))[1]
+
+    force, rate = jax.vmap(product)(jnp.stack([found.y, found.d]), jnp.stack([found.mu, found.nu]))
+    velocity = constraint_velocity(system, projected, u, t)
+    return (force[0], rate[0] + drift(system, q, t)), (force[1], rate[1] + velocity)
+
+
 class ExplicitLinearizedStep(AbstractLinearizedStep):
     """Derivatives at the solution as linear functions of arrays, and the factors of A; of all stages, stacked."""
 
@@ -40,8 +81,8 @@ class ExplicitLinearizedStep(AbstractLinearizedStep):
     kinematics: Any  # (q_n', x', v') ↦ q' and (T⁻¹ v)', at the stages
     to_end: Any  # (q_n', x') ↦ q*'
     corrected: Any  # (q*', y') ↦ q⁺'
-    position: Any  # q*' ↦ P'
-    velocity: Any  # (q*', q⁺', u') ↦ R'
+    corrections: Any  # q*' ↦ P' and R'
+    velocity: Any  # (q⁺', u') ↦ c'
 
     def forward(self, previous, loads, row):
         group, row = self.group, jax.tree.map(jnp.subtract, row, loads)
@@ -66,10 +107,11 @@ class ExplicitLinearizedStep(AbstractLinearizedStep):
 
         dq, du = self.to_end(dq, self.b @ rates), previous.v + self.b @ vdots
         there = at(self.factors, -1)
-        y, mu = solve(there, (rows.y, rows.mu), self.position(dq))
+        position, (force, rate) = self.corrections(dq)
+        y, mu = solve(there, (rows.y, rows.mu), position)
         w = group.from_ambient(self.end, self.corrected(dq, y)) + row.w
         projected = group.to_ambient(self.end, w)
-        d, nu = solve(there, (rows.d, rows.nu), self.velocity(dq, projected, du))
+        d, nu = solve(there, (rows.d, rows.nu), (force, rate + self.velocity(projected, du)))
         v = du + d + row.v
         vdot, lam = solve(at(self.factors, -2), (row.vdot, row.lam), at(self.motion, -1)(projected, v))
         return Variation(w, v, vdot, lam, vdot + row.a, Inner(*stages, y, mu, d, nu))
