@@ -312,10 +312,6 @@ CONTROLLED = lg.IndexReducedODE(rtol=1e-6)
         ),
         (lambda: lg.AdaptiveSteps(CONTROLLED), says("`rtol` = 1e-06", "Leave `rtol` out")),
         (lambda: lg.Richardson(TSIT5), says("`integrator` must be of second order", "as it is")),
-        (
-            lambda: swing(9.81, 4, sensitivity=lg.ContinuousDirect()),
-            says("ContinuousDirect", "the motion is by IndexReducedODE"),
-        ),
     ],
 )
 def test_bad_input(attempt, message):

@@ -1,5 +1,7 @@
 """`lgsens.testing`: right rules pass, and every kind of wrong rule is found, with its place."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -46,7 +48,7 @@ def wrong(kind, **methods):
         own
         | methods
         | {
-            "__annotations__": {field: jax.Array for field in kind.__dataclass_fields__},
+            "__annotations__": {field.name: jax.Array for field in dataclasses.fields(kind)},
             "__module__": __name__,
         },
     )
@@ -76,7 +78,7 @@ WRONG_CONSTRAINTS = {
         Orthogonality,
         {"coupled": property(lambda self: ((3, 4, 5), (9, 10, 11)))},
         {"K = ∂(Bᵀλ)/∂x"},
-        "rx_b]: 0, not",
+        "_b]: 0, not",
     ),
     "a column left out": (
         Coincidence,
@@ -186,7 +188,7 @@ def test_number_of_rows():
         def value(self, a, b, t):
             return b.position - a.position
 
-    with pytest.raises(ValueError, match=says("Wrong: `value` has shape (3,), `num_rows` is 2")):
+    with pytest.raises(ValueError, match=says("Wrong: `value` or `rate` has shape (3,), `num_rows` is 2")):
         check_joint(Wrong())
 
 
