@@ -71,9 +71,9 @@ def check_joint(
     for label, element in zip(labels, elements):
         rows = jax.eval_shape(_said, element, a, b, jnp.zeros(DIM, scene.dtype), time).shape
         if rows != (element.num_rows,):
+            said = "value" if isinstance(element, AbstractConstraint) else "rate"
             raise ValueError(
-                f"{label or f'{type(element).__name__}: '}`value` or `rate` has shape {rows}, `num_rows` is "
-                f"{element.num_rows}."
+                f"{label or f'{type(element).__name__}: '}`{said}` has shape {rows}, `num_rows` is {element.num_rows}."
             )
         multipliers.append(jnp.asarray(scene.rng.standard_normal(rows), scene.dtype))
     starts, velocity = [scene.displacement(free) for _ in range(poses)], scene.displacement(free)
