@@ -188,7 +188,7 @@ def test_number_of_rows():
         def value(self, a, b, t):
             return b.position - a.position
 
-    with pytest.raises(ValueError, match=says("Wrong: `value` or `rate` has shape (3,), `num_rows` is 2")):
+    with pytest.raises(ValueError, match=says("Wrong: `value` has shape (3,), `num_rows` is 2")):
         check_joint(Wrong())
 
 

@@ -147,8 +147,8 @@ def _kinematics_jit(drive: _Drive, driven, rates):
     states = jax.vmap(lambda *args: forces_of_motion(drive, *args))(found.q, driven, rates)
     first = jnp.argmin(found.found)  # the first that was not found, 0 if all were
     result = jnp.where(jnp.all(found.found), RESULTS.successful, RESULTS.position_failed).astype(jnp.int32)
-    values = jnp.concatenate([driven[0][first], driven[1][first, None]])
-    details = {"violation": found.violation[first], "values": values, "position": first}
+    details = {"violation": found.violation[first], "values": driven[0][first], "time": driven[1][first]}
+    details["position"] = first
     return (states, result), jax.lax.stop_gradient(details)
 
 

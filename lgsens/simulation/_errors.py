@@ -78,8 +78,8 @@ def describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> st
         violation = np.abs(details["violation"])
         worst = int(np.argmax(np.where(np.isfinite(violation), violation, np.inf)))
         return (
-            f"{code.message} It failed at position {int(details['position'])}, driven values and time "
-            f"{np.array2string(details['values'], precision=6)}. Left over: |Φ| = {violation[worst]:.3g}, largest in "
+            f"{code.message} It failed at position {int(details['position'])}, driven values "
+            f"{np.array2string(details['values'], precision=6)}, t = {details['time']:.6g} s. Left over: |Φ| = {violation[worst]:.3g}, largest in "
             f"joint {names[worst]!r}."
         )
     if code is RESULTS.steps_exhausted:
