@@ -40,6 +40,7 @@ from lgsens.integrate import (
 from lgsens.linear import BlockSparse as BlockSparse, DenseLU as DenseLU
 from lgsens.model import (
     AbstractSignal as AbstractSignal,
+    Actuator as Actuator,
     AppliedForce as AppliedForce,
     BumpRoad as BumpRoad,
     Bushing as Bushing,
@@ -50,7 +51,9 @@ from lgsens.model import (
     FlatRoad as FlatRoad,
     Gravity as Gravity,
     Harmonic as Harmonic,
+    MaxwellElement as MaxwellElement,
     Model as Model,
+    PIDController as PIDController,
     Polynomial as Polynomial,
     PrismaticJoint as PrismaticJoint,
     Ramp as Ramp,

@@ -117,6 +117,11 @@ def kinematics(
             f"`model`: {rolling} constrain velocities, so the positions depend on the way to them and not on driven "
             "values alone; use `simulate`."
         )
+    if system.num_states:
+        raise ValueError(
+            f"`model`: the force elements {sorted(system.owners_of_states)} have states, whose values depend on the motion before; use "
+            "`simulate`, or leave them out."
+        )
     unknowns, equations = system.group.dim, len(system.constraint_names)
     if unknowns != equations:
         raise ValueError(

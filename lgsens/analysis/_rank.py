@@ -94,7 +94,7 @@ def constraint_rank(model: Model | AbstractSystem, *, t0=0.0) -> ConstraintRank:
             jacobian, rank = moved, left_null_space(moved)[1]
     m, k = first.shape
     names = tuple(redundant_names(jacobian, system.constraint_names))
-    return ConstraintRank(k, m, rank, reference_rank, names)
+    return ConstraintRank(k - system.num_states, m, rank, reference_rank, names)
 
 
 def _moved(system: AbstractSystem, q, t, direction):

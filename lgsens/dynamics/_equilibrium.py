@@ -3,10 +3,14 @@
 Rows of velocity level hold at rest wherever the mechanism is, if b = 0; their λ_v may carry load. So there are m_v
 equations less than unknowns (a wheel on springs may rest wherever it was rolled to), and in place of each the equation
 0 = 0, which leaves the shortest solution. b ≠ 0 forbids rest.
+
+States z of elements do not vanish at rest, their rates do: of their coordinates the velocity is unknown and not the
+place, and C_t has the columns of their derivatives.
 """
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from lgsens.dynamics._initial import Initial
@@ -33,23 +37,29 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
     scale = lax.stop_gradient(system.coordinate_scale())
     weight = mass_scale(system.mass_matrix())
     eps = float(jnp.finfo(dtype).eps)
+    states = np.arange(k) >= k - system.num_states
+    begun = system.settled(q_ref, zero, t) if system.num_states else zero
 
     def split(z):
         # Multipliers in units of the mass scale × 1 m/s², so that both parts of z are of order one.
-        return z[:k] * scale, z[k:] * weight
+        x, lam = z[:k] * scale, z[k:] * weight
+        return (jnp.where(states, 0.0, x), begun + jnp.where(states, x, 0.0), lam) if states.any() else (x, zero, lam)
 
     def equation(z):
-        x, lam = split(z)
+        x, v, lam = split(z)
         q = group.retract(q_ref, x)
-        force = system.residual(q, zero, zero, lam, t)
+        force = system.residual(q, v, zero, lam, t)
         return jnp.concatenate([force * scale / weight, system.constraint(q, t), unsaid])
 
     def matrix(z):
-        x, lam = split(z)
-        tangents = system.tangents(group.retract(q_ref, x), zero, zero, lam, t)
+        x, v, lam = split(z)
+        tangents = system.tangents(group.retract(q_ref, x), v, zero, lam, t)
         by_x = jax.vmap(lambda row: group.tangent_rmv(x, row))
         jacobian = tangents.constraint_jacobian
-        upper = jnp.concatenate([by_x(tangents.stiffness) * scale[None, :], jacobian.T * weight], axis=1)
+        stiffness = by_x(tangents.stiffness)
+        if states.any():
+            stiffness = jnp.where(states, tangents.damping, stiffness)
+        upper = jnp.concatenate([stiffness * scale[None, :], jacobian.T * weight], axis=1)
         positions = by_x(jacobian) * scale[None, :]
         if unsaid.size:
             positions = positions.at[-unsaid.size :].set(0.0)
@@ -60,9 +70,9 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
         def body(carry):
             z, _, iteration = carry
             step = jnp.linalg.lstsq(matrix(z), equation(z), rcond=1e3 * eps)[0]
-            size = jnp.max(jnp.abs(step[:k]))
+            size, moved = (jnp.max(jnp.abs(step[:end])) for end in (k, k - system.num_states))
             # At most 0.2 rad or a fifth of the scene at a time.
-            return z - step * jnp.minimum(1.0, 0.2 / jnp.maximum(size, 0.2)), size, iteration + 1
+            return z - step * jnp.minimum(1.0, 0.2 / jnp.maximum(moved, 0.2)), size, iteration + 1
 
         def unfinished(carry):
             _, size, iteration = carry
@@ -78,10 +88,10 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
         return jnp.linalg.pinv(slope, rtol=1e3 * eps) @ rhs
 
     z = lax.custom_root(equation, jnp.zeros(k + m, dtype), newton, tangent_solve)
-    x, lam = split(z)
-    state = State(q=group.retract(q_ref, x), v=zero, vdot=zero, lam=lam, a=zero)
+    x, v, lam = split(z)
+    state = State(q=group.retract(q_ref, x), v=v, vdot=zero, lam=lam, a=zero)
     # Forces balance to √eps of the largest joint force or moment, taken as mass scale × 1 m/s² at least.
-    left = jnp.max(jnp.abs(jnp.concatenate([equation(z), system.velocity_constraint(state.q, zero, t)])))
+    left = jnp.max(jnp.abs(jnp.concatenate([equation(z), system.velocity_constraint(state.q, v, t)])))
     balanced = left <= jnp.sqrt(eps) * (1.0 + jnp.max(jnp.abs(z[k:]), initial=0.0))
     result = jnp.where(balanced, RESULTS.successful, RESULTS.equilibrium_failed).astype(jnp.int32)
     return Initial(state, zero, result, system.constraint(state.q, t))

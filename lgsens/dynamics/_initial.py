@@ -169,7 +169,7 @@ def initial_state(system: AbstractSystem, t) -> Initial:
     q, violation = assemble(system, t)
     _, v_ref = system.reference()
     factors = ConstrainedMass.of(system, q, t).factors
-    v = consistent_velocity(system, q, v_ref, t, factors)
+    v = system.settled(q, consistent_velocity(system, q, v_ref, t, factors), t)
     vdot, lam, vddot = acceleration_and_jerk(system, q, v, t, factors)
     state = State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
     dtype = v.dtype

@@ -84,6 +84,17 @@ class AbstractSystem(eqx.Module):
         """A(q, t)."""
         return jnp.zeros_like(self.reference()[1], shape=(0, self.group.dim))
 
+    # States that obey ż = g(q, v, z, t): z is the velocity of a coordinate with unit mass, on which nothing depends.
+
+    @property
+    def num_states(self) -> int:
+        """How many of the coordinates, the last ones, have a state as their velocity."""
+        return 0
+
+    def settled(self, q, v, t) -> Float[Array, " k"]:
+        """v with the initial values of the states."""
+        return v
+
 
 class AbstractSparseSystem(AbstractSystem):
     """A system whose matrices are sums of small blocks, one for each element between two bodies.

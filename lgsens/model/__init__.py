@@ -11,6 +11,12 @@ from lgsens.model._constraints import (
     InPlane as InPlane,
     Orthogonality as Orthogonality,
 )
+from lgsens.model._controls import (
+    Actuator as Actuator,
+    ControlSignals as ControlSignals,
+    MaxwellElement as MaxwellElement,
+    PIDController as PIDController,
+)
 from lgsens.model._drivers import (
     Angle as Angle,
     Displacement as Displacement,
@@ -41,6 +47,7 @@ from lgsens.model._joints import (
 )
 from lgsens.model._loads import (
     AbstractClosedFormLoad as AbstractClosedFormLoad,
+    AbstractDynamicLoad as AbstractDynamicLoad,
     AbstractLoad as AbstractLoad,
     BushingLoad as BushingLoad,
     LineForce as LineForce,

@@ -6,6 +6,7 @@ from collections.abc import Hashable, Mapping
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from lgsens.liegroups import Pose
 from lgsens.model._body import RigidBody
@@ -13,6 +14,7 @@ from lgsens.model._evaluate_by_kind import Row, evaluated, joined, stacked
 from lgsens.model._forces import AbstractForce
 from lgsens.model._frames import Frame, ground_frame
 from lgsens.model._joints import AbstractJoint
+from lgsens.model._loads import carriers, num_states
 from lgsens.model._merge import Group, Place, Places, merged
 from lgsens.model._merged_parts import Parts
 from lgsens.model._on_merged_bodies import carried
@@ -43,8 +45,9 @@ def assemble_merged(
     moving, places = merged(bodies, found)
     parts, names = assemble(bodies, frames, joints, forces), sorted(moving)
     own = [places[name] for name in parts.body_names]
+    states = range(len(names), len(names) + len(parts.free) - len(own))  # of states, the same ones in both systems
     here = ground_frame(parts.mass.dtype)
-    offsets = [here if place.offset is None else place.offset for place in own]
+    offsets = [here if place.offset is None else place.offset for place in own] + [here for _ in states]
     fixed: dict[str | None, list[str]] = {}
     for name, joint in sorted(joints.items()):
         if places[joint.a].body == places[joint.b].body and name in parts.constraint_names:
@@ -52,7 +55,7 @@ def assemble_merged(
     seen = Parts(
         system=parts,
         offset=Frame(*map(jnp.stack, zip(*offsets))),
-        body=tuple(None if place.body is None else names.index(place.body) for place in own),
+        body=(*(None if place.body is None else names.index(place.body) for place in own), *states),
         free=parts.free,
         fixed=tuple(map(tuple, fixed.values())),
     )
@@ -92,12 +95,21 @@ def _assemble(
         for i, (of, kept) in enumerate(zip(row.of, violable_rows(name, joint, single, own))):
             if any(kept):
                 constraints.append(Placed(Row(of, row.index), a, b, name, kept, i))
-    loads = []
+    loads, free = [], [body.coordinates for body in ordered]
     for name, force in sorted(forces.items()):
         for load, *ends in force.loads(moving if force.on_merged else bodies):
             a, b = (places[end] for end in ends)
-            if a.body != b.body or (a.body is not None and not load.balanced):
-                loads.append(Placed(carried(load, a.offset, b.offset), number[a.body], number[b.body], name))
+            own = carriers(num_states(load))
+            if own and a.body is b.body is None:
+                raise ValueError(
+                    f"Force {name!r} has states and acts between bodies that fixed joints hold on the ground; leave it "
+                    "out, or leave `merge_fixed` out."
+                )
+            if own or a.body != b.body or (a.body is not None and not load.balanced):
+                here = tuple(range(len(free), len(free) + len(own)))
+                element = carried(load, a.offset, b.offset)
+                loads.append(Placed(element, number[a.body], number[b.body], name, carriers=here))
+                free.extend(own)
     kinds = [
         (jnp.shape(body.inertia) if body.inertia is not None else None, body.pivot is None, body.mass.dtype)
         for body in ordered
@@ -105,17 +117,24 @@ def _assemble(
     inertia, centre = joined(evaluated(_inertia, [(body,) for body in ordered], kinds))
     if moving is not bodies:
         frames = joined([body.frame for body in ordered])
+    mass = stacked([body.mass for body in ordered])
+    velocity = jnp.concatenate([part for body in ordered for part in body.free_velocity])
+    if more := len(free) - len(ordered):
+        add = lambda of, value: jnp.concatenate([of, jnp.broadcast_to(value, (more, *of.shape[1:])).astype(of.dtype)])
+        mass, inertia, centre = add(mass, 1.0), add(inertia, 0.0), add(centre, 0.0)
+        frames = Frame(add(frames.position, 0.0), add(frames.orientation, np.eye(3)))
+        velocity = jnp.concatenate([velocity, jnp.zeros(sum(map(len, free[len(ordered) :])), mass.dtype)])
     return MultibodySystem(
-        mass=stacked([body.mass for body in ordered]),
+        mass=mass,
         inertia=inertia,
         pose=Pose(*frames),
-        velocity=jnp.concatenate([part for body in ordered for part in body.free_velocity]),
+        velocity=velocity,
         centre=centre if any(body.pivot is not None for body in ordered) else None,
         constraints=stack(constraints),
         loads=stack(loads),
         parts=parts,
         body_names=names,
-        free=tuple(body.coordinates for body in ordered),
+        free=tuple(free),
         assembled=all(joint.assembled for joint in joints.values()),
         linear_solver=None,
         minimum_norm=False,

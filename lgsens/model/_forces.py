@@ -13,6 +13,7 @@ from lgsens._validate import number_field, point_field
 from lgsens.model._body import RigidBody
 from lgsens.model._frames import Frame, ground_frame
 from lgsens.model._loads import (
+    AbstractDynamicLoad,
     AbstractLoad,
     BushingLoad,
     PointForce,
@@ -27,7 +28,7 @@ from lgsens.model._signals import AbstractSignal, prepared
 class Attached(NamedTuple):
     """A load and the two bodies that it acts between; None is the ground."""
 
-    load: AbstractLoad
+    load: AbstractLoad | AbstractDynamicLoad
     a: str | None
     b: str | None
 

@@ -10,12 +10,14 @@ from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens.liegroups import cross, skew
 from lgsens.model._elements import AbstractElement, body_fixed
 from lgsens.model._frames import (
     BODY_B,
+    BODY_DIM,
     ROTATION,
     ROTATION_A,
     ROTATION_B,
@@ -53,6 +55,68 @@ class AbstractLoad(AbstractElement):
     def measure(self, a: Frame, b: Frame, va, vb, t) -> Any:
         """What `Trajectory.force` shows of it."""
         return self.force(a, b, va, vb, t)
+
+
+class AbstractDynamicLoad(AbstractElement):
+    """A force between two bodies that depends on states of its own, which obey ż = g(q, v, z, t).
+
+    A state is the velocity of a coordinate with unit mass, of which an element has as many as states: then Q and g
+    together are one generalized force, and autodiff gives the tangents of both. `states` are their names.
+    """
+
+    drawn = "spring"
+
+    @property
+    @abc.abstractmethod
+    def states(self) -> tuple[str, ...]:
+        """The names of its states z, one or more."""
+
+    @abc.abstractmethod
+    def force(self, a: Frame, b: Frame, va, vb, t, z) -> Float[Array, "12"]:
+        """Q at the given poses, velocities [ẋ, Ω] of shape (6,) each, time [s], and states."""
+
+    @abc.abstractmethod
+    def rate(self, a: Frame, b: Frame, va, vb, t, z) -> Float[Array, " s"]:
+        """g there."""
+
+    @abc.abstractmethod
+    def initial(self, a: Frame, b: Frame, va, vb, t) -> Float[Array, " s"]:
+        """z at the start of a motion."""
+
+    def size(self, length) -> Float[Array, " s"]:
+        """A large change of each state over 1 s, in a scene of this length [m]: for tolerances of steps."""
+        return jnp.ones(len(self.states), length.dtype)
+
+    def measure(self, a: Frame, b: Frame, va, vb, t, z) -> Any:
+        """What `Trajectory.force` shows of it."""
+        return self.force(a, b, va, vb, t, z)
+
+
+_COORDINATES = 3  # of one carrier of states: the translations of what else would be a body
+
+
+def places_of_states(count: int) -> tuple[int, ...]:
+    """Where states are among the coordinates of an element, after those of its two bodies: three in every six."""
+    return tuple(2 * BODY_DIM + BODY_DIM * (i // _COORDINATES) + i % _COORDINATES for i in range(count))
+
+
+def carriers(count: int) -> tuple[tuple[int, ...], ...]:
+    """The free coordinates of each carrier of this many states."""
+    return tuple(tuple(range(min(_COORDINATES, count - i))) for i in range(0, count, _COORDINATES))
+
+
+def num_states(load: AbstractLoad | AbstractDynamicLoad) -> int:
+    return len(load.states) if isinstance(load, AbstractDynamicLoad) else 0
+
+
+def generalized_force(load: Any, a: Frame, b: Frame, va, vb, t, *z) -> Float[Array, " n"]:
+    """Q, and where there are states z the force g on their carriers, n = 12 + 6 for each three of them."""
+    force = load.force(a, b, va, vb, t, *z)
+    if not z:
+        return force
+    rate = load.rate(a, b, va, vb, t, *z)
+    zeros = jnp.zeros(BODY_DIM * (2 + len(carriers(rate.shape[0]))), force.dtype)
+    return zeros.at[: 2 * BODY_DIM].set(force).at[np.asarray(places_of_states(rate.shape[0]))].set(rate)
 
 
 class AbstractClosedFormLoad(AbstractLoad):

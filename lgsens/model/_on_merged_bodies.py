@@ -17,7 +17,7 @@ from lgsens.liegroups import cross, turn, turn_back
 from lgsens.model._constraints import AbstractConstraint, AbstractVelocityConstraint
 from lgsens.model._elements import AbstractElement, fixed_fields
 from lgsens.model._frames import BODY_A, BODY_B, ROTATION, Frame
-from lgsens.model._loads import AbstractLoad
+from lgsens.model._loads import AbstractDynamicLoad, AbstractLoad
 
 # How what is fixed to a part is fixed to its body.
 _SEEN = {
@@ -36,7 +36,11 @@ def carried(element: AbstractElement, a: Frame | None, b: Frame | None, *, by_fr
         return element
     fields = fixed_fields(element)
     if by_frames or not fields:
-        kinds = {AbstractConstraint: _CarriedConstraint, AbstractVelocityConstraint: _CarriedVelocityConstraint}
+        kinds = {
+            AbstractConstraint: _CarriedConstraint,
+            AbstractVelocityConstraint: _CarriedVelocityConstraint,
+            AbstractDynamicLoad: _CarriedDynamicLoad,
+        }
         kind: Any = next((kinds[base] for base in kinds if isinstance(element, base)), _CarriedLoad)
         return kind(element, a, b)
     parts = {"a": a, "b": b}
@@ -107,17 +111,47 @@ class _CarriedVelocityConstraint(AbstractVelocityConstraint):
         return self.element.rate(*frames, _velocity(a, va, self.a), _velocity(b, vb, self.b), t)
 
 
+def _of_parts(load, a, b, va, vb):
+    return _frame(a, load.a), _frame(b, load.b), _velocity(a, va, load.a), _velocity(b, vb, load.b)
+
+
+def _carried_force(load, a, b, va, vb, *others):
+    of_parts = load.element.force(*_of_parts(load, a, b, va, vb), *others)
+    return jnp.concatenate([_force(a, of_parts[BODY_A], load.a), _force(b, of_parts[BODY_B], load.b)])
+
+
 class _CarriedLoad(AbstractLoad):
     element: AbstractLoad
     a: Frame | None
     b: Frame | None
 
-    def _of_parts(self, a, b, va, vb):
-        return _frame(a, self.a), _frame(b, self.b), _velocity(a, va, self.a), _velocity(b, vb, self.b)
-
     def force(self, a, b, va, vb, t):
-        of_parts = self.element.force(*self._of_parts(a, b, va, vb), t)
-        return jnp.concatenate([_force(a, of_parts[BODY_A], self.a), _force(b, of_parts[BODY_B], self.b)])
+        return _carried_force(self, a, b, va, vb, t)
 
     def measure(self, a, b, va, vb, t):
-        return self.element.measure(*self._of_parts(a, b, va, vb), t)
+        return self.element.measure(*_of_parts(self, a, b, va, vb), t)
+
+
+class _CarriedDynamicLoad(AbstractDynamicLoad):
+    element: AbstractDynamicLoad
+    a: Frame | None
+    b: Frame | None
+
+    @property
+    def states(self):
+        return self.element.states
+
+    def force(self, a, b, va, vb, t, z):
+        return _carried_force(self, a, b, va, vb, t, z)
+
+    def rate(self, a, b, va, vb, t, z):
+        return self.element.rate(*_of_parts(self, a, b, va, vb), t, z)
+
+    def initial(self, a, b, va, vb, t):
+        return self.element.initial(*_of_parts(self, a, b, va, vb), t)
+
+    def size(self, length):
+        return self.element.size(length)
+
+    def measure(self, a, b, va, vb, t, z):
+        return self.element.measure(*_of_parts(self, a, b, va, vb), t, z)

@@ -22,16 +22,25 @@ from lgsens.model._constraints import (
     AbstractVelocityConstraint,
 )
 from lgsens.model._evaluate_by_kind import Row, joined
-from lgsens.model._frames import ALL, BODY_A, BODY_B, TURNING_A, TURNING_B, Frame, ground_frame
-from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, LoadTangents
+from lgsens.model._frames import ALL, BODY_A, BODY_B, BODY_DIM, ROTATION, TURNING_A, TURNING_B, Frame, ground_frame
+from lgsens.model._loads import (
+    AbstractClosedFormLoad,
+    AbstractDynamicLoad,
+    AbstractLoad,
+    LoadTangents,
+    generalized_force,
+    num_states,
+    places_of_states,
+)
 from lgsens.model._topology import Ends
 
-Element = TypeVar("Element", AbstractRows, AbstractLoad)
+Element = TypeVar("Element", AbstractRows, AbstractLoad | AbstractDynamicLoad)
 
 
 class Placed(NamedTuple, Generic[Element]):
     """An element, or a `Row` of such, the numbers of its two bodies (None: the ground), the name of its owner; of a
-    constraint, which of its equations are kept, and which one of its joint's it is."""
+    constraint, which of its equations are kept, and which one of its joint's it is; of a load, what carries its states.
+    """
 
     element: Element | Row
     a: int | None
@@ -39,6 +48,7 @@ class Placed(NamedTuple, Generic[Element]):
     owner: str
     kept: tuple[bool, ...] = ()
     place: int = 0
+    carriers: tuple[int, ...] = ()
 
 
 class AtEnds(NamedTuple):
@@ -57,6 +67,7 @@ class Stack(eqx.Module, Generic[Element]):
     owners: tuple[str, ...] = eqx.field(static=True)
     kept: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
     places: tuple[int, ...] = eqx.field(static=True)
+    carriers: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())  # of states, as `a` and `b`
 
     def __check_init__(self):
         name, acts_on = type(self.elements).__name__, self.elements.acts_on
@@ -80,20 +91,24 @@ class Stack(eqx.Module, Generic[Element]):
                 f"got {sets!r}. Leave it out where all twelve may be coupled."
             )
 
-    @property
-    def part(self) -> slice:
-        """The element coordinates that belong to bodies; the ground has none."""
-        return BODY_B if self.a is None else BODY_A if self.b is None else slice(BODY_A.start, BODY_B.stop)
-
-    def acting(self, arrays: Float[Array, "... 12"]) -> Float[Array, "... p"]:
+    def acting(self, arrays: Float[Array, "... n"]) -> Float[Array, "... p"]:
         """The entries that belong to bodies and that the element acts on, in the order of `Topology`'s columns."""
-        return entries_at(arrays[..., self.part], self.ends.places(self.elements.acts_on))
+        ends = self.ends
+        return entries_at(arrays, ends.own[ends.places(ends.acts_on)])
+
+    def states(self, twist: Float[Array, "N 6"]) -> tuple[Float[Array, "e s"], ...]:
+        """The states of its elements, if these have any, from [ẋ, Ω] of the bodies."""
+        if not self.carriers:
+            return ()
+        translations = [twist[np.asarray(of), : ROTATION.start] for of in self.carriers]
+        return (jnp.concatenate(translations, axis=1)[:, : num_states(self.elements)],)
 
     @property
     def ends(self) -> Ends:
         found = Ends(self.a, self.b, self.owners, self.kept, acts_on=self.elements.acts_on)
         if not isinstance(self.elements, AbstractRows):
-            return found
+            places = places_of_states(num_states(self.elements))
+            return found._replace(carriers=self.carriers, acts_on=(*found.acts_on, *places))
         velocity = isinstance(self.elements, AbstractVelocityConstraint)
         return found._replace(relative=self.elements.relative, coupled=self.elements.coupled, velocity=velocity)
 
@@ -102,7 +117,8 @@ class Stack(eqx.Module, Generic[Element]):
         own = slice(i, i + 1)
         a, b = (None if side is None else side[own] for side in (self.a, self.b))
         elements = jax.tree.map(lambda leaf: leaf[own], self.elements)
-        return Stack(elements, a, b, self.owners[own], self.kept[own], self.places[own])
+        carriers = tuple(of[own] for of in self.carriers)
+        return Stack(elements, a, b, self.owners[own], self.kept[own], self.places[own], carriers)
 
     def map(self, function, ends: AtEnds, extra: Sequence[Any] = ()):
         """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra)` for every element; `ends`: of `at_ends`.
@@ -162,6 +178,7 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
                 owners=tuple(m.owner for m in members),
                 kept=tuple(m.kept for m in members),
                 places=tuple(m.place for m in members),
+                carriers=tuple(zip(*(m.carriers for m in members))),
             )
         )
     return tuple(sorted(stacks, key=lambda stack: stack.ends.velocity))
@@ -214,11 +231,17 @@ def square_blocks(matrices: Float[Array, "e n n"], places: np.ndarray) -> Float[
     return entries_at(entries_at(matrices, places), places, axis=1)
 
 
-def load_tangents(element: AbstractLoad, a: Frame, b: Frame, va, vb, t) -> LoadTangents:
-    """∂Q/∂q and ∂Q/∂v of one element."""
+def load_tangents(element: AbstractLoad | AbstractDynamicLoad, a: Frame, b: Frame, va, vb, t, *z) -> LoadTangents:
+    """∂Q/∂q and ∂Q/∂v of one element; with states z, of Q and g by the coordinates of bodies and carriers."""
     if isinstance(element, AbstractClosedFormLoad):
         return element.tangents(a, b, va, vb, t)
-    zero = jnp.zeros(12, a.position.dtype)
-    position = jax.jacfwd(lambda x: element.force(moved(a, x[BODY_A]), moved(b, x[BODY_B]), va, vb, t))(zero)
-    velocity = jax.jacfwd(lambda x: element.force(a, b, va + x[BODY_A], vb + x[BODY_B], t))(zero)
+    force = lambda a, b, va, vb, *z: generalized_force(element, a, b, va, vb, t, *z)
+    zero = jnp.zeros(2 * BODY_DIM, a.position.dtype)
+    position = jax.jacfwd(lambda x: force(moved(a, x[BODY_A]), moved(b, x[BODY_B]), va, vb, *z))(zero)
+    velocity = jax.jacfwd(lambda x: force(a, b, va + x[BODY_A], vb + x[BODY_B], *z))(zero)
+    if z:
+        wide = jnp.zeros((len(position), len(position)), zero.dtype)
+        by_states = jax.jacfwd(lambda z: force(a, b, va, vb, z))(*z)
+        position, velocity = (wide.at[:, : 2 * BODY_DIM].set(part) for part in (position, velocity))
+        velocity = velocity.at[:, np.asarray(places_of_states(len(*z)))].set(by_states)
     return LoadTangents(position, velocity)

@@ -20,7 +20,7 @@ class Summary:
         bodies: for each body its degrees of freedom, names as in `RigidBody.free`; for a part of a merged body those
             of that body.
         equations: for each joint the number of its equations; those that its bodies cannot violate do not count.
-        coordinates: number of unknown coordinates k.
+        coordinates: number of unknown coordinates k, without states of force elements.
         constraints: number of constraint equations m, and of multipliers.
         table: what `print` shows.
     """
@@ -51,7 +51,7 @@ def summarize(
     constraint_names = system.constraint_names
     count = Counter(constraint_names)
     equations = {name: count[name] for name in joints}
-    coordinates = sum(map(len, system.free))
+    coordinates = system.group.dim - system.num_states
     part_of = {part: group for group in groups if group.name not in bodies for part in group.parts}
     lines = [f"Bodies ({len(bodies)}): mass [kg], free coordinates"]
     lines += _columns([(name, _mass(body), _free(body, part_of.get(name))) for name, body in bodies.items()])
@@ -66,6 +66,8 @@ def summarize(
         ("Constraint equations", len(constraint_names)),
         ("Degrees of freedom", coordinates - len(constraint_names)),
     ]
+    if system.num_states:
+        totals.append(("States of forces", system.num_states))
     lines += [f"{what:<24}{number:>5}" for what, number in totals]
     free = {name: part_of[name].free if name in part_of else body.free for name, body in bodies.items()}
     return Summary(free, equations, coordinates, len(constraint_names), "\n".join(lines))

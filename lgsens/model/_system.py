@@ -15,7 +15,7 @@ from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew, turn
 from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, chosen
 from lgsens.model._constraints import AbstractRows
 from lgsens.model._frames import BODY_DIM, ROTATION
-from lgsens.model._loads import AbstractLoad
+from lgsens.model._loads import AbstractDynamicLoad, AbstractLoad, generalized_force
 from lgsens.model._merged_parts import Parts
 from lgsens.model._stack import (
     Stack,
@@ -44,7 +44,8 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     and what the loads and joints add, of which the rows and columns of the coordinates that bodies have (`free`) are
     assembled, and of joints the equations that these can violate. Built by `Model.system()`; the order of bodies is
     that of `body_names`, of multipliers that of the stacks. x_i is the origin of the body frame and J the
-    inertia about it: where that is not the centre of mass (`centre`), the body does not translate.
+    inertia about it: where that is not the centre of mass (`centre`), the body does not translate. After the bodies
+    come the carriers of the states of loads, without names: points of unit mass, whose velocities the states are.
     """
 
     mass: Float[Array, " N"]
@@ -53,7 +54,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     velocity: Float[Array, " k"]  # reference velocity
     centre: Float[Array, "N 3"] | None  # centre of mass in the body frame; None: its origin, for all bodies
     constraints: tuple[Stack[AbstractRows], ...]  # those of velocity level last
-    loads: tuple[Stack[AbstractLoad], ...]
+    loads: tuple[Stack[AbstractLoad | AbstractDynamicLoad], ...]
     parts: "Parts[MultibodySystem] | None"  # of merged bodies
     body_names: tuple[str, ...] = eqx.field(static=True)
     free: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # the coordinates, 0 to 5, of each body
@@ -136,8 +137,9 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         the radius of gyration of all of them: a moment counts as a force at the arm l."""
         if not self.minimum_norm:
             return None
-        mass = jnp.mean(self.mass)
-        square = jnp.mean(jnp.trace(self.inertia, axis1=1, axis2=2)) / (3.0 * mass)
+        count = len(self.body_names)
+        mass = jnp.mean(self.mass[:count])
+        square = jnp.mean(jnp.trace(self.inertia[:count], axis1=1, axis2=2)) / (3.0 * mass)
         square = jnp.where(square > 0, square, 1.0)
         angular, t = [], jnp.zeros((), mass.dtype)
         for stack, ends, rows in zip(self.constraints, at_ends(self.constraints, self.pose), self.topology.rows):
@@ -200,15 +202,53 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
 
     def coordinate_scale(self):
         # The scene's length: the extent of the centres of mass, or the largest arm of an attachment.
-        extents = [jnp.ptp(self.pose.position, axis=0)]
+        extents = [jnp.ptp(self.pose.position[: len(self.body_names)], axis=0)]
         for stack in (*self.constraints, *self.loads):
             extents += [jnp.abs(arm).max(axis=0) for arm in stack.elements.fixed("point")]
         length = jnp.max(jnp.stack(extents))
         body = jnp.ones(BODY_DIM, length.dtype)
         scale = body.at[: ROTATION.start].set(jnp.where(length > 0, length, 1.0))
-        if isinstance(self.group, Poses):
-            return scale[np.concatenate([np.asarray(own, int) for own in self.free])]
-        return jnp.tile(scale, len(self.body_names))
+        if not isinstance(self.group, Poses):
+            return jnp.tile(scale, len(self.body_names))
+        every = scale[np.concatenate([np.asarray(own, int) for own in self.free])]
+        for stack in self._dynamic:
+            sizes = jax.vmap(lambda load, length: load.size(length), in_axes=(0, None))(stack.elements, scale[0])
+            every = every.at[self._of_states(stack)].set(sizes)
+        return every
+
+    @property
+    def num_states(self):
+        return sum(map(len, self.free[len(self.body_names) :]))
+
+    @property
+    def _dynamic(self) -> list[Stack[AbstractDynamicLoad]]:
+        """The stacks of loads with states."""
+        return [stack for stack in self.loads if stack.carriers]
+
+    def _of_states(self, stack: Stack[AbstractDynamicLoad]) -> np.ndarray:
+        """The coordinates of the states of each element of a stack, shape (elements, s)."""
+        return np.concatenate([self.index[list(of), : ROTATION.start] for of in stack.carriers], axis=1)[
+            :, : len(stack.elements.states)
+        ]
+
+    def settled(self, q, v, t):
+        stacks = self._dynamic
+        for stack, ends in zip(stacks, at_ends(stacks, self._placed(q), self.twists(v))):
+            v = v.at[self._of_states(stack)].set(stack.map(lambda load, *args: load.initial(*args), ends, (t,)))
+        return v
+
+    @property
+    def owners_of_states(self) -> dict[str, tuple[Stack[AbstractDynamicLoad], int]]:
+        """The stack of each element with states and its place there, by its name."""
+        return {owner: (stack, i) for stack in self._dynamic for i, owner in enumerate(stack.owners)}
+
+    def states_of(self, force: str, v: Float[Array, "*batch k"]) -> dict[str, Float[Array, "*batch"]]:
+        """The states of the element `force` by their names, along leading axes."""
+        known = self.owners_of_states
+        if force not in known:
+            raise ValueError(f"`states_of`: {suggestion(force, known)}, the force elements with states.")
+        stack, i = known[force]
+        return {name: v[..., place] for name, place in zip(stack.elements.states, self._of_states(stack)[i])}
 
     def mass_matrix(self):
         return self.sparse_mass_matrix().dense()
@@ -254,7 +294,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         topology = self.topology
         forces = [(jnp.concatenate([force, moment], axis=1), topology.mass.rows)]
         for stack, ends, coordinates in zip(self.loads, at_ends(self.loads, q, twist), topology.forces):
-            force = stack.map(lambda e, a, b, va, vb, t: e.force(a, b, va, vb, t), ends, (t,))
+            force = stack.map(generalized_force, ends, (t, *stack.states(twist)))
             forces.append((-stack.acting(force), coordinates))
         for stack, ends, pattern in zip(self.constraints, at_ends(self.constraints, q), topology.jacobian):
             force = stack.map(constraint_force, ends, (chosen(lam, pattern.rows), t))
@@ -314,16 +354,15 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             gyroscopic = jax.vmap(skew)(spin) @ self.inertia - jax.vmap(skew)(momentum)
             damping.append(Blocks(gyroscopic, topology.gyroscopic))
         for stack, ends, pattern in zip(self.loads, at_ends(self.loads, q, twist), topology.loads):
-            part = stack.part
-            position, velocity = stack.map(load_tangents, ends, (t,))
+            own = stack.ends.own
+            position, velocity = stack.map(load_tangents, ends, (t, *stack.states(twist)))
             if position is not None:
-                stiffness.append(Blocks(-position[:, part, part], pattern))
+                stiffness.append(Blocks(-square_blocks(position, own), pattern))
             if velocity is not None:
-                damping.append(Blocks(-velocity[:, part, part], pattern))
+                damping.append(Blocks(-square_blocks(velocity, own), pattern))
         placed = zip(self.constraints, at_ends(self.constraints, q), topology.rows, topology.stiffness)
         for stack, ends, rows, coupled in placed:
-            part = stack.part
-            block = stack.map(constraint_stiffness, ends, (chosen(lam, rows), t))[:, part, part]
+            block = square_blocks(stack.map(constraint_stiffness, ends, (chosen(lam, rows), t)), stack.ends.own)
             stiffness.extend(Blocks(square_blocks(block, places), pattern) for places, pattern in coupled)
         return Tangents(self._square(stiffness), self._square(damping), self.sparse_constraint_jacobian(q, t))
 
@@ -337,7 +376,8 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             raise ValueError(f"`force`: {force!r} acts on {len(found)} bodies and has no single value.")
 
         def at_time(q, v, t):
-            (ends,) = at_ends(found, self._placed(q), self.twists(v))
-            return found[0].map(lambda e, *args: e.measure(*args), ends, (t,))
+            twist = self.twists(v)
+            (ends,) = at_ends(found, self._placed(q), twist)
+            return found[0].map(lambda e, *args: e.measure(*args), ends, (t, *found[0].states(twist)))
 
         return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(at_time)(q, v, t))

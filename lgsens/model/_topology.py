@@ -21,16 +21,26 @@ class Ends(NamedTuple):
     coupled: tuple[tuple[int, ...], ...] = ()  # likewise
     acts_on: tuple[int, ...] = ALL  # likewise, and of loads
     velocity: bool = False  # of constraints, whether their rows have velocity level only
+    carriers: tuple[tuple[int, ...], ...] = ()  # of loads with states: the bodies that carry them
+
+    @property
+    def _sides(self) -> list[tuple[int, tuple[int, ...]]]:
+        """The place of each side that is not the ground, and its bodies."""
+        return [(i, side) for i, side in enumerate((self.a, self.b, *self.carriers)) if side is not None]
 
     @property
     def slots(self) -> np.ndarray:
-        """The bodies of each element, shape (elements, 1 or 2)."""
-        return np.stack([np.asarray(side, int) for side in (self.a, self.b) if side is not None], axis=1)
+        """The bodies of each element, carriers of states too, shape (elements, 1 or more)."""
+        return np.stack([np.asarray(side, int) for _, side in self._sides], axis=1)
+
+    @property
+    def own(self) -> np.ndarray:
+        """The coordinates of an element that belong to bodies, 0 … 11 or more; the ground has none."""
+        return np.concatenate([BODY_DIM * i + np.arange(BODY_DIM) for i, _ in self._sides])
 
     def places(self, coordinates: tuple[int, ...]) -> np.ndarray:
-        """Where these of the twelve are among those of bodies; the ground has none."""
-        places = np.asarray(coordinates, int) - (0 if self.a is not None else BODY_DIM)
-        return places[(places >= 0) & (places < BODY_DIM * self.slots.shape[1])]
+        """Where these increasing coordinates are among `own`."""
+        return np.flatnonzero(np.isin(self.own, coordinates))
 
 
 class Topology:

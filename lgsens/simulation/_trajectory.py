@@ -93,11 +93,18 @@ class AbstractMotion(eqx.Module):
         system, (states, t) = self._multibody(), self._kinematics()
         return system.multiplier(joint, states.q, states.v, states.vdot, states.lam, t)
 
+    def states_of(self, force: str) -> dict[str, Float[Array, "*n"]]:
+        """The states of a force element (`Actuator`, `PIDController`, `MaxwellElement`) by their names, shape (n+1,).
+
+        Raises `ValueError` for an unknown name, or an element without states.
+        """
+        return self._multibody().states_of(force, self._kinematics()[0].v)
+
     def force(self, name: str) -> Any:
         """What a force element measures, every array with a leading axis n + 1 if this is a trajectory.
 
         A `SpringDamper` gives its `LineForce` (length [m], rate [m/s], tension [N]), a `TyreSpring` its normal
-        force [N], shape (n+1,); other elements the generalized force [F_a, M_a, F_b, M_b] that they apply.
+        force [N], shape (n+1,); a `PIDController` its `ControlSignals`; other elements the generalized force [F_a, M_a, F_b, M_b] that they apply.
         Raises `ValueError` for an unknown name, or one of several loads (gravity).
         """
         states, t = self._kinematics()
