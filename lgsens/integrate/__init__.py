@@ -16,14 +16,17 @@ from lgsens.integrate._grid import (
     AbstractGrid as AbstractGrid,
     AbstractLink as AbstractLink,
     EqualGrid as EqualGrid,
-    Node as Node,
     UnevenGrid as UnevenGrid,
     earlier as earlier,
     later as later,
     with_first as with_first,
 )
 from lgsens.integrate._index3 import factorize_iteration_matrix as factorize_iteration_matrix
-from lgsens.integrate._linearized import AbstractLinearizedStep as AbstractLinearizedStep, Variation as Variation
+from lgsens.integrate._linearized import (
+    AbstractLinearizedStep as AbstractLinearizedStep,
+    Node as Node,
+    Variation as Variation,
+)
 from lgsens.integrate._march import (
     Mark as Mark,
     Progress as Progress,

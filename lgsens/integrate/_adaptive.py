@@ -33,8 +33,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
-from lgsens.integrate._grid import Node, UnevenGrid, with_first
+from lgsens.integrate._grid import UnevenGrid, with_first
 from lgsens.integrate._lanes import in_any_lane
+from lgsens.integrate._linearized import Node
 from lgsens.integrate._march import Progress, Walk, chosen
 from lgsens.integrate._pace import UnevenPace
 from lgsens.integrate._scheme import AbstractIntegrator, AbstractScheme, Laid, Start, Stats, scheme_of

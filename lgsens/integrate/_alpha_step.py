@@ -14,8 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate._alpha import AbstractAlpha, Motion
-from lgsens.integrate._grid import Node
-from lgsens.integrate._linearized import AbstractLinearizedStep
+from lgsens.integrate._linearized import AbstractLinearizedStep, Node
 from lgsens.linear import LU, Inverse
 
 

@@ -166,7 +166,8 @@ class IndexReducedODE(AbstractScheme):
             a[i + 1, : i + 1] = row
         return Coefficients(a, np.asarray(tableau.b_sol)[:used], np.concatenate([[0.0], tableau.c])[:used])
 
-    def _arrays(self, dtype) -> Coefficients:
+    def arrays(self, dtype) -> Coefficients:
+        """The same in JAX."""
         return Coefficients(*(jnp.asarray(each, dtype) for each in self.coefficients))
 
     # How a motion begins, and what is seen of it.
@@ -192,7 +193,7 @@ class IndexReducedODE(AbstractScheme):
         if states.inner is None:  # by the control of diffrax, or without what is in between
             return None
         retract = jax.vmap(system.group.retract, (None, 0))
-        _, b, c = self._arrays(states.v.dtype)
+        _, b, c = self.arrays(states.v.dtype)
         places = grid.places()
         nodes, begun, found = jax.vmap(grid.node)(places), earlier(states), later(states).inner
         q = jax.vmap(retract)(begun.q, found.x)
@@ -216,7 +217,7 @@ class IndexReducedODE(AbstractScheme):
 
     def take(self, system, shared, before, begun, memory, node, running):
         group, h = system.group, node.h
-        a, b, c = self._arrays(h.dtype)
+        a, b, c = self.arrays(h.dtype)
 
         def stage(slopes, inputs):
             i, weights, t = inputs
@@ -253,7 +254,7 @@ class IndexReducedODE(AbstractScheme):
         """x and u of the end, x_i and v_i of the stages, as the slopes give them."""
         rates = with_first(previous.v, jax.vmap(system.group.tangent_inv_mv)(found.x, found.v))
         vdots = with_first(previous.vdot, found.vdot)
-        a, b, _ = (node.h * each for each in self._arrays(node.h.dtype))
+        a, b, _ = (node.h * each for each in self.arrays(node.h.dtype))
         return b @ rates, previous.v + b @ vdots, (a[1:] @ rates, previous.v[None] + a[1:] @ vdots)
 
     def _points(self, system, node, previous, state):
@@ -261,7 +262,7 @@ class IndexReducedODE(AbstractScheme):
         found = state.inner
         q = jax.vmap(system.group.retract, (None, 0))(previous.q, found.x)
         points = _followed((q, found.v, found.vdot, found.lam), (state.q, state.v, state.vdot, state.lam))
-        c = self._arrays(node.h.dtype).c
+        c = self.arrays(node.h.dtype).c
         return _followed(node.begin + c[1:] * node.h, node.t), points
 
     # Sensitivities.
@@ -287,12 +288,9 @@ class IndexReducedODE(AbstractScheme):
             function = lambda q, x, v: (group.retract(q, x), group.tangent_inv_mv(x, v))
             return jax.linearize(function, previous.q, x, v)[1]
 
-        a, b, _ = (node.h * each for each in self._arrays(node.h.dtype))
         return ExplicitLinearizedStep(
+            scheme=self,
             group=group,
-            inertia=shared,
-            a=a[1:],
-            b=b,
             begun=previous.q,
             end=state.q,
             factors=jax.vmap(factors)(_followed(times, node.t), _followed(points[0], q)),

@@ -24,16 +24,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from lgsens.dynamics import State
-from lgsens.integrate._linearized import Variation
+from lgsens.integrate._linearized import Node, Variation
 from lgsens.integrate._pace import AbstractPace, EqualPace, UnevenPace
-
-
-class Node(NamedTuple):
-    """One step in time, or a tangent or cotangent of it."""
-
-    begin: Float[Array, ""]
-    t: Float[Array, ""]  # its end
-    h: Float[Array, ""]
 
 
 class Resizes(Protocol):

@@ -74,7 +74,6 @@ from lgsens.integrate._alpha import AbstractAlpha, advance, increment
 from lgsens.integrate._alpha_step import AbstractEquations, AbstractStep
 from lgsens.integrate._linearized import AbstractLinearizedStep, Variation
 from lgsens.integrate._singular import margin_by_mass, margin_of
-from lgsens.liegroups import AbstractLieGroup
 from lgsens.linear import LU, Factors, Matrix
 
 
@@ -130,10 +129,6 @@ class Loads(NamedTuple):
 class Index3LinearizedStep(AbstractLinearizedStep):
     """The equations above, and the factors of S at the converged state."""
 
-    scheme: AbstractAlpha = eqx.field(static=True)
-    group: AbstractLieGroup = eqx.field(static=True)
-    mass: Matrix
-    h: Float[Array, ""]
     x: Float[Array, " k"]
     tangents: Tangents
     factors: Factors
@@ -142,15 +137,15 @@ class Index3LinearizedStep(AbstractLinearizedStep):
         """See `_singular`."""
         return margin_of(self.factors, self.tangents.constraint_jacobian, scale)
 
-    def forward(self, previous, loads, row):
-        scheme, group, h, x = self.scheme, self.group, self.h, self.x
+    def forward(self, shared, node, previous, loads, row):
+        scheme, group, h, x = shared.scheme, shared.system.group, node.h, self.x
         k_t, c_t, jacobian = self.tangents
         dx = h * previous.v + (h**2 * (0.5 - scheme.beta)) * previous.a + loads.x
         w = group.Ad_inv_mv(group.exp(x), previous.w) + group.tangent_mv(x, dx) + row.w
         v = previous.v + (h * (1.0 - scheme.gamma)) * previous.a + loads.v + row.v
         vdot = (scheme.alpha_m * previous.a - scheme.alpha_f * previous.vdot) / (1.0 - scheme.alpha_f) + row.vdot
         u, lam = self.factors.solve(
-            row.a - loads.residual - (self.mass @ vdot + c_t @ v + k_t @ w),
+            row.a - loads.residual - (shared.mass @ vdot + c_t @ v + k_t @ w),
             row.lam - (loads.violation + jacobian @ w) / (scheme.beta * h**2),
         )
         return Variation(
@@ -161,8 +156,8 @@ class Index3LinearizedStep(AbstractLinearizedStep):
             a=u,
         )
 
-    def backward(self, c, loads):
-        scheme, group, h, x = self.scheme, self.group, self.h, self.x
+    def backward(self, shared, node, c, loads):
+        scheme, group, h, x = shared.scheme, shared.system.group, node.h, self.x
         alpha_m, alpha_f = scheme.alpha_m, scheme.alpha_f
         k_t, c_t, jacobian = self.tangents
         mu_a, mu_lam = self.factors.solve(
@@ -176,7 +171,7 @@ class Index3LinearizedStep(AbstractLinearizedStep):
         mu_phi = mu_lam / (scheme.beta * h**2)
         mu_w = c.w - mu_a @ k_t - mu_phi @ jacobian
         mu_v = c.v - mu_a @ c_t
-        mu_vdot = c.vdot - mu_a @ self.mass
+        mu_vdot = c.vdot - mu_a @ shared.mass
         mu_x = group.tangent_rmv(x, mu_w)
         previous = Variation(
             w=group.Ad_inv_rmv(group.exp(x), mu_w),
@@ -236,7 +231,7 @@ class Index3(AbstractEquations):
         x = increment(self.scheme, previous, state.a, h)
         at_state = tangents(system, state.q, state.v, state.vdot, state.lam, node.t)
         factors = factorize_iteration_matrix(self.scheme, system, at_state, self.mass, x, h)
-        return Index3LinearizedStep(self.scheme, system.group, self.mass, h, x, at_state, factors)
+        return Index3LinearizedStep(x, at_state, factors)
 
     def margin(self, state, t):
         return margin_by_mass(self.system, self.mass, constraint_jacobian(self.system, state.q, t), self.scale)

@@ -15,11 +15,11 @@ and against the rows of E themselves.
 """
 
 import abc
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
@@ -36,17 +36,24 @@ class Variation(NamedTuple):
     inner: Any = None
 
 
+class Node(NamedTuple):
+    """One step in time, or a tangent or cotangent of it."""
+
+    begin: Float[Array, ""]
+    t: Float[Array, ""]  # its end
+    h: Float[Array, ""]
+
+
 class AbstractLinearizedStep(eqx.Module):
     """The linearized equations of one step, with what solves them."""
 
     @abc.abstractmethod
-    def forward(self, previous: Variation, loads: Any, row: Variation) -> Variation:
-        """δ_{n+1} from δ_n, E_p p' and b."""
+    def forward(self, shared: Any, node: Node, previous: Variation, loads: Any, row: Variation) -> Variation:
+        """δ_{n+1} from δ_n, E_p p' and b; `shared`, what all steps share, is no part of what is stacked for each."""
 
-    def backward(self, c: Variation, loads: Any) -> tuple[Variation, Any, Variation]:
+    def backward(self, shared: Any, node: Node, c: Variation, loads: Any) -> tuple[Variation, Any, Variation]:
         """c_n, `c_loads` and μ from c, here by JAX's transposition of `forward`; `loads`: in shape."""
-        zeros = lambda tree: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), tree)
-        return jax.linear_transpose(self.forward, zeros(c), zeros(loads), zeros(c))(c)
+        return jax.linear_transpose(partial(self.forward, shared, node), c, loads, c)(c)
 
 
 class DenseLinearizedStep(AbstractLinearizedStep):
@@ -55,12 +62,12 @@ class DenseLinearizedStep(AbstractLinearizedStep):
     lu: tuple[Array, Array]  # of E_{y⁺}
     by_previous: Float[Array, "n n"]  # E_y
 
-    def forward(self, previous, loads, row):
+    def forward(self, shared, node, previous, loads, row):
         flat, unravel = ravel_pytree(row)
         rhs = flat - ravel_pytree(loads)[0] - self.by_previous @ ravel_pytree(previous)[0]
         return unravel(jsl.lu_solve(self.lu, rhs))
 
-    def backward(self, c, loads):
+    def backward(self, shared, node, c, loads):
         flat, unravel = ravel_pytree(c)
         mu = jsl.lu_solve(self.lu, flat, trans=1)
         return unravel(-(mu @ self.by_previous)), unravel(-mu), unravel(mu)

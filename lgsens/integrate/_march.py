@@ -10,7 +10,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from lgsens.dynamics import AbstractSystem, State
-from lgsens.integrate._grid import AbstractGrid, Node, with_first
+from lgsens.integrate._grid import AbstractGrid, with_first
+from lgsens.integrate._linearized import Node
 from lgsens.integrate._scheme import AbstractScheme, Stats
 
 Output = Callable[[State, Any], Any]  # (state, t) ↦ pytree

@@ -19,8 +19,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.dynamics import RESULTS, AbstractSystem, Initial, State
-from lgsens.integrate._grid import AbstractGrid, EqualGrid, Node
-from lgsens.integrate._linearized import AbstractLinearizedStep, DenseLinearizedStep, Variation
+from lgsens.integrate._grid import AbstractGrid, EqualGrid
+from lgsens.integrate._linearized import AbstractLinearizedStep, DenseLinearizedStep, Node, Variation
 from lgsens.integrate._pace import AbstractPace
 
 

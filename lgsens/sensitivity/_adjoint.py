@@ -9,6 +9,8 @@ and an empty step μ = c_{n+1}, which it adds to c_n. The pull-back of the loads
 once. What is kept is the states.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -33,12 +35,10 @@ def adjoint_sweep(scheme: AbstractScheme, states: State, parameters: Parameters,
     def prepare(step: Step):
         return scheme.linearized(system, shared, grid.node(step.place), step.begun, step.state)
 
-    last_step = jax.tree.map(lambda leaf: leaf[-1], every)
-    shapes = jax.eval_shape(loads_of, system, grid, last_step, last_step.place)
-
-    def one(c: Variation, inputs):
-        linearized, link, own = inputs
-        begun, of_loads, mu = linearized.backward(c, shapes)
+    def one(loads, c: Variation, inputs):
+        linearized, step, own = inputs
+        link = step.link
+        begun, of_loads, mu = linearized.backward(shared, grid.node(step.place), c, loads)
         previous, of_place = link.begun_transposed(begun)
         previous = link.unless_empty(previous, c)
         of_loads = link.unless_empty(of_loads, jax.tree.map(jnp.zeros_like, of_loads))
@@ -48,12 +48,14 @@ def adjoint_sweep(scheme: AbstractScheme, states: State, parameters: Parameters,
     def block(carry, inputs):
         c, bar = carry
         step, own = inputs
-        c, (mu, of_loads, of_place) = lax.scan(one, c, (jax.vmap(prepare)(step), step.link, own), reverse=True)
 
         def all_loads(system, grid, places):
             return jax.vmap(lambda step, place: loads_of(system, grid, step, place))(step, places)
 
-        _, pull_back = jax.vjp(all_loads, system, grid, step.place)
+        loads, pull_back = jax.vjp(all_loads, system, grid, step.place)
+        shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), loads)
+        inputs = (jax.vmap(prepare)(step), step, own)
+        c, (mu, of_loads, of_place) = lax.scan(partial(one, shapes), c, inputs, reverse=True)
         of_system, of_grid, of_places = pull_back(of_loads)
         bar = jax.tree.map(jnp.add, bar, Parameters(of_system, of_grid))
         return (c, bar), (mu, grid.place_cotangents(of_places, of_place))

@@ -27,11 +27,12 @@ def direct_sweep(scheme: AbstractScheme, states: State, parameters: Parameters, 
         loads = scheme.loads(shared, step.begun, step.state)
         _, of_parameters = jax.jvp(loads, (system, node), (d.system, d_node))
         linearized = scheme.linearized(system, shared, node, step.begun, step.state)
-        return linearized, of_parameters, step.link
+        return linearized, of_parameters, step
 
     def one(previous: Variation, inputs):
-        (linearized, loads, link), row, d_place = inputs
-        current = linearized.forward(link.begun(previous, d_place), loads, row)
+        (linearized, loads, step), row, d_place = inputs
+        link, node = step.link, grid.node(step.place)
+        current = linearized.forward(shared, node, link.begun(previous, d_place), loads, row)
         current = link.unless_empty(current, jax.tree.map(jnp.add, previous, row))
         return current, current
 

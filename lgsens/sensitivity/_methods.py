@@ -207,6 +207,7 @@ def _direct_rule(scheme, primals, tangents):
     first, d_parameters = unravel(flat)
     b = with_first(first, earlier(zeros_like(states)))
 
+    @partial(jax.jit, inline=True)  # traced once for L and for Lᵀ
     def matrix(unknown):
         """L (δ, p'), of which every part seems to depend on the states: so none is constant in second derivatives."""
         nothing = 0.0 * states.v[0, 0]

@@ -77,7 +77,8 @@ def direct_on_the_fly(
             d_node = node_tangent(grid, d.grid, place, d_place)
             loads = scheme.loads(walk.shared, begun, progress.state)
             _, of_parameters = jax.jvp(loads, (system, node), (d.system, d_node))
-            return link.unless_empty(linearized.forward(link.begun(delta, d_place), of_parameters, none), delta)
+            current = linearized.forward(walk.shared, node, link.begun(delta, d_place), of_parameters, none)
+            return link.unless_empty(current, delta)
 
         delta = jax.vmap(along)(delta, d, d_places)
         rate = with_derivative(functional.rate, progress.state, node.t, delta)
