@@ -14,8 +14,8 @@ from lgsens.integrate._generalized_alpha import GeneralizedAlpha as GeneralizedA
 from lgsens.integrate._given import GivenSteps as GivenSteps
 from lgsens.integrate._grid import (
     AbstractGrid as AbstractGrid,
-    AbstractLink as AbstractLink,
     EqualGrid as EqualGrid,
+    Link as Link,
     UnevenGrid as UnevenGrid,
     earlier as earlier,
     later as later,

@@ -36,8 +36,7 @@ from lgsens.integrate._generalized_alpha import GeneralizedAlpha
 from lgsens.integrate._grid import UnevenGrid, with_first
 from lgsens.integrate._lanes import in_any_lane
 from lgsens.integrate._linearized import Node
-from lgsens.integrate._march import Progress, Walk, chosen
-from lgsens.integrate._pace import UnevenPace
+from lgsens.integrate._march import Progress, Walk, selected
 from lgsens.integrate._scheme import AbstractIntegrator, AbstractScheme, Laid, Start, Stats, scheme_of
 
 _AIM = 0.5  # θ: few steps are rejected
@@ -174,9 +173,9 @@ def integrate_controlled(
 
         def begins(trial: _Trial) -> tuple[Progress, Float[Array, ""]]:
             """A first step begins with the state that belongs to its size, another with what earlier trials leave."""
-            state = chosen(n == 0, first.at(system, trial.h), progress.state)
-            memory = scheme.rejected(progress.memory, trial.done.memory)
-            return Progress(state, memory, progress.running), jnp.where(n == 0, trial.h, size)
+            state = selected(n == 0, first.at(system, trial.h), progress.state)
+            begin = progress._replace(state=state).with_matrix(trial.done.memory.matrix)
+            return begin, jnp.where(n == 0, trial.h, size)
 
         def attempt(trial: _Trial) -> _Trial:
             start, size = begins(trial)
@@ -196,9 +195,8 @@ def integrate_controlled(
             )
             stats = stats._replace(iterations=trial.stats.iterations + stats.iterations, converged=done.running)
             new = _Trial(jnp.where(again, h * shorter, h), done, stats, error, rejected, again)
-            kept = walk.chosen(trial.trying, done, trial.done)
-            others = chosen(trial.trying, new._replace(done=None), trial._replace(done=None))
-            return others._replace(done=kept)
+            others = selected(trial.trying, new._replace(done=None), trial._replace(done=None))
+            return others._replace(done=done.where(trial.trying, trial.done))
 
         none = jnp.zeros((), jnp.int32)
         stats = Stats(none, h * 0.0, h * 0.0, progress.running, jnp.nan * h)
@@ -206,7 +204,7 @@ def integrate_controlled(
             lambda trial: in_any_lane(trial.trying), attempt, _Trial(wanted, progress, stats, h * 0.0, none, active)
         )
         _, size = begins(trial)
-        progress = walk.chosen(active, trial.done, progress)
+        progress = trial.done.where(active, progress)
         error = jnp.maximum(trial.error, _LEAST)
         rho = (_AIM / error * _AIM / before) ** (1.0 / 12.0) * (size / trial.h) ** 0.25
         grown = trial.h * (1.0 + _LIMIT * jnp.arctan((rho - 1.0) / _LIMIT))
@@ -218,7 +216,7 @@ def integrate_controlled(
     expected = relative(first.state.v, first.state.vdot, jerk, h)
     guess = h * jnp.minimum(1.0, (_AIM / jnp.maximum(expected, _LEAST)) ** (1.0 / 3.0))
     begun = first.at(system, guess)
-    memory = scheme.memory(system, walk.shared, begun, Node(t0, t0 + guess, guess), UnevenPace.first(h.dtype))
+    memory = scheme.memory(walk.shared, begun, Node(t0, t0 + guess, guess), uneven=True)
     running = jnp.all(jnp.isfinite(begun.a))
     begin = (Progress(begun, memory, running), guess, guess, jnp.full((), _AIM, h.dtype), h * 0.0)
     (*_, elapsed), (sizes, later, newton, errors, rejected) = lax.scan(step, begin, jnp.arange(num_steps))

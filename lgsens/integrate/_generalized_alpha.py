@@ -22,37 +22,29 @@ redundant, Φ(q⁺)/(βh²) − c λ⁺ = 0, with −diag(c) in the corner of S 
 import dataclasses
 import math
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from lgsens.dynamics import given_way, split_velocity
-from lgsens.integrate._alpha import AbstractAlpha
-from lgsens.integrate._alpha_step import AbstractEquations, Matrix, Wear
+from lgsens.integrate._alpha import AbstractAlpha, AbstractEquations, Matrix, Wear
 from lgsens.integrate._guess import Guess
 from lgsens.integrate._index3 import Index3
 from lgsens.integrate._levels import Levels
 from lgsens.integrate._newton import Chord, take_step
-from lgsens.integrate._pace import AbstractPace
-from lgsens.integrate._scheme import Start
+from lgsens.integrate._scheme import Memory, Start
 from lgsens.integrate._singular import Watch
 from lgsens.linear import LU, Inverse
 
 
-class Memory(eqx.Module):
-    """What the iteration of the next step knows of the steps before."""
+class Past(NamedTuple):
+    """What is known of the steps before, besides the matrix."""
 
     guess: Guess
-    matrix: Matrix | None  # None: full Newton, or as kept in a mark
     watch: Watch
-    watched: Float[Array, ""]  # when
-    pace: AbstractPace
-
-
-def _with_matrix(memory: Memory, matrix: Matrix | None) -> Memory:
-    return dataclasses.replace(memory, matrix=matrix)
 
 
 class GeneralizedAlpha(AbstractAlpha):
@@ -135,7 +127,7 @@ class GeneralizedAlpha(AbstractAlpha):
         return self._kind(system).of(self, system)
 
     def equations(self, system, node, previous, state):
-        return self.shared(system).step(previous, node).left(state, node.t)
+        return self.shared(system).step(previous, node).left(state)
 
     def start(self, system, initial, t0):
         """The starting values of the scheme; see `second_order_start`.
@@ -150,7 +142,7 @@ class GeneralizedAlpha(AbstractAlpha):
         state = self.complete(system, initial.state)
         if not self.second_order_start:
             return Start(state)
-        a_1 = (self.alpha_m - self.alpha_f) * initial.jerk
+        a_1 = self.delta * initial.jerk
         if self.stabilized:
             return Start(state, a_1=a_1)
         missed = self.missed_increment(system, state.v, state.vdot, initial.jerk)
@@ -184,12 +176,11 @@ class GeneralizedAlpha(AbstractAlpha):
         The true one is h v + h²/2 v̇ + h³ (v̈/6 + ad(v) v̇/12), from ẋ = T⁻¹(x) v and T⁻¹ = I + ½ ad(x) + …; hence
         c = (1/6 − β − Δ/2) v̈ + ad(v) v̇/12.
         """
-        delta = self.alpha_m - self.alpha_f
-        return (1.0 / 6.0 - self.beta - delta / 2.0) * jerk + system.group.ad_mv(v, vdot) / 12.0
+        return (1.0 / 6.0 - self.beta - self.delta / 2.0) * jerk + system.group.ad_mv(v, vdot) / 12.0
 
-    def memory(self, system, shared, state, node, pace, *, exact=False):
+    def memory(self, shared, state, node, *, uneven, exact=False):
         matrix = shared.no_matrix(state, node, self.factor_every, LU if exact else Inverse)
-        return Memory(Guess.first(state), matrix, Watch.first(node.h.dtype), node.begin, pace)
+        return Memory(Past(Guess.first(state, uneven=uneven), Watch.first(node.begin)), matrix)
 
     def remembered(self, shared, memory, linearized, node, stats):
         """Its exact matrix serves the next step, and is the first of which no other one is made."""
@@ -200,44 +191,27 @@ class GeneralizedAlpha(AbstractAlpha):
         matrix = Matrix(linearized.factors, node.h, once, LU)
         margin = linearized.margin(shared.scale)
         stats = stats if margin is None else stats._replace(margin=margin)
-        return _with_matrix(memory, matrix), stats
-
-    def kept(self, memory):
-        return _with_matrix(memory, None)
-
-    def restored(self, system, shared, kept, state, node):
-        return _with_matrix(kept, shared.no_matrix(state, node, self.factor_every))
-
-    def rejected(self, before, after):
-        """The matrix is the new one, which is large."""
-        return _with_matrix(before, after.matrix)
+        return memory._replace(matrix=matrix), stats
 
     def take(self, system, shared, before, begun, memory, node, running):
-        matrix, pace, t, h = memory.matrix, memory.pace, node.t, node.h
-        weights = pace.weights(h, self.alpha_m - self.alpha_f), pace.weights(h, 0.0)
-        chord = None if matrix is None else Chord(matrix.solver, self._due(memory, shared, node), matrix.kind)
-        state, guess, stats, chord = take_step(
-            self, shared.step(begun, node), shared.scale, before, memory.guess, weights, chord, running, t, h
-        )
-        watch, watched = memory.watch, memory.watched
-        if chord is None:
-            stats = stats._replace(margin=pace.margin(True, stats.margin, lambda: shared.margin(state, t)))
-        else:
-            made = chord.due
-            stats = stats._replace(margin=pace.margin(made, stats.margin, lambda: shared.margin(state, t)))
-            watch = jax.tree.map(partial(jnp.where, made), watch.after(stats.margin, t - watched), watch)
-            watched = jnp.where(made, t, watched)
+        (guess, watch), matrix = memory
+        unknowns = before.a.size + before.lam.size
+        chord = None if matrix is None else Chord(matrix.solver, self._due(memory, node, unknowns), matrix.kind)
+        state, next_guess, stats, chord = take_step(shared.step(begun, node), before, guess, chord, running)
+        made = chord is None or chord.due
+        margin = guess.pace.margin(made, stats.margin, lambda: shared.margin(state, node.t))
+        if chord is not None:
+            watch = jax.tree.map(partial(jnp.where, made), watch.after(margin, node.t), watch)
             wear = matrix.wear.after(made, stats.iterations)
-            matrix = Matrix(chord.solver, jnp.where(made, h, matrix.h), wear, matrix.kind)
-        return state, Memory(guess, matrix, watch, watched, pace.after(h)), stats
+            matrix = Matrix(chord.solver, jnp.where(made, node.h, matrix.h), wear, matrix.kind)
+        return state, Memory(Past(next_guess, watch), matrix), stats._replace(margin=margin)
 
-    def _due(self, memory: Memory, shared: AbstractEquations, node) -> Bool[Array, ""]:
+    def _due(self, memory: Memory, node, unknowns: int) -> Bool[Array, ""]:
         """Whether a step wants a new matrix."""
-        matrix = memory.matrix
+        (guess, watch), matrix = memory
         due = (matrix.wear.steps == 0) | (matrix.wear.steps >= self.factor_every)
-        ahead = (node.t - memory.watched) + (2.0 * self.factor_every) * node.h
-        due = due | memory.watch.ends_within(ahead) | memory.pace.changed(node.h, matrix.h)
-        return due if self.iterations is not None else due | matrix.wear.out(shared.unknowns)
+        due = due | watch.ends_by(node.t, (2.0 * self.factor_every) * node.h) | guess.pace.changed(node.h, matrix.h)
+        return due if self.iterations is not None else due | matrix.wear.out(unknowns)
 
     def numbers(self, system):
         return self._kind(system).numbers(self, system)

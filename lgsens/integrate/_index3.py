@@ -70,9 +70,8 @@ from lgsens.dynamics import (
     tangents,
     times_tangent_operator,
 )
-from lgsens.integrate._alpha import AbstractAlpha, advance, increment
-from lgsens.integrate._alpha_step import AbstractEquations, AbstractStep
-from lgsens.integrate._linearized import AbstractLinearizedStep, Variation
+from lgsens.integrate._alpha import AbstractAlpha, AbstractEquations, AbstractStep, advance, increment
+from lgsens.integrate._linearized import AbstractLinearizedStep, Node, Variation
 from lgsens.integrate._singular import margin_by_mass, margin_of
 from lgsens.linear import LU, Factors, Matrix
 
@@ -92,25 +91,23 @@ class Index3Step(AbstractStep):
 
     shared: "Index3"
     previous: State
-    h: Float[Array, ""]
+    node: Node
 
     def motion(self, u, lam):
-        return advance(self.shared.scheme, self.shared.system, self.previous, u, self.h)
+        return advance(self.shared.scheme, self.shared.system, self.previous, u, self.node.h)
 
-    def defect(self, motion, lam, t):
-        system, softness, h = self.shared.system, self.shared.softness, self.h
+    def defect(self, motion, lam):
+        system, softness, (_, t, h) = self.shared.system, self.shared.softness, self.node
         residual = system.residual(motion.q, motion.v, motion.vdot, lam, t)
         # Φ is zero at the solution, up to round-off that h' would multiply by 1/h³
         h = lax.stop_gradient(h) if softness is None else h
         violation = system.constraint(motion.q, t) / (self.shared.scheme.beta * h**2)
         return residual, violation if softness is None else violation - softness * lam
 
-    def factors(self, motion, lam, t, kind=LU):
-        shared = self.shared
+    def factors(self, motion, lam, kind=LU):
+        shared, (_, t, h) = self.shared, self.node
         at_state = tangents(shared.system, motion.q, motion.v, motion.vdot, lam, t)
-        factors = factorize_iteration_matrix(
-            shared.scheme, shared.system, at_state, shared.mass, motion.x, self.h, kind
-        )
+        factors = factorize_iteration_matrix(shared.scheme, shared.system, at_state, shared.mass, motion.x, h, kind)
         return factors, margin_of(factors, at_state.constraint_jacobian, shared.scale)
 
     def change(self, du, dlam):
@@ -219,12 +216,8 @@ class Index3(AbstractEquations):
 
         return function
 
-    @property
-    def unknowns(self):
-        return self.system.group.dim + len(self.system.constraint_names)
-
     def step(self, previous, node):
-        return Index3Step(self, previous, node.h)
+        return Index3Step(self, previous, node)
 
     def linearized(self, node, previous, state):
         system, h = self.system, node.h

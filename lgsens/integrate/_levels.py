@@ -36,8 +36,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import AbstractSystem, State, full_jacobian, require_independent
-from lgsens.integrate._alpha import AbstractAlpha, increment
-from lgsens.integrate._alpha_step import AbstractEquations
+from lgsens.integrate._alpha import AbstractAlpha, AbstractEquations, increment
 from lgsens.integrate._level_step import Counts, LevelFactors, LevelStep, LevelTangents, by_configuration
 from lgsens.integrate._linearized import AbstractLinearizedStep, Variation
 from lgsens.integrate._singular import margin_by_mass
@@ -170,12 +169,8 @@ class Levels(AbstractEquations):
 
         return function
 
-    @property
-    def unknowns(self):
-        return self.system.group.dim + self.counts.multipliers + self.counts.both
-
     def step(self, previous, node):
-        return LevelStep(self, previous, self._normal(previous, node), node.h)
+        return LevelStep(self, previous, node, self._normal(previous, node))
 
     def _normal(self, previous: State, node):
         if not self.counts.both:

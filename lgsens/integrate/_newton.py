@@ -22,11 +22,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.dynamics import State
-from lgsens.integrate._alpha import AbstractAlpha
-from lgsens.integrate._alpha_step import AbstractStep
+from lgsens.integrate._alpha import AbstractStep
 from lgsens.integrate._guess import Guess
 from lgsens.integrate._lanes import in_any_lane, renewed_where
-from lgsens.integrate._pace import Weights
 from lgsens.integrate._scheme import Stats
 from lgsens.linear import LU
 
@@ -62,40 +60,34 @@ class _Iterate(NamedTuple):
 
 
 def take_step(
-    scheme: AbstractAlpha,
-    equations: AbstractStep,
-    scale: Float[Array, " k"],
-    previous: State,
-    guess: Guess,
-    weights: tuple[Weights, Weights],
-    chord: Chord | None,
-    running,
-    t,
-    h,
+    equations: AbstractStep, previous: State, guess: Guess, chord: Chord | None, running
 ) -> tuple[State, Guess, Stats, Chord | None]:
-    """The state at t = t_n + h, the guess for the next step, and what Newton did; NaN unless `running` and converged.
+    """The state at the end of the step, the guess for the next one, and what Newton did; NaN unless `running` and
+    converged.
 
-    `previous`, not resized, and `weights` of past u and λ: where the iteration starts. `chord` has the iteration matrix
-    of an earlier step, for modified Newton; it is returned with the last one made. None: full Newton only.
+    `previous`, not resized: where the iteration starts. `chord` has the iteration matrix of an earlier step, for
+    modified Newton; it is returned with the last one made. None: full Newton only.
 
     Modified Newton, and the full Newton that takes over where it gives up, are rounds of one loop: a new matrix at the
     iterate where one is due, then iterations until the next is. What makes a matrix, nearly all that there is to
     compile, so is compiled once.
     """
+    scheme, scale, h = equations.shared.scheme, equations.shared.scale, equations.node.h
     eps = float(jnp.finfo(scale.dtype).eps)
     tolerance = max(scheme.tolerance, 64 * eps)
     round_off = max(1.0, len(scale) / 12) * eps
     target = max(tolerance**2, 0.04 * round_off)
     noise = max(_ROUGH, len(scale)) * eps
+    weights = guess.weights(h, scheme.delta)
     u, lam = guess.extrapolated(previous, weights)
     kind = None if chord is None else chord.kind
 
     def matrix(iterate: _Iterate, kind) -> tuple[Solver, Float[Array, ""]]:
-        return equations.factors(equations.motion(iterate.u, iterate.lam), iterate.lam, t, kind)
+        return equations.factors(equations.motion(iterate.u, iterate.lam), iterate.lam, kind)
 
     def corrected(solver: Solver | None, iterate: _Iterate) -> _Iterate:
         motion = equations.motion(iterate.u, iterate.lam)
-        residual, violation = equations.defect(motion, iterate.lam, t)
+        residual, violation = equations.defect(motion, iterate.lam)
         solver, margin = matrix(iterate, LU) if solver is None else (solver, iterate.margin)
         du, dlam = solver.solve(residual, violation)
         size, count = jnp.max(equations.change(du, dlam) * (scheme.beta * h**2) / scale), iterate.iterations + 1
@@ -188,4 +180,5 @@ def take_step(
         converged=converged,
         margin=jnp.where(converged, iterate.margin, jnp.nan),
     )
-    return state, guess.after(previous, jnp.maximum(iterate.contraction, _FASTEST), weights), stats, chord
+    guess = guess.after(previous, jnp.maximum(iterate.contraction, _FASTEST), weights, h)
+    return state, guess, stats, chord

@@ -21,7 +21,6 @@ from jaxtyping import Array, Bool, Float, Int
 from lgsens.dynamics import RESULTS, AbstractSystem, Initial, State
 from lgsens.integrate._grid import AbstractGrid, EqualGrid
 from lgsens.integrate._linearized import AbstractLinearizedStep, DenseLinearizedStep, Node, Variation
-from lgsens.integrate._pace import AbstractPace
 
 
 class Stats(NamedTuple):
@@ -59,6 +58,18 @@ class Start(NamedTuple):
             v=state.v if self.v_2 is None else state.v + h**2 * self.v_2,
             a=state.a if self.a_1 is None else state.a + h * self.a_1,
         )
+
+
+class Memory(NamedTuple):
+    """What the iteration of a step knows of those before it.
+
+    Attributes:
+        past: what is small; of the last step taken, and kept where a run is to go on from.
+        matrix: what is large; of the last step, taken or not, and not kept.
+    """
+
+    past: Any = None
+    matrix: Any = None
 
 
 class Stages(NamedTuple):
@@ -197,36 +208,22 @@ class AbstractScheme(AbstractIntegrator):
         """What all steps share."""
         return None
 
-    def memory(
-        self, system: AbstractSystem, shared: Any, state: State, node: Node, pace: AbstractPace, *, exact: bool = False
-    ) -> Any:
-        """What the iteration of the next step knows of the steps before, at the start.
+    def memory(self, shared: Any, state: State, node: Node, *, uneven: bool, exact: bool = False) -> Memory:
+        """What the iteration of the next step knows of the steps before, at the start; `uneven`: not all are equal.
 
         `exact`: that of runs in which `remembered` is told of the linearization of each step.
         """
-        return None
+        return Memory()
 
     def remembered(
-        self, shared: Any, memory: Any, linearized: AbstractLinearizedStep, node: Node, stats: Stats
-    ) -> tuple[Any, Stats]:
-        """What is to be remembered of the linearization of the last step."""
+        self, shared: Any, memory: Memory, linearized: AbstractLinearizedStep, node: Node, stats: Stats
+    ) -> tuple[Memory, Stats]:
+        """With what the linearization of the last step is good for in the next one."""
         return memory, stats
 
-    def kept(self, memory: Any) -> Any:
-        """What is kept of it where a run is to go on from."""
-        return memory
-
-    def restored(self, system: AbstractSystem, shared: Any, kept: Any, state: State, node: Node) -> Any:
-        """`memory`, from what was kept of it."""
-        return kept
-
-    def rejected(self, before: Any, after: Any) -> Any:
-        """The memory where a step has been tried and is not taken."""
-        return before
-
     def take(
-        self, system: AbstractSystem, shared: Any, before: State, begun: State, memory: Any, node: Node, running
-    ) -> tuple[State, Any, Stats]:
+        self, system: AbstractSystem, shared: Any, before: State, begun: State, memory: Memory, node: Node, running
+    ) -> tuple[State, Memory, Stats]:
         """The state at the end of a step that begins with `begun` (`before`, resized), and what Newton did; NaN unless
         `running` and converged. Here: full Newton with the matrix of the equations."""
         scale = system.coordinate_scale()

@@ -53,7 +53,9 @@ def continuous_direct_sweep(
     def sweep(previous: Motion, inputs):
         state, place, d_place, link = inputs
         h = grid.node(place).h
-        current = advance(scheme, mass, previous, node(state, place, d_place), h, link.ratio)
+        current = advance(
+            scheme, mass, previous, node(state, place, d_place), h, 1.0 if link.ratio is None else link.ratio
+        )
         current = link.unless_empty(current, previous)
         return current, current
 

@@ -21,8 +21,8 @@ import jax.numpy as jnp
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate import (
     AbstractGrid,
-    AbstractLink,
     AbstractScheme,
+    Link,
     Node,
     Variation,
     earlier,
@@ -43,7 +43,7 @@ class Step(NamedTuple):
     """One converged step: where it is, how it follows the one before, what it begins with, and its end."""
 
     place: Any
-    link: AbstractLink
+    link: Link
     begun: State
     state: State
 

@@ -71,7 +71,8 @@ def direct_on_the_fly(
         link, begun = grid.link(scheme, place, progress.state), grid.begun(scheme, place, progress.state)
         progress, stats = walk.on(grid, progress, place)
         linearized = scheme.linearized(system, walk.shared, node, begun, progress.state)
-        progress, stats = walk.remembering(progress, linearized, node, stats)
+        memory, stats = scheme.remembered(walk.shared, progress.memory, linearized, node, stats)
+        progress = progress._replace(memory=memory)
 
         def along(delta, d: Parameters, d_place):
             d_node = node_tangent(grid, d.grid, place, d_place)

@@ -13,8 +13,8 @@ from lgsens.dynamics import initial_state
 from lgsens.examples import spinning_top
 from lgsens.integrate import EqualGrid, UnevenGrid, states_of
 from lgsens.sensitivity import Parameters, direct_sweep
-from lgsens.sensitivity._adjoint import adjoint_sweep
 from lgsens.sensitivity._linearization import matvec, zeros_like
+from lgsens.sensitivity._sweeps import adjoint_sweep
 
 TSIT5 = lg.IndexReducedODE()
 GIVEN = lg.GivenSteps([1.0, 2.0, 0.0, 1.5, 1.0], TSIT5)
