@@ -1,17 +1,8 @@
 """Schemes, grids, and the march through time (paper, §4)."""
 
-from lgsens.integrate._adaptive import (
-    AdaptiveSteps as AdaptiveSteps,
-    ControlledStats as ControlledStats,
-    integrate_controlled as integrate_controlled,
-)
-from lgsens.integrate._alpha import AbstractAlpha as AbstractAlpha
-from lgsens.integrate._explicit import (
-    IndexReducedODE as IndexReducedODE,
-)
+from lgsens.integrate._explicit import IndexReducedODE as IndexReducedODE
 from lgsens.integrate._explicit_step import ended as ended
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha as GeneralizedAlpha
-from lgsens.integrate._given import GivenSteps as GivenSteps
 from lgsens.integrate._grid import (
     AbstractGrid as AbstractGrid,
     EqualGrid as EqualGrid,
@@ -20,6 +11,7 @@ from lgsens.integrate._grid import (
     earlier as earlier,
     later as later,
     with_first as with_first,
+    with_last as with_last,
 )
 from lgsens.integrate._index3 import factorize_iteration_matrix as factorize_iteration_matrix
 from lgsens.integrate._linearized import (
@@ -29,7 +21,6 @@ from lgsens.integrate._linearized import (
 )
 from lgsens.integrate._march import (
     Mark as Mark,
-    Progress as Progress,
     Walk as Walk,
     first_mark as first_mark,
     march as march,
@@ -46,4 +37,9 @@ from lgsens.integrate._scheme import (
     rows as rows,
     scheme_of as scheme_of,
 )
-from lgsens.integrate._singular import margin_of as margin_of, singular_steps as singular_steps
+from lgsens.integrate._singular import singular_steps as singular_steps
+from lgsens.integrate._uneven import (
+    AdaptiveSteps as AdaptiveSteps,
+    ControlledStats as ControlledStats,
+    GivenSteps as GivenSteps,
+)

@@ -117,6 +117,10 @@ class Matrix(eqx.Module):
     wear: Wear
     kind: Any = eqx.field(static=True)  # LU or Inverse
 
+    def after(self, solver, made, iterations, h) -> "Matrix":
+        """After a step of size h and so many iterations, which made a new one or not."""
+        return Matrix(solver, jnp.where(made, h, self.h), self.wear.after(made, iterations), self.kind)
+
 
 class AbstractStep(eqx.Module):
     """The equations of one step from `previous`."""

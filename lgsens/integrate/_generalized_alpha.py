@@ -8,15 +8,9 @@ With u = a_{n+1}, one step from (q, v, v̇, a) at t_n solves for u and λ
     v̇⁺  = ((1 − α_m) u + α_m a − α_f v̇) / (1 − α_f)       (29)
     r(q⁺, v⁺, v̇⁺, λ⁺, t⁺) = 0,   Φ(q⁺)/(βh²) = 0          (25), (26)
 
-The unknown is u and not x, and the constraint is divided by βh²: with ∂x/∂u = βh² the matrix of eq. (30)
-becomes
-
-    S = [[c M + γh C_t + βh² K_t T(x),  Bᵀ],
-         [B T(x),                       0 ]],      c = (1 − α_m)/(1 − α_f),
-
-which does not degenerate as h → 0 (Bottasso, Bauchau & Cardona 2007; its condition at h = 1e-3 would
-else be 1e18). Its constraint rows and multipliers are further scaled by the size of M. Where constraints may be
-redundant, Φ(q⁺)/(βh²) − c λ⁺ = 0, with −diag(c) in the corner of S (`dynamics/_redundant.py`).
+The unknown is u and not x, and the constraint is divided by βh²: with ∂x/∂u = βh² the matrix S of eq. (30), written out
+in `_index3.py`, does not degenerate as h → 0 (Bottasso, Bauchau & Cardona 2007; its condition at h = 1e-3 would else be
+1e18). Its constraint rows and multipliers are further scaled by the size of M.
 """
 
 import dataclasses
@@ -29,12 +23,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from lgsens._validate import require_setting
 from lgsens.dynamics import given_way, split_velocity
 from lgsens.integrate._alpha import AbstractAlpha, AbstractEquations, Matrix, Wear
 from lgsens.integrate._guess import Guess
 from lgsens.integrate._index3 import Index3
 from lgsens.integrate._levels import Levels
-from lgsens.integrate._newton import Chord, take_step
+from lgsens.integrate._newton import take_step
 from lgsens.integrate._scheme import Memory, Start
 from lgsens.integrate._singular import Watch
 from lgsens.linear import LU, Inverse
@@ -93,33 +88,18 @@ class GeneralizedAlpha(AbstractAlpha):
     stabilized: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def __check_init__(self):
-        if not isinstance(self.rho_inf, int | float) or not 0.0 <= self.rho_inf < 1.0:
-            raise ValueError(
-                f"GeneralizedAlpha: `rho_inf` must be a number in [0, 1), got {self.rho_inf!r}; 0.9 damps little, "
-                "0 most."
-            )
-        if not isinstance(self.tolerance, int | float) or not 0.0 < self.tolerance < math.inf:
-            raise ValueError(
-                f"GeneralizedAlpha: `tolerance` must be positive, got {self.tolerance!r}; 1e-10 is the default."
-            )
-        if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
-            raise ValueError(
-                f"GeneralizedAlpha: `max_iterations` must be an int, at least 1, got {self.max_iterations!r}."
-            )
-        if not isinstance(self.factor_every, int) or self.factor_every < 0:
-            raise ValueError(
-                "GeneralizedAlpha: `factor_every` must be an int, at least 0 (0: full Newton always), got "
-                f"{self.factor_every!r}."
-            )
-        if self.iterations is not None and (not isinstance(self.iterations, int) or self.iterations < 1):
-            raise ValueError(
-                "GeneralizedAlpha: `iterations` must be an int, at least 1, or None (until they converge), got "
-                f"{self.iterations!r}."
-            )
-        if not isinstance(self.stabilized, bool):
-            raise ValueError(
-                f"GeneralizedAlpha: `stabilized` must be True (index 2) or False (index 3), got {self.stabilized!r}."
-            )
+        number = lambda value: isinstance(value, int | float)
+        count = lambda value, least: isinstance(value, int) and value >= least
+        check = partial(require_setting, self)
+        valid = number(self.rho_inf) and 0.0 <= self.rho_inf < 1.0
+        check("rho_inf", valid, "a number in [0, 1)", "; 0.9 damps little, 0 most")
+        valid = number(self.tolerance) and 0.0 < self.tolerance < math.inf
+        check("tolerance", valid, "positive", "; 1e-10 is the default")
+        check("max_iterations", count(self.max_iterations, 1), "an int, at least 1")
+        check("factor_every", count(self.factor_every, 0), "an int, at least 0 (0: full Newton always)")
+        valid = self.iterations is None or count(self.iterations, 1)
+        check("iterations", valid, "an int, at least 1, or None (until they converge)")
+        check("stabilized", isinstance(self.stabilized, bool), "True (index 2) or False (index 3)")
 
     # What the scheme is for the march and the sweeps.
 
@@ -195,15 +175,12 @@ class GeneralizedAlpha(AbstractAlpha):
 
     def take(self, system, shared, before, begun, memory, node, running):
         (guess, watch), matrix = memory
-        unknowns = before.a.size + before.lam.size
-        chord = None if matrix is None else Chord(matrix.solver, self._due(memory, node, unknowns), matrix.kind)
-        state, next_guess, stats, chord = take_step(shared.step(begun, node), before, guess, chord, running)
-        made = chord is None or chord.due
+        due = matrix is not None and self._due(memory, node, before.a.size + before.lam.size)
+        equations = shared.step(begun, node)
+        state, next_guess, stats, matrix, made = take_step(equations, before, guess, matrix, due, running)
         margin = guess.pace.margin(made, stats.margin, lambda: shared.margin(state, node.t))
-        if chord is not None:
+        if matrix is not None:
             watch = jax.tree.map(partial(jnp.where, made), watch.after(margin, node.t), watch)
-            wear = matrix.wear.after(made, stats.iterations)
-            matrix = Matrix(chord.solver, jnp.where(made, node.h, matrix.h), wear, matrix.kind)
         return state, Memory(Past(next_guess, watch), matrix), stats._replace(margin=margin)
 
     def _due(self, memory: Memory, node, unknowns: int) -> Bool[Array, ""]:

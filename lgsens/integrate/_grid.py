@@ -206,3 +206,8 @@ def earlier(states: Tree) -> Tree:
 def with_first(first: Tree, rest: Tree) -> Tree:
     """One instant before a stack of others."""
     return jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), first, rest)
+
+
+def with_last(rest: Tree, last: Tree) -> Tree:
+    """One instant after a stack of others."""
+    return jax.tree.map(lambda others, one: jnp.concatenate([others, one[None]]), rest, last)

@@ -140,7 +140,14 @@ class Levels(AbstractEquations):
     def of(cls, scheme, system):
         require_independent(system, "A step with constraints of velocity level (`stabilized`, nonholonomic)")
         mass, counts = system.mass_matrix(), Counts.of(scheme, system)
-        return cls(scheme, counts, system, mass, jnp.linalg.inv(mass), system.coordinate_scale())
+        return cls(
+            scheme=scheme,
+            counts=counts,
+            system=system,
+            mass=mass,
+            inverse_mass=jnp.linalg.inv(mass),
+            scale=system.coordinate_scale(),
+        )
 
     @staticmethod
     def numbers(scheme, system):

@@ -20,9 +20,12 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
+
+from lgsens.dynamics import State
 
 
 class Variation(NamedTuple):
@@ -34,6 +37,16 @@ class Variation(NamedTuple):
     lam: Float[Array, " m"]
     a: Float[Array, " k"]
     inner: Any = None
+
+    @classmethod
+    def of(cls, w, rest: State) -> "Variation":
+        """With all but w as in `rest`."""
+        return cls(w, rest.v, rest.vdot, rest.lam, rest.a, rest.inner)
+
+    @classmethod
+    def none(cls, states: State) -> "Variation":
+        """That of a state, or of stacked ones, which does not vary."""
+        return jax.tree.map(jnp.zeros_like, cls.of(states.v, states))
 
 
 class Node(NamedTuple):

@@ -216,7 +216,7 @@ class AbstractScheme(AbstractIntegrator):
         return Memory()
 
     def remembered(
-        self, shared: Any, memory: Memory, linearized: AbstractLinearizedStep, node: Node, stats: Stats
+        self, shared: Any, memory: Memory, linearized: Any, node: Node, stats: Stats
     ) -> tuple[Memory, Stats]:
         """With what the linearization of the last step is good for in the next one."""
         return memory, stats
@@ -270,13 +270,13 @@ class AbstractScheme(AbstractIntegrator):
         def of_previous(delta):
             return ravel_pytree(rows(self, system, node, _moved(system, previous, delta), state))[0]
 
-        zero, unravel = ravel_pytree(_none(previous))
+        zero, unravel = ravel_pytree(Variation.none(previous))
         by_previous = jax.jacfwd(lambda delta: of_previous(unravel(delta)))(zero)
         return DenseLinearizedStep(jsl.lu_factor(self._matrix(system, node, previous, state)), by_previous)
 
     def _matrix(self, system, node: Node, previous: State, state: State):
         """E_{y⁺}."""
-        zero, unravel = ravel_pytree(_none(state))
+        zero, unravel = ravel_pytree(Variation.none(state))
 
         def of_state(delta):
             return ravel_pytree(rows(self, system, node, previous, _moved(system, state, unravel(delta))))[0]
@@ -284,20 +284,14 @@ class AbstractScheme(AbstractIntegrator):
         return jax.jacfwd(of_state)(zero)
 
 
-def _none(state: State) -> Variation:
-    zeros = lambda tree: jax.tree.map(jnp.zeros_like, tree)
-    return Variation(jnp.zeros_like(state.v), *zeros((state.v, state.vdot, state.lam, state.a, state.inner)))
-
-
 def _moved(system: AbstractSystem, state: State, delta: Variation) -> State:
     """q exp(w̃), v + v', …"""
-    _, *rest = delta
-    parts = (state.v, state.vdot, state.lam, state.a, state.inner)
-    return State(system.group.retract(state.q, delta.w), *jax.tree.map(jnp.add, parts, tuple(rest)))
+    parts = jax.tree.map(jnp.add, tuple(Variation.of(state.v, state)[1:]), tuple(delta[1:]))
+    return State(system.group.retract(state.q, delta.w), *parts)
 
 
 def rows(scheme: AbstractScheme, system: AbstractSystem, node: Node, previous: State, state: State):
     """E as a `Variation`: its w is log(q_n exp(x̃)⁻¹ q_{n+1}), whose derivative is w' of q_{n+1} less that predicted."""
     left, group = scheme.equations(system, node, previous, state), system.group
     w = group.log(group.compose(group.inverse(left.q), state.q))
-    return Variation(w, left.v, left.vdot, left.lam, left.a, left.inner)
+    return Variation.of(w, left)

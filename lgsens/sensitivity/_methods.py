@@ -14,8 +14,9 @@ import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
+from lgsens._validate import require_setting
 from lgsens.dynamics import State, require_independent
-from lgsens.integrate import AbstractScheme, GeneralizedAlpha, Stats, earlier, states_of, with_first
+from lgsens.integrate import AbstractScheme, GeneralizedAlpha, Stats, Variation, earlier, states_of, with_first
 from lgsens.sensitivity._continuous_adjoint import Cotangents, continuous_adjoint_sweep
 from lgsens.sensitivity._continuous_direct import continuous_direct_sweep
 from lgsens.sensitivity._criterion_terms import Functional, OfState, derivative_terms, plain_terms, points
@@ -27,7 +28,6 @@ from lgsens.sensitivity._linearization import (
     matvec,
     to_algebra,
     to_ambient,
-    zeros_like,
 )
 from lgsens.sensitivity._sweeps import adjoint_sweep, direct_sweep
 
@@ -37,14 +37,23 @@ _TREATMENTS = ("state", "derivatives", "first_order", None)
 class AbstractSensitivity(eqx.Module):
     """A method to differentiate a trajectory."""
 
-    @abc.abstractmethod
     def trajectory(
         self, scheme: AbstractScheme, state0: State, parameters: Parameters, found: tuple[State, Stats] | None = None
     ) -> tuple[State, Stats]:
         """The states and statistics of all steps, with this method as their derivative.
 
-        `found`: the states and statistics of this very run, if they are known already.
+        `found`: the states and statistics of this very run, if they are known already. Of the march that finds them
+        nothing is differentiated.
         """
+        if found is None:
+            system, grid = lax.stop_gradient(parameters)
+            found = states_of(scheme, system, grid, lax.stop_gradient(state0))
+        states, stats = found
+        return self.differentiable(scheme, state0, parameters, states), stats
+
+    @abc.abstractmethod
+    def differentiable(self, scheme: AbstractScheme, state0: State, parameters: Parameters, states: State) -> State:
+        """The states of a run, as a function of what the run depends on."""
 
 
 class AbstractDiscrete(AbstractSensitivity):
@@ -54,19 +63,16 @@ class AbstractDiscrete(AbstractSensitivity):
 
     def __check_init__(self):
         given = self.checkpoints
-        if given in (None, "sqrt") or (isinstance(given, int) and not isinstance(given, bool) and given > 0):
-            return
-        raise ValueError(
-            f"{type(self).__name__}: `checkpoints` must be None, 'sqrt' or a number of states, at least 1, got "
-            f"{given!r}."
-        )
+        valid = given in (None, "sqrt") or (isinstance(given, int) and not isinstance(given, bool) and given > 0)
+        require_setting(self, "checkpoints", valid, "None, 'sqrt' or a number of states, at least 1")
 
-    def _require_all_states(self) -> None:
+    def trajectory(self, scheme, state0, parameters, found=None):
         if self.checkpoints is not None:
             raise ValueError(
                 f"{type(self).__name__}: `checkpoints` = {self.checkpoints!r} is for `simulate(…, save=…)`: a "
                 "trajectory has all its states anyway. Ask for what the criterion needs with `save`, or leave it out."
             )
+        return super().trajectory(scheme, state0, parameters, found)
 
 
 class DirectDifferentiation(AbstractDiscrete):
@@ -84,9 +90,8 @@ class DirectDifferentiation(AbstractDiscrete):
     Raises `ValueError` for other `checkpoints`, and for a trajectory, which has all states anyway, with any.
     """
 
-    def trajectory(self, scheme, state0, parameters, found=None):
-        self._require_all_states()
-        return _decoded(_direct_trajectory(scheme, state0, parameters, found))
+    def differentiable(self, scheme, state0, parameters, states):
+        return _direct_trajectory(scheme, state0, parameters, states)
 
 
 class AdjointVariable(AbstractDiscrete):
@@ -101,9 +106,8 @@ class AdjointVariable(AbstractDiscrete):
     Raises `ValueError` as `DirectDifferentiation`.
     """
 
-    def trajectory(self, scheme, state0, parameters, found=None):
-        self._require_all_states()
-        return _decoded(_adjoint_trajectory(scheme, state0, parameters, found))
+    def differentiable(self, scheme, state0, parameters, states):
+        return _adjoint_trajectory(scheme, state0, parameters, states)
 
 
 class ContinuousDirect(AbstractSensitivity):
@@ -114,9 +118,10 @@ class ContinuousDirect(AbstractSensitivity):
     it is the transpose of the forward sweep.
     """
 
-    def trajectory(self, scheme, state0, parameters, found=None):
+    def differentiable(self, scheme, state0, parameters, states):
         _require_positions("ContinuousDirect", parameters)
-        return _decoded(_continuous_trajectory(scheme, state0, parameters))
+        physical = partial(scheme.physical, parameters.system)
+        return _continuous_trajectory(_linear_scheme(scheme), physical(state0), parameters, physical(states))
 
 
 class Autodiff(AbstractSensitivity):
@@ -128,7 +133,10 @@ class Autodiff(AbstractSensitivity):
     """
 
     def trajectory(self, scheme, state0, parameters, found=None):
-        return _decoded(_run(scheme.for_autodiff(), state0, parameters))
+        return states_of(scheme.for_autodiff(), *parameters, state0)
+
+    def differentiable(self, scheme, state0, parameters, states):
+        return self.trajectory(scheme, state0, parameters)[0]
 
 
 class ContinuousAdjoint(eqx.Module):
@@ -153,10 +161,7 @@ class ContinuousAdjoint(eqx.Module):
     accelerations: str | None = eqx.field(static=True, default="state")
 
     def __check_init__(self):
-        if self.accelerations not in _TREATMENTS:
-            raise ValueError(
-                f"ContinuousAdjoint: `accelerations` must be one of {_TREATMENTS}, got {self.accelerations!r}."
-            )
+        require_setting(self, "accelerations", self.accelerations in _TREATMENTS, f"one of {_TREATMENTS}")
 
     def cotangents(
         self,
@@ -202,29 +207,6 @@ def _linear_scheme(scheme: AbstractScheme) -> GeneralizedAlpha:
     return dataclasses.replace(scheme, stabilized=False) if isinstance(scheme, GeneralizedAlpha) else GeneralizedAlpha()
 
 
-# The custom rules see statistics as floats: an integer output of a `custom_vjp` reaches operations that have no
-# derivative (`jnp.all`) with a tangent, and JAX refuses.
-
-
-def _run(scheme, state0, parameters, found=None):
-    states, stats = states_of(scheme, parameters.system, parameters.grid, state0) if found is None else found
-    return states, encoded(stats, states.v.dtype)
-
-
-def encoded(stats: Stats, dtype) -> Stats:
-    return jax.tree.map(lambda leaf: leaf.astype(dtype), stats)
-
-
-def decoded(stats: Stats) -> Stats:
-    stats = lax.stop_gradient(stats)
-    return stats._replace(iterations=stats.iterations.astype(jnp.int32), converged=stats.converged.astype(bool))
-
-
-def _decoded(run: tuple[State, Stats]) -> tuple[State, Stats]:
-    states, stats = run
-    return states, decoded(stats)
-
-
 def _raveled(tree):
     """The leaves as one vector, and the function that makes the tree of it; every leaf depends on the vector.
 
@@ -247,21 +229,21 @@ def _raveled(tree):
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _direct_trajectory(scheme, state0, parameters, found):
-    return _run(scheme, state0, parameters, found)
+def _direct_trajectory(scheme, state0, parameters, states):
+    return states
 
 
 @_direct_trajectory.defjvp
 def _direct_rule(scheme, primals, tangents):
     state0, parameters, _ = primals
     d_state0, d_parameters, _ = tangents
-    states, stats = _direct_trajectory(scheme, *primals)
+    states = _direct_trajectory(scheme, *primals)
     group = parameters.system.group
     # `custom_linear_solve` is transposed only where no part of b is a constant, and the tangent of a parameter that is
     # not differentiated is one: a zero. Cut from one vector, all depend on all.
     flat, unravel = _raveled((to_algebra(group, state0, d_state0), d_parameters))
     first, d_parameters = unravel(flat)
-    b = with_first(first, earlier(zeros_like(states)))
+    b = with_first(first, earlier(Variation.none(states)))
 
     @partial(jax.jit, inline=True)  # traced once for L and for Lᵀ
     def matrix(unknown):
@@ -275,49 +257,44 @@ def _direct_rule(scheme, primals, tangents):
         solve=lambda _, rhs: direct_sweep(scheme, states, parameters, *rhs),
         transpose_solve=lambda _, rhs: adjoint_sweep(scheme, states, parameters, *rhs),
     )
-    d_states = jax.vmap(partial(to_ambient, group))(states, delta)
-    return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
+    return states, jax.vmap(partial(to_ambient, group))(states, delta)
 
 
 # Direct differentiation of the equations of motion: a rule whose tangent is linear in the input tangents, as it is.
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _continuous_trajectory(scheme, state0, parameters):
-    states, stats = _run(scheme, state0, parameters)
-    return scheme.physical(parameters.system, states), stats
+def _continuous_trajectory(scheme, state0, parameters, states):
+    return states
 
 
 @_continuous_trajectory.defjvp
 def _continuous_rule(scheme, primals, tangents):
-    state0, parameters = primals
-    d_state0, d_parameters = tangents
-    states, stats = _continuous_trajectory(scheme, state0, parameters)
+    state0, parameters, _ = primals
+    d_state0, d_parameters, _ = tangents
+    states = _continuous_trajectory(scheme, *primals)
     group = parameters.system.group
-    physical = partial(scheme.physical, parameters.system)
-    first = to_algebra(group, physical(state0), physical(d_state0))
-    delta = continuous_direct_sweep(_linear_scheme(scheme), states, parameters, first, d_parameters)
-    d_states = jax.vmap(partial(to_ambient, group))(states, delta)
-    return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
+    first = to_algebra(group, state0, d_state0)
+    delta = continuous_direct_sweep(scheme, states, parameters, first, d_parameters)
+    return states, jax.vmap(partial(to_ambient, group))(states, delta)
 
 
 # Adjoint variable method.
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _adjoint_trajectory(scheme, state0, parameters, found):
-    return _run(scheme, state0, parameters, found)
+def _adjoint_trajectory(scheme, state0, parameters, states):
+    return states
 
 
-def _adjoint_forward(scheme, state0, parameters, found):
-    states, stats = _run(scheme, state0, parameters, found)
-    return (states, stats), (states, parameters)
+def _adjoint_forward(scheme, state0, parameters, states):
+    return states, (states, parameters)
 
 
 def _adjoint_backward(scheme, kept, cotangents):
     states, parameters = kept
     group = parameters.system.group
-    c = jax.vmap(partial(cotangent_to_algebra, group))(states, cotangents[0])
+    c = jax.vmap(partial(cotangent_to_algebra, group))(states, cotangents)
     mu, bar = adjoint_sweep(scheme, states, parameters, c, jax.tree.map(jnp.zeros_like, parameters))
     state0 = jax.tree.map(lambda leaf: leaf[0], states)
     first = jax.tree.map(lambda leaf: leaf[0], mu)

@@ -25,7 +25,6 @@ from lgsens.sensitivity._linearization import (
     place_tangents,
     to_algebra,
     to_ambient,
-    zeros_like,
 )
 
 
@@ -52,7 +51,7 @@ def direct_on_the_fly(
     )(directions)
     system, grid = parameters
     group, walk = system.group, Walk.of(scheme, system)
-    none = zeros_like(state0)
+    none = Variation.none(state0)
 
     def with_derivative(function, state: State, t, delta: Variation):
         """f (c,) and f' (p, c)."""

@@ -40,7 +40,7 @@ from lgsens.integrate import (
     with_first,
 )
 from lgsens.sensitivity._linearization import Parameters
-from lgsens.sensitivity._methods import AbstractDiscrete, AbstractSensitivity, DirectDifferentiation, decoded, encoded
+from lgsens.sensitivity._methods import AbstractDiscrete, AbstractSensitivity, DirectDifferentiation
 
 Output = Callable[..., Any]  # (system, state, t) ↦ pytree
 
@@ -76,8 +76,7 @@ def saved_run(
         method = dataclasses.replace(method, checkpoints=None)
         return _in_segments(segments, method, output, scheme, state0, parameters)
     if method == DirectDifferentiation():
-        run = _saved(output, scheme, state0, parameters)
-        return run._replace(stats=decoded(run.stats))
+        return _saved(output, scheme, state0, parameters)
     return _from_states(method, output, scheme, state0, parameters)
 
 
@@ -91,16 +90,12 @@ def _from_states(method: AbstractSensitivity, output: Output, scheme, state0, pa
 def _saved(output, scheme, state0, parameters) -> SavedRun:
     system, grid = parameters
     outputs, final, stats = march(scheme, system, grid, state0, lambda state, t: output(system, state, t))
-    return SavedRun(outputs, final, encoded(stats, final.v.dtype))
+    return SavedRun(outputs, final, stats)
 
 
 @_saved.defjvp
 def _rule(output, scheme, primals, tangents):
-    def whole(state0, parameters):
-        run = _from_states(DirectDifferentiation(), output, scheme, state0, parameters)
-        return run._replace(stats=encoded(run.stats, run.final.v.dtype))
-
-    return jax.jvp(whole, primals, tangents)
+    return jax.jvp(partial(_from_states, DirectDifferentiation(), output, scheme), primals, tangents)
 
 
 class Segments(NamedTuple):
