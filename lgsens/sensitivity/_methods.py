@@ -37,23 +37,14 @@ _TREATMENTS = ("state", "derivatives", "first_order", None)
 class AbstractSensitivity(eqx.Module):
     """A method to differentiate a trajectory."""
 
+    @abc.abstractmethod
     def trajectory(
         self, scheme: AbstractScheme, state0: State, parameters: Parameters, found: tuple[State, Stats] | None = None
     ) -> tuple[State, Stats]:
         """The states and statistics of all steps, with this method as their derivative.
 
-        `found`: the states and statistics of this very run, if they are known already. Of the march that finds them
-        nothing is differentiated.
+        `found`: the states and statistics of this very run, if they are known already.
         """
-        if found is None:
-            system, grid = lax.stop_gradient(parameters)
-            found = states_of(scheme, system, grid, lax.stop_gradient(state0))
-        states, stats = found
-        return self.differentiable(scheme, state0, parameters, states), stats
-
-    @abc.abstractmethod
-    def differentiable(self, scheme: AbstractScheme, state0: State, parameters: Parameters, states: State) -> State:
-        """The states of a run, as a function of what the run depends on."""
 
 
 class AbstractDiscrete(AbstractSensitivity):
@@ -66,13 +57,12 @@ class AbstractDiscrete(AbstractSensitivity):
         valid = given in (None, "sqrt") or (isinstance(given, int) and not isinstance(given, bool) and given > 0)
         require_setting(self, "checkpoints", valid, "None, 'sqrt' or a number of states, at least 1")
 
-    def trajectory(self, scheme, state0, parameters, found=None):
+    def _require_all_states(self) -> None:
         if self.checkpoints is not None:
             raise ValueError(
                 f"{type(self).__name__}: `checkpoints` = {self.checkpoints!r} is for `simulate(…, save=…)`: a "
                 "trajectory has all its states anyway. Ask for what the criterion needs with `save`, or leave it out."
             )
-        return super().trajectory(scheme, state0, parameters, found)
 
 
 class DirectDifferentiation(AbstractDiscrete):
@@ -90,8 +80,9 @@ class DirectDifferentiation(AbstractDiscrete):
     Raises `ValueError` for other `checkpoints`, and for a trajectory, which has all states anyway, with any.
     """
 
-    def differentiable(self, scheme, state0, parameters, states):
-        return _direct_trajectory(scheme, state0, parameters, states)
+    def trajectory(self, scheme, state0, parameters, found=None):
+        self._require_all_states()
+        return _decoded(_direct_trajectory(scheme, state0, parameters, found))
 
 
 class AdjointVariable(AbstractDiscrete):
@@ -106,8 +97,9 @@ class AdjointVariable(AbstractDiscrete):
     Raises `ValueError` as `DirectDifferentiation`.
     """
 
-    def differentiable(self, scheme, state0, parameters, states):
-        return _adjoint_trajectory(scheme, state0, parameters, states)
+    def trajectory(self, scheme, state0, parameters, found=None):
+        self._require_all_states()
+        return _decoded(_adjoint_trajectory(scheme, state0, parameters, found))
 
 
 class ContinuousDirect(AbstractSensitivity):
@@ -118,10 +110,9 @@ class ContinuousDirect(AbstractSensitivity):
     it is the transpose of the forward sweep.
     """
 
-    def differentiable(self, scheme, state0, parameters, states):
+    def trajectory(self, scheme, state0, parameters, found=None):
         _require_positions("ContinuousDirect", parameters)
-        physical = partial(scheme.physical, parameters.system)
-        return _continuous_trajectory(_linear_scheme(scheme), physical(state0), parameters, physical(states))
+        return _decoded(_continuous_trajectory(scheme, state0, parameters))
 
 
 class Autodiff(AbstractSensitivity):
@@ -133,10 +124,7 @@ class Autodiff(AbstractSensitivity):
     """
 
     def trajectory(self, scheme, state0, parameters, found=None):
-        return states_of(scheme.for_autodiff(), *parameters, state0)
-
-    def differentiable(self, scheme, state0, parameters, states):
-        return self.trajectory(scheme, state0, parameters)[0]
+        return _decoded(_run(scheme.for_autodiff(), state0, parameters))
 
 
 class ContinuousAdjoint(eqx.Module):
@@ -207,6 +195,29 @@ def _linear_scheme(scheme: AbstractScheme) -> GeneralizedAlpha:
     return dataclasses.replace(scheme, stabilized=False) if isinstance(scheme, GeneralizedAlpha) else GeneralizedAlpha()
 
 
+# The custom rules see statistics as floats: an integer output of a `custom_vjp` reaches operations that have no
+# derivative (`jnp.all`) with a tangent, and JAX refuses.
+
+
+def _run(scheme, state0, parameters, found=None):
+    states, stats = states_of(scheme, parameters.system, parameters.grid, state0) if found is None else found
+    return states, encoded(stats, states.v.dtype)
+
+
+def encoded(stats: Stats, dtype) -> Stats:
+    return jax.tree.map(lambda leaf: leaf.astype(dtype), stats)
+
+
+def decoded(stats: Stats) -> Stats:
+    stats = lax.stop_gradient(stats)
+    return stats._replace(iterations=stats.iterations.astype(jnp.int32), converged=stats.converged.astype(bool))
+
+
+def _decoded(run: tuple[State, Stats]) -> tuple[State, Stats]:
+    states, stats = run
+    return states, decoded(stats)
+
+
 def _raveled(tree):
     """The leaves as one vector, and the function that makes the tree of it; every leaf depends on the vector.
 
@@ -229,15 +240,15 @@ def _raveled(tree):
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _direct_trajectory(scheme, state0, parameters, states):
-    return states
+def _direct_trajectory(scheme, state0, parameters, found):
+    return _run(scheme, state0, parameters, found)
 
 
 @_direct_trajectory.defjvp
 def _direct_rule(scheme, primals, tangents):
     state0, parameters, _ = primals
     d_state0, d_parameters, _ = tangents
-    states = _direct_trajectory(scheme, *primals)
+    states, stats = _direct_trajectory(scheme, *primals)
     group = parameters.system.group
     # `custom_linear_solve` is transposed only where no part of b is a constant, and the tangent of a parameter that is
     # not differentiated is one: a zero. Cut from one vector, all depend on all.
@@ -257,44 +268,49 @@ def _direct_rule(scheme, primals, tangents):
         solve=lambda _, rhs: direct_sweep(scheme, states, parameters, *rhs),
         transpose_solve=lambda _, rhs: adjoint_sweep(scheme, states, parameters, *rhs),
     )
-    return states, jax.vmap(partial(to_ambient, group))(states, delta)
+    d_states = jax.vmap(partial(to_ambient, group))(states, delta)
+    return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
 
 
 # Direct differentiation of the equations of motion: a rule whose tangent is linear in the input tangents, as it is.
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _continuous_trajectory(scheme, state0, parameters, states):
-    return states
+def _continuous_trajectory(scheme, state0, parameters):
+    states, stats = _run(scheme, state0, parameters)
+    return scheme.physical(parameters.system, states), stats
 
 
 @_continuous_trajectory.defjvp
 def _continuous_rule(scheme, primals, tangents):
-    state0, parameters, _ = primals
-    d_state0, d_parameters, _ = tangents
-    states = _continuous_trajectory(scheme, *primals)
+    state0, parameters = primals
+    d_state0, d_parameters = tangents
+    states, stats = _continuous_trajectory(scheme, state0, parameters)
     group = parameters.system.group
-    first = to_algebra(group, state0, d_state0)
-    delta = continuous_direct_sweep(scheme, states, parameters, first, d_parameters)
-    return states, jax.vmap(partial(to_ambient, group))(states, delta)
+    physical = partial(scheme.physical, parameters.system)
+    first = to_algebra(group, physical(state0), physical(d_state0))
+    delta = continuous_direct_sweep(_linear_scheme(scheme), states, parameters, first, d_parameters)
+    d_states = jax.vmap(partial(to_ambient, group))(states, delta)
+    return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
 
 
 # Adjoint variable method.
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _adjoint_trajectory(scheme, state0, parameters, states):
-    return states
+def _adjoint_trajectory(scheme, state0, parameters, found):
+    return _run(scheme, state0, parameters, found)
 
 
-def _adjoint_forward(scheme, state0, parameters, states):
-    return states, (states, parameters)
+def _adjoint_forward(scheme, state0, parameters, found):
+    states, stats = _run(scheme, state0, parameters, found)
+    return (states, stats), (states, parameters)
 
 
 def _adjoint_backward(scheme, kept, cotangents):
     states, parameters = kept
     group = parameters.system.group
-    c = jax.vmap(partial(cotangent_to_algebra, group))(states, cotangents)
+    c = jax.vmap(partial(cotangent_to_algebra, group))(states, cotangents[0])
     mu, bar = adjoint_sweep(scheme, states, parameters, c, jax.tree.map(jnp.zeros_like, parameters))
     state0 = jax.tree.map(lambda leaf: leaf[0], states)
     first = jax.tree.map(lambda leaf: leaf[0], mu)

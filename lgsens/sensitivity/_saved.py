@@ -1,48 +1,31 @@
-"""A run that keeps what was asked of each state, and no state; and with checkpoints, the states of some steps.
+"""A run that keeps what was asked of each state, and no state.
 
 The scan of the integrator stacks the outputs of a function of the state instead of the states themselves, so that a
 batch of designs does not stack whole trajectories. Derivatives need the states (`_methods.py`), so the rule makes the
 trajectory and takes the same function of it: the values are the same, and so is what is differentiated.
-
-Two-level checkpointing: the sweeps of the sensitivities need the states of all n steps. A run that keeps the mark at
-every s-th state (`Mark`: what the march needs to go on from there) has the n/s segments between them integrated again,
-one at a time, when a sweep comes to them: n/s + s states at a time instead of n, least for s = √n, for one more
-integration. To JAX a segment is a checkpoint: the march finds its states, of which nothing is differentiated, and the
-rule of the method says how they depend on its first one.
-
-A segment is a run on a grid of its own, `AbstractGrid.segments`, and the long run receives the cotangents of its grid
-through that function. Each segment begins without a matrix, so the steps of the second integration are those of the
-first one. The steps after the last one, which fill its segment, are replaced by its state, with no cotangent.
 """
 
-import dataclasses
-import math
-from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
+from jax.flatten_util import ravel_pytree
 
 from lgsens.dynamics import State
-from lgsens.integrate import (
-    AbstractGrid,
-    AbstractScheme,
-    Mark,
-    Stats,
-    Walk,
-    first_mark,
-    later,
-    march,
-    march_on,
-    with_first,
-)
+from lgsens.integrate import AbstractScheme, Stats, march
 from lgsens.sensitivity._linearization import Parameters
-from lgsens.sensitivity._methods import AbstractDiscrete, AbstractSensitivity, DirectDifferentiation
-
-Output = Callable[..., Any]  # (system, state, t) ↦ pytree
+from lgsens.sensitivity._methods import AbstractSensitivity, AdjointVariable, DirectDifferentiation, decoded, encoded
+from lgsens.sensitivity._segments import (
+    Output,
+    Segments,
+    adjoint_in_segments,
+    direct_in_segments,
+    run_in_segments,
+)
 
 
 class SavedRun(NamedTuple):
@@ -53,7 +36,7 @@ class SavedRun(NamedTuple):
     stats: Stats
 
 
-class _OfPhysical(eqx.Module):
+class _Shown(eqx.Module):
     """An output of physical states as one of the scheme's; equal, for one compilation, where both are."""
 
     output: Output = eqx.field(static=True)
@@ -70,14 +53,16 @@ def saved_run(
 
     The default method does without the states where nothing is differentiated, those with `checkpoints` always.
     """
-    output = _OfPhysical(output, scheme)
-    if isinstance(method, AbstractDiscrete) and method.checkpoints is not None:
+    shown = _Shown(output, scheme)
+    if isinstance(method, DirectDifferentiation | AdjointVariable) and method.checkpoints is not None:
         segments = Segments.of(parameters.grid.num_steps, method.checkpoints)
-        method = dataclasses.replace(method, checkpoints=None)
-        return _in_segments(segments, method, output, scheme, state0, parameters)
-    if method == DirectDifferentiation():
-        return _saved(output, scheme, state0, parameters)
-    return _from_states(method, output, scheme, state0, parameters)
+        rule = _direct_segments if isinstance(method, DirectDifferentiation) else _adjoint_segments
+        run, _ = cast(tuple[SavedRun, Any], rule(shown, scheme, segments, state0, parameters))
+    elif method == DirectDifferentiation():
+        run = _saved(shown, scheme, state0, parameters)
+    else:
+        return _from_states(method, shown, scheme, state0, parameters)
+    return run._replace(stats=decoded(run.stats))
 
 
 def _from_states(method: AbstractSensitivity, output: Output, scheme, state0, parameters: Parameters) -> SavedRun:
@@ -90,60 +75,88 @@ def _from_states(method: AbstractSensitivity, output: Output, scheme, state0, pa
 def _saved(output, scheme, state0, parameters) -> SavedRun:
     system, grid = parameters
     outputs, final, stats = march(scheme, system, grid, state0, lambda state, t: output(system, state, t))
-    return SavedRun(outputs, final, stats)
+    return SavedRun(outputs, final, encoded(stats, final.v.dtype))
 
 
 @_saved.defjvp
 def _rule(output, scheme, primals, tangents):
-    return jax.jvp(partial(_from_states, DirectDifferentiation(), output, scheme), primals, tangents)
+    def whole(state0, parameters):
+        run = _from_states(DirectDifferentiation(), output, scheme, state0, parameters)
+        return run._replace(stats=encoded(run.stats, run.final.v.dtype))
+
+    return jax.jvp(whole, primals, tangents)
 
 
-class Segments(NamedTuple):
-    """How `num_steps` steps are divided: `count` segments of `length`."""
-
-    num_steps: int
-    length: int
-
-    @classmethod
-    def of(cls, num_steps: int, checkpoints: str | int) -> "Segments":
-        """At most `checkpoints` segments; "sqrt": about √n."""
-        return cls(
-            num_steps, math.isqrt(num_steps - 1) + 1 if checkpoints == "sqrt" else -(-num_steps // int(checkpoints))
-        )
-
-    @property
-    def count(self) -> int:
-        return -(-self.num_steps // self.length)
-
-    def joined(self, rows: Any) -> Any:
-        """The rows of steps 1 … n."""
-        flat = lambda leaf: leaf.reshape(self.count * self.length, *leaf.shape[2:])[: self.num_steps]
-        return jax.tree.map(flat, rows)
-
-    def grids(self, grid: AbstractGrid) -> AbstractGrid:
-        """Those of the segments, stacked."""
-        return grid.segments(self.count, self.length)
+# With checkpoints the linear map from the tangents x of (state0, parameters) to those y of outputs and final state,
+# y = A x, is the solution of [[I, 0], [−A, I]] [x; y] = [b; 0]: so `custom_linear_solve` again carries both sweeps, and
+# takes second derivatives of A by the rule above, which keeps all states.
 
 
-def _in_segments(
-    segments: Segments, method: AbstractDiscrete, output: Output, scheme, state0, parameters: Parameters
-) -> SavedRun:
-    system, grid = parameters
+def _segmented(output, scheme, segments: Segments, state0, parameters) -> tuple[SavedRun, Any]:
+    outputs, final, stats, marks = run_in_segments(output, scheme, segments, state0, parameters)
+    return SavedRun(outputs, final, encoded(stats, final.v.dtype)), marks
 
-    @partial(jax.checkpoint, prevent_cse=False)
-    def segment(system, mark: Mark, own: AbstractGrid):
-        fixed = lax.stop_gradient((system, mark, own))
-        states, end, stats = march_on(Walk.of(scheme, fixed[0]), fixed[2], fixed[1], lambda state, _: state)
-        last = jnp.minimum(segments.num_steps - fixed[1].n.astype(int), segments.length)
-        rows = jnp.minimum(jnp.arange(segments.length + 1), last)
-        found = jax.tree.map(lambda leaf: leaf[rows], with_first(fixed[1].progress.state, states))
-        states, _ = method.trajectory(scheme, mark.progress.state, Parameters(system, own), (found, stats))
-        outputs = jax.vmap(partial(output, system))(later(states), own.times()[1:])
-        final = jax.tree.map(lambda leaf: leaf[last], states)
-        return end._replace(progress=end.progress._replace(state=final)), (outputs, stats)
 
-    begin = first_mark(Walk.of(scheme, system), grid, state0)
-    begin = lax.stop_gradient(begin)._replace(progress=lax.stop_gradient(begin.progress)._replace(state=state0))
-    end, (outputs, stats) = lax.scan(partial(segment, system), begin, segments.grids(grid))
-    first = jax.tree.map(jnp.asarray, output(system, state0, grid.t0))
-    return SavedRun(with_first(first, segments.joined(outputs)), end.progress.state, segments.joined(stats))
+def _without_derivative(tree):
+    """Zero tangents, of the type that JAX asks for."""
+
+    def zero(leaf):
+        inexact = jnp.issubdtype(leaf.dtype, jnp.inexact)
+        return jnp.zeros_like(leaf) if inexact else np.zeros(leaf.shape, jax.dtypes.float0)
+
+    return jax.tree.map(zero, tree)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
+def _direct_segments(output, scheme, segments, state0, parameters) -> tuple[SavedRun, Any]:
+    return _segmented(output, scheme, segments, state0, parameters)
+
+
+@_direct_segments.defjvp
+def _direct_segments_rule(output, scheme, segments, primals, tangents):
+    run, marks = _direct_segments(output, scheme, segments, *primals)
+    kept = lax.stop_gradient((marks, run.final))
+    floats = eqx.filter((run.outputs, run.final), eqx.is_inexact_array)
+    flat, unravel = ravel_pytree((tangents, jax.tree.map(jnp.zeros_like, floats)))
+
+    def whole(state0, parameters):
+        found = _saved(output, scheme, state0, parameters)
+        return eqx.filter((found.outputs, found.final), eqx.is_inexact_array)
+
+    def matvec(unknown):
+        x, y = unravel(unknown)
+        return ravel_pytree((x, jax.tree.map(jnp.subtract, y, jax.jvp(whole, primals, x)[1])))[0]
+
+    def solve(_, rhs):
+        b, y = unravel(rhs)
+        found = direct_in_segments(output, scheme, segments, kept[0], primals[1], b)
+        return ravel_pytree((b, jax.tree.map(jnp.add, y, found)))[0]
+
+    def transpose_solve(_, rhs):
+        c, c_outputs = unravel(rhs)
+        found = adjoint_in_segments(output, scheme, segments, *kept, primals[1], c_outputs)
+        return ravel_pytree((jax.tree.map(jnp.add, c, found), c_outputs))[0]
+
+    solution = lax.custom_linear_solve(matvec, flat, solve=solve, transpose_solve=transpose_solve)
+    d_outputs, d_final = eqx.combine(unravel(solution)[1], _without_derivative((run.outputs, run.final)))
+    return (run, marks), (SavedRun(d_outputs, d_final, _without_derivative(run.stats)), _without_derivative(marks))
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
+def _adjoint_segments(output, scheme, segments, state0, parameters) -> tuple[SavedRun, Any]:
+    return _segmented(output, scheme, segments, state0, parameters)
+
+
+def _adjoint_segments_forward(output, scheme, segments, state0, parameters):
+    run, marks = _segmented(output, scheme, segments, state0, parameters)
+    return (run, marks), (marks, run.final, parameters)
+
+
+def _adjoint_segments_backward(output, scheme, segments, kept, cotangents):
+    marks, final, parameters = kept
+    run, _ = cotangents
+    floats = eqx.filter((run.outputs, run.final), lambda leaf: leaf.dtype != jax.dtypes.float0)
+    return adjoint_in_segments(output, scheme, segments, marks, final, parameters, floats)
+
+
+_adjoint_segments.defvjp(_adjoint_segments_forward, _adjoint_segments_backward)

@@ -10,7 +10,7 @@ import lgsens as lg
 from lgsens.examples import spinning_top
 from lgsens.integrate import EqualGrid, Walk, first_mark, march_on, states_of
 from lgsens.sensitivity import AbstractSensitivity
-from lgsens.sensitivity._saved import Segments
+from lgsens.sensitivity._segments import Segments
 
 DIRECT, ADJOINT = lg.DirectDifferentiation, lg.AdjointVariable
 SCHEME = lg.GeneralizedAlpha()
