@@ -58,6 +58,12 @@ def require(condition: Callable[..., Any], message: str, *values: Any) -> None:
         raise ValueError(message)
 
 
+def require_setting(owner: Any, name: str, valid: bool, must: str, advice: str = "") -> None:
+    """Raise `ValueError` unless a static setting of `owner` is valid."""
+    if not valid:
+        raise ValueError(f"{type(owner).__name__}: `{name}` must be {must}, got {getattr(owner, name)!r}{advice}.")
+
+
 def suggestion(name: str, known: Any) -> str:
     """The known names, for a message about an unknown one."""
     return f"{name!r} is not one of {sorted(known)}"

@@ -1,32 +1,26 @@
 """Schemes, grids, and the march through time (paper, §4)."""
 
-from lgsens.integrate._adaptive import (
-    AdaptiveSteps as AdaptiveSteps,
-    ControlledStats as ControlledStats,
-    integrate_controlled as integrate_controlled,
-)
-from lgsens.integrate._alpha import AbstractAlpha as AbstractAlpha
-from lgsens.integrate._explicit import (
-    IndexReducedODE as IndexReducedODE,
-)
+from lgsens.integrate._explicit import IndexReducedODE as IndexReducedODE
 from lgsens.integrate._explicit_step import ended as ended
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha as GeneralizedAlpha
-from lgsens.integrate._given import GivenSteps as GivenSteps
 from lgsens.integrate._grid import (
     AbstractGrid as AbstractGrid,
-    AbstractLink as AbstractLink,
     EqualGrid as EqualGrid,
-    Node as Node,
+    Link as Link,
     UnevenGrid as UnevenGrid,
     earlier as earlier,
     later as later,
     with_first as with_first,
+    with_last as with_last,
 )
 from lgsens.integrate._index3 import factorize_iteration_matrix as factorize_iteration_matrix
-from lgsens.integrate._linearized import AbstractLinearizedStep as AbstractLinearizedStep, Variation as Variation
+from lgsens.integrate._linearized import (
+    AbstractLinearizedStep as AbstractLinearizedStep,
+    Node as Node,
+    Variation as Variation,
+)
 from lgsens.integrate._march import (
     Mark as Mark,
-    Progress as Progress,
     Walk as Walk,
     first_mark as first_mark,
     march as march,
@@ -43,4 +37,9 @@ from lgsens.integrate._scheme import (
     rows as rows,
     scheme_of as scheme_of,
 )
-from lgsens.integrate._singular import margin_of as margin_of, singular_steps as singular_steps
+from lgsens.integrate._singular import singular_steps as singular_steps
+from lgsens.integrate._uneven import (
+    AdaptiveSteps as AdaptiveSteps,
+    ControlledStats as ControlledStats,
+    GivenSteps as GivenSteps,
+)

@@ -1,12 +1,22 @@
-"""The formulas of generalized-α that position and velocity follow, whatever its constraints: eqs. (24), (27)–(29)."""
+"""Generalized-α whatever its constraints: what position and velocity follow, eqs. (24), (27)–(29), and what Newton's
+iteration and the sensitivities know of the equations of a step.
 
+The unknowns are u = a_{n+1} and the multipliers of the equations, `State.lam`: λ, and others where they have any.
+"""
+
+import abc
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
-from jaxtyping import Array, Float
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.dynamics import AbstractSystem, State
+from lgsens.integrate._linearized import AbstractLinearizedStep, Node
 from lgsens.integrate._scheme import AbstractScheme
+from lgsens.linear import LU, Inverse
 
 
 class AbstractAlpha(AbstractScheme):
@@ -37,6 +47,11 @@ class AbstractAlpha(AbstractScheme):
         return (self.gamma + 0.5) ** 2 / 4.0
 
     @property
+    def delta(self) -> float:
+        """Δ = α_m − α_f: a_n stands for the acceleration at t_n + Δ h."""
+        return self.alpha_m - self.alpha_f
+
+    @property
     def inertia_factor(self) -> float:
         """c = ∂v̇⁺/∂u."""
         return (1.0 - self.alpha_m) / (1.0 - self.alpha_f)
@@ -64,3 +79,118 @@ def advance(scheme: AbstractAlpha, system: AbstractSystem, previous: State, u, h
         1.0 - scheme.alpha_f
     )
     return Motion(x, system.group.retract(previous.q, x), v, vdot)
+
+
+class Wear(NamedTuple):
+    """What has been done with the matrix that steps share.
+
+    A matrix that serves s steps of n_1, …, n_s iterations costs (R + Σ n_i)/s iterations per step if making it costs R.
+    This is least where the next step would take more than that; it is taken to need as many as the last one. R is 6
+    for the top (9 unknowns), 10 for 35, 20 for the quarter-car (94) and for chains in blocks, and flat: with half or
+    twice of it times change by 3 %. (A new matrix wherever the contraction exceeds 0.1, the rule before, was made three
+    times as often on the quarter-car, and cost 42 % more: 59 and 42 µs per step of 1 ms.)
+    """
+
+    steps: Int[Array, ""]
+    iterations: Int[Array, ""]
+    last: Int[Array, ""]  # of the last step
+
+    @classmethod
+    def unused(cls) -> "Wear":
+        return cls(*(jnp.zeros((), jnp.int32) for _ in range(3)))
+
+    def after(self, made, iterations) -> "Wear":
+        """After a step of so many iterations, which made a new matrix or not."""
+        return Wear(jnp.where(made, 0, self.steps) + 1, jnp.where(made, 0, self.iterations) + iterations, iterations)
+
+    def out(self, unknowns: int) -> Bool[Array, ""]:
+        """Whether a new matrix pays."""
+        renewal = min(20, 4 + unknowns // 5)
+        return (self.steps > 1) & (self.last * self.steps > renewal + self.iterations)
+
+
+class Matrix(eqx.Module):
+    """The matrix that modified Newton keeps, in factors."""
+
+    solver: Any
+    h: Float[Array, ""]  # of the step that it was made for
+    wear: Wear
+    kind: Any = eqx.field(static=True)  # LU or Inverse
+
+    def after(self, solver, made, iterations, h) -> "Matrix":
+        """After a step of size h and so many iterations, which made a new one or not."""
+        return Matrix(solver, jnp.where(made, h, self.h), self.wear.after(made, iterations), self.kind)
+
+
+class AbstractStep(eqx.Module):
+    """The equations of one step from `previous`."""
+
+    shared: eqx.AbstractVar["AbstractEquations"]
+    previous: eqx.AbstractVar[State]
+    node: eqx.AbstractVar[Node]
+
+    @abc.abstractmethod
+    def motion(self, u, lam) -> Motion:
+        """What follows from the unknowns."""
+
+    @abc.abstractmethod
+    def defect(self, motion: Motion, lam) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
+        """What is left of the dynamic equilibrium [N or N m], and of the constraints, as accelerations."""
+
+    @abc.abstractmethod
+    def factors(self, motion: Motion, lam, kind: Any = LU) -> tuple[Any, Float[Array, ""]]:
+        """The factors of the iteration matrix, whose solution for the defect is what Newton takes from the unknowns;
+        and their margin (`_singular`)."""
+
+    @abc.abstractmethod
+    def change(self, du, dlam) -> Float[Array, " k"]:
+        """How far increments of the unknowns move the configuration, over βh²."""
+
+    def left(self, state: State) -> State:
+        """What a state leaves of the equations, and the configuration that they predict."""
+        motion = self.motion(state.a, state.lam)
+        residual, violation = self.defect(Motion(motion.x, state.q, state.v, state.vdot), state.lam)
+        return State(motion.q, state.v - motion.v, state.vdot - motion.vdot, violation, residual)
+
+
+class AbstractEquations(eqx.Module):
+    """What all steps share, and the equations of each."""
+
+    scheme: eqx.AbstractVar[AbstractAlpha]
+    system: eqx.AbstractVar[AbstractSystem]
+    scale: eqx.AbstractVar[Float[Array, " k"]]
+
+    @classmethod
+    @abc.abstractmethod
+    def of(cls, scheme: AbstractAlpha, system: AbstractSystem) -> "AbstractEquations":
+        """Those of a system."""
+
+    @staticmethod
+    @abc.abstractmethod
+    def numbers(scheme: AbstractAlpha, system: AbstractSystem) -> int:
+        """How many numbers the factors of a step are."""
+
+    @abc.abstractmethod
+    def loads(self, previous: State, state: State) -> Callable[[AbstractSystem, Node], Any]:
+        """See `AbstractScheme.loads`."""
+
+    @abc.abstractmethod
+    def step(self, previous: State, node: Node) -> AbstractStep:
+        """The equations of the step from `previous`."""
+
+    @abc.abstractmethod
+    def linearized(self, node: Node, previous: State, state: State) -> AbstractLinearizedStep:
+        """Their exact linearization at a converged step."""
+
+    @abc.abstractmethod
+    def margin(self, state: State, t) -> Float[Array, ""]:
+        """A margin (`_singular`) that can be compared with those of other step sizes."""
+
+    def no_matrix(self, state: State, node: Node, factor_every: int, kind: Any = Inverse) -> Matrix | None:
+        """Zeros in the shapes of the factors of an iteration matrix, to begin with; None: full Newton shares none."""
+        if not factor_every:
+            return None
+        at_state = Motion(state.v, state.q, state.v, state.vdot)
+        factors = lambda: self.step(state, node).factors(at_state, state.lam, kind)[0]
+        zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(factors))
+        return Matrix(zeros, node.h, Wear.unused(), kind)

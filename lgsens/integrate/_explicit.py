@@ -44,7 +44,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from lgsens._validate import as_count
+from lgsens._validate import as_count, require_setting
 from lgsens.dynamics import (
     RESULTS,
     ConstrainedInertia,
@@ -55,10 +55,10 @@ from lgsens.dynamics import (
     factorized_accelerations,
 )
 from lgsens.integrate._explicit_step import ExplicitLinearizedStep, Inner, corrections, ended
-from lgsens.integrate._grid import earlier, later, with_first
+from lgsens.integrate._grid import earlier, later, with_first, with_last
 from lgsens.integrate._scheme import AbstractScheme, Stages, Stats
 
-MODES = ("reverse", "forward")
+_MODES = ("reverse", "forward")
 
 
 class StepStats(NamedTuple):
@@ -78,14 +78,9 @@ class StepStats(NamedTuple):
 class Coefficients(NamedTuple):
     """a, b and c of a scheme, without stages that only its error estimate uses."""
 
-    a: np.ndarray
-    b: np.ndarray
-    c: np.ndarray
-
-
-def _followed(rest, last):
-    """One instant after a stack of others."""
-    return jax.tree.map(lambda others, one: jnp.concatenate([others, one[None]]), rest, last)
+    a: Any
+    b: Any
+    c: Any
 
 
 class IndexReducedODE(AbstractScheme):
@@ -127,17 +122,13 @@ class IndexReducedODE(AbstractScheme):
     mode: str = eqx.field(static=True, default="reverse", kw_only=True)
 
     def __check_init__(self):
-        for name in ("rtol", "atol"):
-            value = getattr(self, name)
-            if value is not None and (not isinstance(value, int | float) or not 0.0 < value < math.inf):
-                raise ValueError(
-                    f"IndexReducedODE: `{name}` must be positive or None, got {value!r}; 1e-6 is a good start."
-                )
+        for name, value in (("rtol", self.rtol), ("atol", self.atol)):
+            valid = value is None or (isinstance(value, int | float) and 0.0 < value < math.inf)
+            require_setting(self, name, valid, "positive or None", "; 1e-6 is a good start")
         if self.atol is not None and self.rtol is None:
             raise ValueError(f"IndexReducedODE: `atol` = {self.atol!r} needs `rtol`: without it all steps are equal.")
         as_count(self.max_steps, "max_steps", " (it is static)")
-        if self.mode not in MODES:
-            raise ValueError(f"IndexReducedODE: `mode` must be one of {MODES}, got {self.mode!r}.")
+        require_setting(self, "mode", self.mode in _MODES, f"one of {_MODES}")
         if self.solver is not None:
             _tableau(self.solver)
 
@@ -166,7 +157,8 @@ class IndexReducedODE(AbstractScheme):
             a[i + 1, : i + 1] = row
         return Coefficients(a, np.asarray(tableau.b_sol)[:used], np.concatenate([[0.0], tableau.c])[:used])
 
-    def _arrays(self, dtype) -> Coefficients:
+    def arrays(self, dtype) -> Coefficients:
+        """The same in JAX."""
         return Coefficients(*(jnp.asarray(each, dtype) for each in self.coefficients))
 
     # How a motion begins, and what is seen of it.
@@ -192,7 +184,7 @@ class IndexReducedODE(AbstractScheme):
         if states.inner is None:  # by the control of diffrax, or without what is in between
             return None
         retract = jax.vmap(system.group.retract, (None, 0))
-        _, b, c = self._arrays(states.v.dtype)
+        _, b, c = self.arrays(states.v.dtype)
         places = grid.places()
         nodes, begun, found = jax.vmap(grid.node)(places), earlier(states), later(states).inner
         q = jax.vmap(retract)(begun.q, found.x)
@@ -216,7 +208,7 @@ class IndexReducedODE(AbstractScheme):
 
     def take(self, system, shared, before, begun, memory, node, running):
         group, h = system.group, node.h
-        a, b, c = self._arrays(h.dtype)
+        a, b, c = self.arrays(h.dtype)
 
         def stage(slopes, inputs):
             i, weights, t = inputs
@@ -242,27 +234,28 @@ class IndexReducedODE(AbstractScheme):
         found: Inner = state.inner
         x, u, stages = self._advanced(system, node, previous, found)
         times, points = self._points(system, node, previous, state)
-        motion = jax.vmap(lambda t, q, v, *rest: equations_of_motion(system, q, v, *rest, t))(times, *points)
+        left = lambda t, q, v, vdot, lam: equations_of_motion(system, q, v, vdot, lam, t)
+        force, rate = jax.vmap(left)(times, *points)
         q = system.group.retract(previous.q, x)
-        position, velocity = corrections(system, q, node.t, found, state.q, u)
-        inner = Inner(found.x - stages[0], found.v - stages[1], *earlier(motion), *position, *velocity)
-        vdot, lam = (rows[-1] for rows in motion)
-        return State(system.group.retract(q, found.y), state.v - (u + found.d), vdot, lam, state.a - state.vdot, inner)
+        (y, mu), (d, nu) = corrections(system, q, node.t, found, state.q, u)
+        inner = Inner(found.x - stages[0], found.v - stages[1], force[:-1], rate[:-1], y, mu, d, nu)
+        v, a = state.v - (u + found.d), state.a - state.vdot
+        return State(system.group.retract(q, found.y), v, force[-1], rate[-1], a, inner)
 
     def _advanced(self, system, node, previous, found: Inner):
         """x and u of the end, x_i and v_i of the stages, as the slopes give them."""
         rates = with_first(previous.v, jax.vmap(system.group.tangent_inv_mv)(found.x, found.v))
         vdots = with_first(previous.vdot, found.vdot)
-        a, b, _ = (node.h * each for each in self._arrays(node.h.dtype))
+        a, b, _ = (node.h * each for each in self.arrays(node.h.dtype))
         return b @ rates, previous.v + b @ vdots, (a[1:] @ rates, previous.v[None] + a[1:] @ vdots)
 
     def _points(self, system, node, previous, state):
         """t, and (q, v, v̇, λ), where E holds: of the stages and of the end, stacked."""
         found = state.inner
         q = jax.vmap(system.group.retract, (None, 0))(previous.q, found.x)
-        points = _followed((q, found.v, found.vdot, found.lam), (state.q, state.v, state.vdot, state.lam))
-        c = self._arrays(node.h.dtype).c
-        return _followed(node.begin + c[1:] * node.h, node.t), points
+        points = with_last((q, found.v, found.vdot, found.lam), (state.q, state.v, state.vdot, state.lam))
+        c = self.arrays(node.h.dtype).c
+        return with_last(node.begin + c[1:] * node.h, node.t), points
 
     # Sensitivities.
 
@@ -276,8 +269,8 @@ class IndexReducedODE(AbstractScheme):
         q = group.retract(previous.q, x)
         times, points = self._points(system, node, previous, state)
 
-        def motion(t, q, v, *rest):
-            return jax.linearize(lambda q, v: equations_of_motion(system, q, v, *rest, t), q, v)[1]
+        def motion(t, q, v, vdot, lam):
+            return jax.linearize(lambda q, v: equations_of_motion(system, q, v, vdot, lam, t), q, v)[1]
 
         def factors(t, q):
             kkt = ConstrainedInertia.of(shared, system, q, t)
@@ -287,15 +280,12 @@ class IndexReducedODE(AbstractScheme):
             function = lambda q, x, v: (group.retract(q, x), group.tangent_inv_mv(x, v))
             return jax.linearize(function, previous.q, x, v)[1]
 
-        a, b, _ = (node.h * each for each in self._arrays(node.h.dtype))
         return ExplicitLinearizedStep(
+            scheme=self,
             group=group,
-            inertia=shared,
-            a=a[1:],
-            b=b,
             begun=previous.q,
             end=state.q,
-            factors=jax.vmap(factors)(_followed(times, node.t), _followed(points[0], q)),
+            factors=jax.vmap(factors)(with_last(times, node.t), with_last(points[0], q)),
             motion=jax.vmap(motion)(times, *points),
             kinematics=jax.vmap(kinematics)(found.x, found.v),
             to_end=jax.linearize(group.retract, previous.q, x)[1],

@@ -15,6 +15,7 @@ from lgsens.dynamics import (
     State,
     constraint_velocity,
     factorized_accelerations,
+    full_jacobian,
 )
 from lgsens.integrate._linearized import AbstractLinearizedStep, Variation
 from lgsens.liegroups import AbstractLieGroup
@@ -54,26 +55,19 @@ def ended(inertia: Inertia, system: AbstractSystem, q, u, t):
 
 
 def corrections(system: AbstractSystem, q, t, found: Inner, projected, u):
-    """P and R, each in two rows; products with A at q* are derivatives of r and c, so no matrix is made."""
-    still = jnp.zeros_like(u)
-
-    def product(x, mu):
-        push = lambda vdot, lam: system.residual(q, still, vdot, lam, t)
-        _, force = jax.jvp(push, (still, jnp.zeros_like(mu)), (x, mu))
-        return force, jax.jvp(lambda v: constraint_velocity(system, q, v, t), (still,), (x,))[1]
-
-    force, rate = jax.vmap(product)(jnp.stack([found.y, found.d]), jnp.stack([found.mu, found.nu]))
+    """P and R, each in two rows. (With M and B at hand; their products as derivatives of r and c compile longer.)"""
+    mass, jacobian = system.mass_matrix(), full_jacobian(system, q, t)
+    product = lambda x, mu: (mass @ x + mu @ jacobian, jacobian @ x)
+    (force, rate), (impulse, jump) = product(found.y, found.mu), product(found.d, found.nu)
     velocity = constraint_velocity(system, projected, u, t)
-    return (force[0], rate[0] + drift(system, q, t)), (force[1], rate[1] + velocity)
+    return (force, rate + drift(system, q, t)), (impulse, jump + velocity)
 
 
 class ExplicitLinearizedStep(AbstractLinearizedStep):
     """Derivatives at the solution as linear functions of arrays, and the factors of A; of all stages, stacked."""
 
+    scheme: Any = eqx.field(static=True)  # `coefficients`
     group: AbstractLieGroup = eqx.field(static=True)
-    inertia: Inertia
-    a: Float[Array, "s s+1"]  # h a_ij, h b_j
-    b: Float[Array, " s+1"]
     begun: Any  # q_n
     end: Any  # q⁺
     factors: Any  # of A, at the stages, the end and q*
@@ -84,14 +78,15 @@ class ExplicitLinearizedStep(AbstractLinearizedStep):
     corrections: Any  # q*' ↦ P' and R'
     velocity: Any  # (q⁺', u') ↦ c'
 
-    def forward(self, previous, loads, row):
+    def forward(self, shared, node, previous, loads, row):
         group, row = self.group, jax.tree.map(jnp.subtract, row, loads)
+        a, b, _ = (node.h * each for each in self.scheme.arrays(node.h.dtype))
         rows: Inner = row.inner
         dq = group.to_ambient(self.begun, previous.w)
         at = lambda tree, which: jax.tree.map(lambda leaf: leaf[which], tree)
 
         def solve(factors, rows, change):
-            return ConstrainedInertia(self.inertia, *factors).solve(*map(jnp.subtract, rows, change))
+            return ConstrainedInertia(shared, *factors).solve(*map(jnp.subtract, rows, change))
 
         def stage(slopes, inputs):
             i, weights, (x, v, *rows), factors, motion, kinematics = inputs
@@ -100,12 +95,12 @@ class ExplicitLinearizedStep(AbstractLinearizedStep):
             vdot, lam = solve(factors, rows, motion(change, dv))
             return tuple(slope.at[i].set(k) for slope, k in zip(slopes, (rate, vdot))), (dx, dv, vdot, lam)
 
-        count = len(self.b)
+        count = len(b)
         slopes = tuple(jnp.zeros((count, *k.shape), k.dtype).at[0].set(k) for k in (previous.v, previous.vdot))
         linear = at(self.factors, slice(-2)), at(self.motion, slice(-1)), self.kinematics
-        (rates, vdots), stages = lax.scan(stage, slopes, (jnp.arange(1, count), self.a, tuple(rows[:4]), *linear))
+        (rates, vdots), stages = lax.scan(stage, slopes, (jnp.arange(1, count), a[1:], tuple(rows[:4]), *linear))
 
-        dq, du = self.to_end(dq, self.b @ rates), previous.v + self.b @ vdots
+        dq, du = self.to_end(dq, b @ rates), previous.v + b @ vdots
         there = at(self.factors, -1)
         position, (force, rate) = self.corrections(dq)
         y, mu = solve(there, (rows.y, rows.mu), position)

@@ -8,51 +8,38 @@ With u = a_{n+1}, one step from (q, v, v̇, a) at t_n solves for u and λ
     v̇⁺  = ((1 − α_m) u + α_m a − α_f v̇) / (1 − α_f)       (29)
     r(q⁺, v⁺, v̇⁺, λ⁺, t⁺) = 0,   Φ(q⁺)/(βh²) = 0          (25), (26)
 
-The unknown is u and not x, and the constraint is divided by βh²: with ∂x/∂u = βh² the matrix of eq. (30)
-becomes
-
-    S = [[c M + γh C_t + βh² K_t T(x),  Bᵀ],
-         [B T(x),                       0 ]],      c = (1 − α_m)/(1 − α_f),
-
-which does not degenerate as h → 0 (Bottasso, Bauchau & Cardona 2007; its condition at h = 1e-3 would
-else be 1e18). Its constraint rows and multipliers are further scaled by the size of M. Where constraints may be
-redundant, Φ(q⁺)/(βh²) − c λ⁺ = 0, with −diag(c) in the corner of S (`dynamics/_redundant.py`).
+The unknown is u and not x, and the constraint is divided by βh²: with ∂x/∂u = βh² the matrix S of eq. (30), written out
+in `_index3.py`, does not degenerate as h → 0 (Bottasso, Bauchau & Cardona 2007; its condition at h = 1e-3 would else be
+1e18). Its constraint rows and multipliers are further scaled by the size of M.
 """
 
 import dataclasses
 import math
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
+from lgsens._validate import require_setting
 from lgsens.dynamics import given_way, split_velocity
-from lgsens.integrate._alpha import AbstractAlpha
-from lgsens.integrate._alpha_step import AbstractEquations, Matrix, Wear
+from lgsens.integrate._alpha import AbstractAlpha, AbstractEquations, Matrix, Wear
 from lgsens.integrate._guess import Guess
 from lgsens.integrate._index3 import Index3
 from lgsens.integrate._levels import Levels
-from lgsens.integrate._newton import Chord, take_step
-from lgsens.integrate._pace import AbstractPace
-from lgsens.integrate._scheme import Start
+from lgsens.integrate._newton import take_step
+from lgsens.integrate._scheme import Memory, Start
 from lgsens.integrate._singular import Watch
 from lgsens.linear import LU, Inverse
 
 
-class Memory(eqx.Module):
-    """What the iteration of the next step knows of the steps before."""
+class Past(NamedTuple):
+    """What is known of the steps before, besides the matrix."""
 
     guess: Guess
-    matrix: Matrix | None  # None: full Newton, or as kept in a mark
     watch: Watch
-    watched: Float[Array, ""]  # when
-    pace: AbstractPace
-
-
-def _with_matrix(memory: Memory, matrix: Matrix | None) -> Memory:
-    return dataclasses.replace(memory, matrix=matrix)
 
 
 class GeneralizedAlpha(AbstractAlpha):
@@ -101,33 +88,18 @@ class GeneralizedAlpha(AbstractAlpha):
     stabilized: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def __check_init__(self):
-        if not isinstance(self.rho_inf, int | float) or not 0.0 <= self.rho_inf < 1.0:
-            raise ValueError(
-                f"GeneralizedAlpha: `rho_inf` must be a number in [0, 1), got {self.rho_inf!r}; 0.9 damps little, "
-                "0 most."
-            )
-        if not isinstance(self.tolerance, int | float) or not 0.0 < self.tolerance < math.inf:
-            raise ValueError(
-                f"GeneralizedAlpha: `tolerance` must be positive, got {self.tolerance!r}; 1e-10 is the default."
-            )
-        if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
-            raise ValueError(
-                f"GeneralizedAlpha: `max_iterations` must be an int, at least 1, got {self.max_iterations!r}."
-            )
-        if not isinstance(self.factor_every, int) or self.factor_every < 0:
-            raise ValueError(
-                "GeneralizedAlpha: `factor_every` must be an int, at least 0 (0: full Newton always), got "
-                f"{self.factor_every!r}."
-            )
-        if self.iterations is not None and (not isinstance(self.iterations, int) or self.iterations < 1):
-            raise ValueError(
-                "GeneralizedAlpha: `iterations` must be an int, at least 1, or None (until they converge), got "
-                f"{self.iterations!r}."
-            )
-        if not isinstance(self.stabilized, bool):
-            raise ValueError(
-                f"GeneralizedAlpha: `stabilized` must be True (index 2) or False (index 3), got {self.stabilized!r}."
-            )
+        number = lambda value: isinstance(value, int | float)
+        count = lambda value, least: isinstance(value, int) and value >= least
+        check = partial(require_setting, self)
+        valid = number(self.rho_inf) and 0.0 <= self.rho_inf < 1.0
+        check("rho_inf", valid, "a number in [0, 1)", "; 0.9 damps little, 0 most")
+        valid = number(self.tolerance) and 0.0 < self.tolerance < math.inf
+        check("tolerance", valid, "positive", "; 1e-10 is the default")
+        check("max_iterations", count(self.max_iterations, 1), "an int, at least 1")
+        check("factor_every", count(self.factor_every, 0), "an int, at least 0 (0: full Newton always)")
+        valid = self.iterations is None or count(self.iterations, 1)
+        check("iterations", valid, "an int, at least 1, or None (until they converge)")
+        check("stabilized", isinstance(self.stabilized, bool), "True (index 2) or False (index 3)")
 
     # What the scheme is for the march and the sweeps.
 
@@ -135,7 +107,7 @@ class GeneralizedAlpha(AbstractAlpha):
         return self._kind(system).of(self, system)
 
     def equations(self, system, node, previous, state):
-        return self.shared(system).step(previous, node).left(state, node.t)
+        return self.shared(system).step(previous, node).left(state)
 
     def start(self, system, initial, t0):
         """The starting values of the scheme; see `second_order_start`.
@@ -150,7 +122,7 @@ class GeneralizedAlpha(AbstractAlpha):
         state = self.complete(system, initial.state)
         if not self.second_order_start:
             return Start(state)
-        a_1 = (self.alpha_m - self.alpha_f) * initial.jerk
+        a_1 = self.delta * initial.jerk
         if self.stabilized:
             return Start(state, a_1=a_1)
         missed = self.missed_increment(system, state.v, state.vdot, initial.jerk)
@@ -184,12 +156,11 @@ class GeneralizedAlpha(AbstractAlpha):
         The true one is h v + h²/2 v̇ + h³ (v̈/6 + ad(v) v̇/12), from ẋ = T⁻¹(x) v and T⁻¹ = I + ½ ad(x) + …; hence
         c = (1/6 − β − Δ/2) v̈ + ad(v) v̇/12.
         """
-        delta = self.alpha_m - self.alpha_f
-        return (1.0 / 6.0 - self.beta - delta / 2.0) * jerk + system.group.ad_mv(v, vdot) / 12.0
+        return (1.0 / 6.0 - self.beta - self.delta / 2.0) * jerk + system.group.ad_mv(v, vdot) / 12.0
 
-    def memory(self, system, shared, state, node, pace, *, exact=False):
+    def memory(self, shared, state, node, *, uneven, exact=False):
         matrix = shared.no_matrix(state, node, self.factor_every, LU if exact else Inverse)
-        return Memory(Guess.first(state), matrix, Watch.first(node.h.dtype), node.begin, pace)
+        return Memory(Past(Guess.first(state, uneven=uneven), Watch.first(node.begin)), matrix)
 
     def remembered(self, shared, memory, linearized, node, stats):
         """Its exact matrix serves the next step, and is the first of which no other one is made."""
@@ -200,44 +171,24 @@ class GeneralizedAlpha(AbstractAlpha):
         matrix = Matrix(linearized.factors, node.h, once, LU)
         margin = linearized.margin(shared.scale)
         stats = stats if margin is None else stats._replace(margin=margin)
-        return _with_matrix(memory, matrix), stats
-
-    def kept(self, memory):
-        return _with_matrix(memory, None)
-
-    def restored(self, system, shared, kept, state, node):
-        return _with_matrix(kept, shared.no_matrix(state, node, self.factor_every))
-
-    def rejected(self, before, after):
-        """The matrix is the new one, which is large."""
-        return _with_matrix(before, after.matrix)
+        return memory._replace(matrix=matrix), stats
 
     def take(self, system, shared, before, begun, memory, node, running):
-        matrix, pace, t, h = memory.matrix, memory.pace, node.t, node.h
-        weights = pace.weights(h, self.alpha_m - self.alpha_f), pace.weights(h, 0.0)
-        chord = None if matrix is None else Chord(matrix.solver, self._due(memory, shared, node), matrix.kind)
-        state, guess, stats, chord = take_step(
-            self, shared.step(begun, node), shared.scale, before, memory.guess, weights, chord, running, t, h
-        )
-        watch, watched = memory.watch, memory.watched
-        if chord is None:
-            stats = stats._replace(margin=pace.margin(True, stats.margin, lambda: shared.margin(state, t)))
-        else:
-            made = chord.due
-            stats = stats._replace(margin=pace.margin(made, stats.margin, lambda: shared.margin(state, t)))
-            watch = jax.tree.map(partial(jnp.where, made), watch.after(stats.margin, t - watched), watch)
-            watched = jnp.where(made, t, watched)
-            wear = matrix.wear.after(made, stats.iterations)
-            matrix = Matrix(chord.solver, jnp.where(made, h, matrix.h), wear, matrix.kind)
-        return state, Memory(guess, matrix, watch, watched, pace.after(h)), stats
+        (guess, watch), matrix = memory
+        due = matrix is not None and self._due(memory, node, before.a.size + before.lam.size)
+        equations = shared.step(begun, node)
+        state, next_guess, stats, matrix, made = take_step(equations, before, guess, matrix, due, running)
+        margin = guess.pace.margin(made, stats.margin, lambda: shared.margin(state, node.t))
+        if matrix is not None:
+            watch = jax.tree.map(partial(jnp.where, made), watch.after(margin, node.t), watch)
+        return state, Memory(Past(next_guess, watch), matrix), stats._replace(margin=margin)
 
-    def _due(self, memory: Memory, shared: AbstractEquations, node) -> Bool[Array, ""]:
+    def _due(self, memory: Memory, node, unknowns: int) -> Bool[Array, ""]:
         """Whether a step wants a new matrix."""
-        matrix = memory.matrix
+        (guess, watch), matrix = memory
         due = (matrix.wear.steps == 0) | (matrix.wear.steps >= self.factor_every)
-        ahead = (node.t - memory.watched) + (2.0 * self.factor_every) * node.h
-        due = due | memory.watch.ends_within(ahead) | memory.pace.changed(node.h, matrix.h)
-        return due if self.iterations is not None else due | matrix.wear.out(shared.unknowns)
+        due = due | watch.ends_by(node.t, (2.0 * self.factor_every) * node.h) | guess.pace.changed(node.h, matrix.h)
+        return due if self.iterations is not None else due | matrix.wear.out(unknowns)
 
     def numbers(self, system):
         return self._kind(system).numbers(self, system)

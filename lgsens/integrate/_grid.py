@@ -15,7 +15,7 @@ its arrays have places ends with such. For its equations it has the size before 
 
 import abc
 import dataclasses
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import equinox as eqx
 import jax
@@ -24,16 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from lgsens.dynamics import State
-from lgsens.integrate._linearized import Variation
-from lgsens.integrate._pace import AbstractPace, EqualPace, UnevenPace
-
-
-class Node(NamedTuple):
-    """One step in time, or a tangent or cotangent of it."""
-
-    begin: Float[Array, ""]
-    t: Float[Array, ""]  # its end
-    h: Float[Array, ""]
+from lgsens.integrate._linearized import Node, Variation
 
 
 class Resizes(Protocol):
@@ -42,57 +33,35 @@ class Resizes(Protocol):
     def resized(self, vdot, a, ratio) -> Float[Array, " k"]: ...
 
 
-class AbstractLink(eqx.Module):
-    """How a step follows the one before, linearized; stacked, all of them."""
-
-    @abc.abstractmethod
-    def begun(self, previous: Variation, d_place: Any) -> Variation:
-        """The variation of what the step begins with."""
-
-    @abc.abstractmethod
-    def begun_transposed(self, begun: Variation) -> tuple[Variation, Any]:
-        """The cotangents of δ_n and of the place, from that of what the step begins with."""
-
-    @abc.abstractmethod
-    def unless_empty(self, rows: Any, otherwise: Any) -> Any:
-        """`rows`, or, of an empty step, `otherwise`."""
-
-
-class EqualLink(AbstractLink):
-    """Nothing changes from step to step."""
-
-    ratio: ClassVar[float] = 1.0
-
-    def begun(self, previous, d_place):
-        return previous
-
-    def begun_transposed(self, begun):
-        return begun, None
-
-    def unless_empty(self, rows, otherwise):
-        return rows
-
-
-class UnevenLink(AbstractLink):
-    """The algorithmic acceleration changes with the size of steps."""
+class Link(eqx.Module):
+    """How a step follows the one before, linearized; stacked, all of them. Between equal steps nothing changes."""
 
     scheme: Resizes = eqx.field(static=True)
-    ratio: Float[Array, ""]
-    by_ratio: Float[Array, " k"]  # ∂a*/∂r
-    empty: Bool[Array, ""]
+    ratio: Any = None  # of the sizes, shape (); None, like the others: steps are equal
+    by_ratio: Any = None  # ∂a*/∂r, shape (k,)
+    empty: Any = None  # whether the step is, shape ()
 
-    def begun(self, previous, d_place):
+    def begun(self, previous: Variation, d_place: Any) -> Variation:
+        """The variation of what the step begins with."""
+        if self.ratio is None:
+            return previous
         a = self.scheme.resized(previous.vdot, previous.a, self.ratio)
         return previous._replace(a=a + d_place.ratio * self.by_ratio)
 
-    def begun_transposed(self, begun):
+    def begun_transposed(self, begun: Variation) -> tuple[Variation, Float[Array, ""] | None]:
+        """The cotangents of δ_n and of the ratio, from that of what the step begins with."""
+        if self.ratio is None:
+            return begun, None
         zero = jnp.zeros_like(begun.a)
         transposed = jax.linear_transpose(lambda vdot, a: self.scheme.resized(vdot, a, self.ratio), zero, zero)
         vdot, a = transposed(begun.a)
         ratio = jnp.where(self.empty, 0.0, jnp.dot(begun.a, self.by_ratio))
         return begun._replace(vdot=begun.vdot + vdot, a=a), ratio
 
-    def unless_empty(self, rows, otherwise):
+    def unless_empty(self, rows: Any, otherwise: Any) -> Any:
+        """`rows`, or, of an empty step, `otherwise`."""
+        if self.empty is None:
+            return rows
         return jax.tree.map(lambda row, other: jnp.where(self.empty, other, row), rows, otherwise)
 
 
@@ -115,30 +84,22 @@ class AbstractGrid(eqx.Module):
     def node(self, place: Any) -> Node:
         """The step at a place."""
 
-    @abc.abstractmethod
-    def link(self, scheme: Resizes, place: Any, previous: State) -> AbstractLink:
+    def link(self, scheme: Resizes, place: Any, previous: State) -> Link:
         """How the step at a place follows the state before it."""
+        return Link(scheme)
 
-    @abc.abstractmethod
-    def place_cotangents(self, of_nodes: Any, of_links: Any) -> Any:
-        """The cotangents of places, stacked, from those by `node` and those by `link`."""
-
-    @abc.abstractmethod
     def begun(self, scheme: Resizes, place: Any, state: State) -> State:
         """What the step at a place begins with."""
+        return state
 
-    @abc.abstractmethod
     def empty(self, place: Any) -> Bool[Array, ""] | None:
         """Whether the step is none; None: no step of this grid is empty."""
-
-    @abc.abstractmethod
-    def pace(self) -> AbstractPace:
-        """What an iteration knows of the times of the steps before, at the start."""
+        return None
 
     @property
     @abc.abstractmethod
     def first_size(self) -> Float[Array, ""]:
-        """The size of the first step."""
+        """The size of the step to which the a at t0 belongs."""
 
     @abc.abstractmethod
     def segments(self, count: int, length: int) -> "AbstractGrid":
@@ -160,21 +121,6 @@ class EqualGrid(AbstractGrid):
 
     def node(self, place):
         return Node(self.t0 + place * self.h, self.t0 + (place + 1) * self.h, self.h)
-
-    def link(self, scheme, place, previous):
-        return EqualLink()
-
-    def place_cotangents(self, of_nodes, of_links):
-        return of_nodes
-
-    def begun(self, scheme, place, state):
-        return state
-
-    def empty(self, place):
-        return None
-
-    def pace(self):
-        return EqualPace()
 
     @property
     def first_size(self):
@@ -210,6 +156,10 @@ class UnevenGrid(AbstractGrid):
     def num_steps(self) -> int:
         return self.h.shape[-1]
 
+    @property
+    def first_size(self):
+        return self.before
+
     def times(self):
         return self.t0 + jnp.concatenate([jnp.zeros_like(self.h[:1]), jnp.cumsum(self.h)])
 
@@ -225,23 +175,13 @@ class UnevenGrid(AbstractGrid):
 
     def link(self, scheme, place, previous):
         by_ratio = jax.jacfwd(lambda ratio: scheme.resized(previous.vdot, previous.a, ratio))(place.ratio)
-        return UnevenLink(scheme, place.ratio, by_ratio, self.empty(place))
-
-    def place_cotangents(self, of_nodes, of_links):
-        return of_nodes._replace(ratio=of_nodes.ratio + of_links)
+        return Link(scheme, place.ratio, by_ratio, self.empty(place))
 
     def begun(self, scheme, place, state):
         return dataclasses.replace(state, a=scheme.resized(state.vdot, state.a, place.ratio))
 
     def empty(self, place):
         return place.size == 0.0
-
-    def pace(self):
-        return UnevenPace.first(self.h.dtype)
-
-    @property
-    def first_size(self):
-        return self.before
 
     def segments(self, count, length):
         h = jnp.concatenate([self.h, jnp.zeros(count * length - self.num_steps, self.h.dtype)]).reshape(count, length)
@@ -266,3 +206,8 @@ def earlier(states: Tree) -> Tree:
 def with_first(first: Tree, rest: Tree) -> Tree:
     """One instant before a stack of others."""
     return jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), first, rest)
+
+
+def with_last(rest: Tree, last: Tree) -> Tree:
+    """One instant after a stack of others."""
+    return jax.tree.map(lambda others, one: jnp.concatenate([others, one[None]]), rest, last)

@@ -1,12 +1,60 @@
-"""Where the iteration of the next step starts."""
+"""Where the iteration of the next step starts: past values, extrapolated to its end.
 
+The parabola through three values at the times τ_0 > τ_1 > τ_2 has at τ the value Σ w_i x_i,
+
+    w_i = Π_{j ≠ i} (τ − τ_j)/(τ_i − τ_j),
+
+3, −3, 1 at equal distances. Multipliers belong to the ends t_n of steps, algorithmic accelerations to t_n + Δ h_n.
+"""
+
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from lgsens.dynamics import State
-from lgsens.integrate._pace import Weights
+from lgsens.integrate._lanes import renewed_where
+
+_SAME = 2.0  # the change of h up to which modified Newton keeps its matrix
+
+Weights = tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]] | None  # None: 3, −3, 1
+
+
+class Pace(NamedTuple):
+    """How far apart the last three states are; h None: steps are equal.
+
+    In units of the next step: equal ones have the weights 3, −3, 1 to the last bit.
+    """
+
+    h: Float[Array, "3"] | None  # of the last three steps; 0 before the first, where values are alike and any size does
+
+    def weights(self, h, delta: float) -> Weights:
+        """Of values at t_n + Δ h_n, extrapolated to the end of a step of size h."""
+        if self.h is None:
+            return None
+        r = jnp.where(self.h > 0.0, self.h / h, 1.0)
+        to = (1.0 + delta * (1.0 - r[0]), 1.0 + r[0] + delta * (1.0 - r[1]), 1.0 + r[0] + r[1] + delta * (1.0 - r[2]))
+        return (
+            to[1] * to[2] / ((to[1] - to[0]) * (to[2] - to[0])),
+            to[0] * to[2] / ((to[0] - to[1]) * (to[2] - to[1])),
+            to[0] * to[1] / ((to[0] - to[2]) * (to[1] - to[2])),
+        )
+
+    def after(self, h) -> "Pace":
+        """With a step of size h done."""
+        return self if self.h is None else Pace(jnp.concatenate([h[None], self.h[:2]]))
+
+    def changed(self, h, before) -> Bool[Array, ""] | bool:
+        """Whether a matrix made for steps of size `before` is none for steps of size h."""
+        return False if self.h is None else (h > _SAME * before) | (_SAME * h < before)
+
+    def margin(self, made, of_matrix, by_mass: Callable[[], Float[Array, ""]]) -> Float[Array, ""]:
+        """The margin (`_singular`) of a step, where it made a matrix: that of the matrix, or one that can be compared
+        where steps differ."""
+        if self.h is None:
+            return of_matrix
+        return renewed_where(jnp.asarray(made), by_mass, jnp.full_like(of_matrix, jnp.nan))
 
 
 class Past(NamedTuple):
@@ -56,14 +104,23 @@ class Guess(NamedTuple):
     a: Past
     lam: Past
     contraction: Float[Array, ""]
+    pace: Pace
 
     @classmethod
-    def first(cls, state0: State) -> "Guess":
-        return cls(Past.none(state0.a), Past.none(state0.lam), jnp.ones((), state0.a.dtype))
+    def first(cls, state0: State, *, uneven: bool) -> "Guess":
+        dtype = state0.a.dtype
+        pace = Pace(jnp.zeros(3, dtype) if uneven else None)
+        return cls(Past.none(state0.a), Past.none(state0.lam), jnp.ones((), dtype), pace)
+
+    def weights(self, h, delta: float) -> tuple[Weights, Weights]:
+        """Those of a and of λ in a step of size h."""
+        return self.pace.weights(h, delta), self.pace.weights(h, 0.0)
 
     def extrapolated(self, state: State, weights: tuple[Weights, Weights]):
         """u and λ."""
         return self.a.predicted(state.a, weights[0]), self.lam.predicted(state.lam, weights[1])
 
-    def after(self, state: State, contraction, weights: tuple[Weights, Weights]) -> "Guess":
-        return Guess(self.a.after(state.a, weights[0]), self.lam.after(state.lam, weights[1]), contraction)
+    def after(self, state: State, contraction, weights: tuple[Weights, Weights], h) -> "Guess":
+        """After the step of size h that `state` began."""
+        pasts = self.a.after(state.a, weights[0]), self.lam.after(state.lam, weights[1])
+        return Guess(*pasts, contraction, self.pace.after(h))

@@ -70,11 +70,9 @@ from lgsens.dynamics import (
     tangents,
     times_tangent_operator,
 )
-from lgsens.integrate._alpha import AbstractAlpha, advance, increment
-from lgsens.integrate._alpha_step import AbstractEquations, AbstractStep
-from lgsens.integrate._linearized import AbstractLinearizedStep, Variation
+from lgsens.integrate._alpha import AbstractAlpha, AbstractEquations, AbstractStep, advance, increment
+from lgsens.integrate._linearized import AbstractLinearizedStep, Node, Variation
 from lgsens.integrate._singular import margin_by_mass, margin_of
-from lgsens.liegroups import AbstractLieGroup
 from lgsens.linear import LU, Factors, Matrix
 
 
@@ -93,25 +91,23 @@ class Index3Step(AbstractStep):
 
     shared: "Index3"
     previous: State
-    h: Float[Array, ""]
+    node: Node
 
     def motion(self, u, lam):
-        return advance(self.shared.scheme, self.shared.system, self.previous, u, self.h)
+        return advance(self.shared.scheme, self.shared.system, self.previous, u, self.node.h)
 
-    def defect(self, motion, lam, t):
-        system, softness, h = self.shared.system, self.shared.softness, self.h
+    def defect(self, motion, lam):
+        system, softness, (_, t, h) = self.shared.system, self.shared.softness, self.node
         residual = system.residual(motion.q, motion.v, motion.vdot, lam, t)
         # Φ is zero at the solution, up to round-off that h' would multiply by 1/h³
         h = lax.stop_gradient(h) if softness is None else h
         violation = system.constraint(motion.q, t) / (self.shared.scheme.beta * h**2)
         return residual, violation if softness is None else violation - softness * lam
 
-    def factors(self, motion, lam, t, kind=LU):
-        shared = self.shared
+    def factors(self, motion, lam, kind=LU):
+        shared, (_, t, h) = self.shared, self.node
         at_state = tangents(shared.system, motion.q, motion.v, motion.vdot, lam, t)
-        factors = factorize_iteration_matrix(
-            shared.scheme, shared.system, at_state, shared.mass, motion.x, self.h, kind
-        )
+        factors = factorize_iteration_matrix(shared.scheme, shared.system, at_state, shared.mass, motion.x, h, kind)
         return factors, margin_of(factors, at_state.constraint_jacobian, shared.scale)
 
     def change(self, du, dlam):
@@ -130,10 +126,6 @@ class Loads(NamedTuple):
 class Index3LinearizedStep(AbstractLinearizedStep):
     """The equations above, and the factors of S at the converged state."""
 
-    scheme: AbstractAlpha = eqx.field(static=True)
-    group: AbstractLieGroup = eqx.field(static=True)
-    mass: Matrix
-    h: Float[Array, ""]
     x: Float[Array, " k"]
     tangents: Tangents
     factors: Factors
@@ -142,15 +134,15 @@ class Index3LinearizedStep(AbstractLinearizedStep):
         """See `_singular`."""
         return margin_of(self.factors, self.tangents.constraint_jacobian, scale)
 
-    def forward(self, previous, loads, row):
-        scheme, group, h, x = self.scheme, self.group, self.h, self.x
+    def forward(self, shared, node, previous, loads, row):
+        scheme, group, h, x = shared.scheme, shared.system.group, node.h, self.x
         k_t, c_t, jacobian = self.tangents
         dx = h * previous.v + (h**2 * (0.5 - scheme.beta)) * previous.a + loads.x
         w = group.Ad_inv_mv(group.exp(x), previous.w) + group.tangent_mv(x, dx) + row.w
         v = previous.v + (h * (1.0 - scheme.gamma)) * previous.a + loads.v + row.v
         vdot = (scheme.alpha_m * previous.a - scheme.alpha_f * previous.vdot) / (1.0 - scheme.alpha_f) + row.vdot
         u, lam = self.factors.solve(
-            row.a - loads.residual - (self.mass @ vdot + c_t @ v + k_t @ w),
+            row.a - loads.residual - (shared.mass @ vdot + c_t @ v + k_t @ w),
             row.lam - (loads.violation + jacobian @ w) / (scheme.beta * h**2),
         )
         return Variation(
@@ -161,8 +153,8 @@ class Index3LinearizedStep(AbstractLinearizedStep):
             a=u,
         )
 
-    def backward(self, c, loads):
-        scheme, group, h, x = self.scheme, self.group, self.h, self.x
+    def backward(self, shared, node, c, loads):
+        scheme, group, h, x = shared.scheme, shared.system.group, node.h, self.x
         alpha_m, alpha_f = scheme.alpha_m, scheme.alpha_f
         k_t, c_t, jacobian = self.tangents
         mu_a, mu_lam = self.factors.solve(
@@ -176,7 +168,7 @@ class Index3LinearizedStep(AbstractLinearizedStep):
         mu_phi = mu_lam / (scheme.beta * h**2)
         mu_w = c.w - mu_a @ k_t - mu_phi @ jacobian
         mu_v = c.v - mu_a @ c_t
-        mu_vdot = c.vdot - mu_a @ self.mass
+        mu_vdot = c.vdot - mu_a @ shared.mass
         mu_x = group.tangent_rmv(x, mu_w)
         previous = Variation(
             w=group.Ad_inv_rmv(group.exp(x), mu_w),
@@ -224,19 +216,15 @@ class Index3(AbstractEquations):
 
         return function
 
-    @property
-    def unknowns(self):
-        return self.system.group.dim + len(self.system.constraint_names)
-
     def step(self, previous, node):
-        return Index3Step(self, previous, node.h)
+        return Index3Step(self, previous, node)
 
     def linearized(self, node, previous, state):
         system, h = self.system, node.h
         x = increment(self.scheme, previous, state.a, h)
         at_state = tangents(system, state.q, state.v, state.vdot, state.lam, node.t)
         factors = factorize_iteration_matrix(self.scheme, system, at_state, self.mass, x, h)
-        return Index3LinearizedStep(self.scheme, system.group, self.mass, h, x, at_state, factors)
+        return Index3LinearizedStep(x, at_state, factors)
 
     def margin(self, state, t):
         return margin_by_mass(self.system, self.mass, constraint_jacobian(self.system, state.q, t), self.scale)

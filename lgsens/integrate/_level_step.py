@@ -43,8 +43,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import AbstractSystem, State, constraint_velocity, mass_scale
-from lgsens.integrate._alpha import AbstractAlpha, advance
-from lgsens.integrate._alpha_step import AbstractEquations, AbstractStep
+from lgsens.integrate._alpha import AbstractAlpha, AbstractStep, advance
+from lgsens.integrate._linearized import Node
 from lgsens.linear import LU, Factors
 
 
@@ -117,10 +117,10 @@ class LevelFactors(eqx.Module):
 class LevelStep(AbstractStep):
     """The equations above."""
 
-    shared: AbstractEquations
+    shared: Any  # Levels
     previous: State
+    node: Node
     normal: Float[Array, "k b"]  # N
-    h: Float[Array, ""]
 
     def correction(self, lam):
         """N ν."""
@@ -130,15 +130,11 @@ class LevelStep(AbstractStep):
         return jnp.maximum(jnp.abs(du), jnp.abs(self.correction(dlam)))
 
     def motion(self, u, lam):
-        return advance(self.shared.scheme, self.shared.system, self.previous, u, self.h, self.correction(lam))
+        return advance(self.shared.scheme, self.shared.system, self.previous, u, self.node.h, self.correction(lam))
 
-    def defect(self, motion, lam, t):
-        scheme, system, counts, h = (
-            self.shared.scheme,
-            self.shared.system,
-            self.shared.counts,
-            lax.stop_gradient(self.h),
-        )
+    def defect(self, motion, lam):
+        scheme, system, counts = self.shared.scheme, self.shared.system, self.shared.counts
+        t, h = self.node.t, lax.stop_gradient(self.node.h)
         residual = system.residual(motion.q, motion.v, motion.vdot, lam[: counts.multipliers], t)
         positions = system.constraint(motion.q, t) / (scheme.beta * h**2)
         velocities = counts.rate(system, motion.q, motion.v, t) / (scheme.gamma * h)
@@ -149,13 +145,13 @@ class LevelStep(AbstractStep):
         k_t, c_t, jacobian = system.tangents(q, v, vdot, lam[: counts.multipliers], t)
         return LevelTangents(k_t, c_t, jacobian, by_configuration(system, lambda q: counts.rate(system, q, v, t), q))
 
-    def factors(self, motion, lam, t, kind=LU):
-        at_state = self.tangents(motion.q, motion.v, motion.vdot, lam, t)
+    def factors(self, motion, lam, kind=LU):
+        at_state = self.tangents(motion.q, motion.v, motion.vdot, lam, self.node.t)
         return self.factorized(at_state, motion.x, kind), self.shared.margin_at(at_state.jacobian)
 
     def factorized(self, at_state: LevelTangents, x, kind: Any = LU) -> LevelFactors:
         """The factors of S₂."""
-        scheme, mass, counts, h = self.shared.scheme, self.shared.mass, self.shared.counts, self.h
+        scheme, mass, counts, h = self.shared.scheme, self.shared.mass, self.shared.counts, self.node.h
         k_t, c_t, jacobian, rate_stiffness = at_state
         k, p, b, m = mass.shape[0], counts.positions, counts.both, counts.multipliers
         scale = mass_scale(mass)

@@ -36,12 +36,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import AbstractSystem, State, full_jacobian, require_independent
-from lgsens.integrate._alpha import AbstractAlpha, increment
-from lgsens.integrate._alpha_step import AbstractEquations
+from lgsens.integrate._alpha import AbstractAlpha, AbstractEquations, increment
 from lgsens.integrate._level_step import Counts, LevelFactors, LevelStep, LevelTangents, by_configuration
 from lgsens.integrate._linearized import AbstractLinearizedStep, Variation
 from lgsens.integrate._singular import margin_by_mass
-from lgsens.liegroups import AbstractLieGroup
 
 
 class Loads(NamedTuple):
@@ -58,12 +56,6 @@ class Loads(NamedTuple):
 class LevelLinearizedStep(AbstractLinearizedStep):
     """The equations above, and the factors of S₂ at the converged state."""
 
-    scheme: AbstractAlpha = eqx.field(static=True)
-    group: AbstractLieGroup = eqx.field(static=True)
-    counts: Counts = eqx.field(static=True)
-    mass: Float[Array, "k k"]
-    inverse_mass: Float[Array, "k k"]
-    h: Float[Array, ""]
     x: Float[Array, " k"]
     tangents: LevelTangents
     normal: Float[Array, "k b"]  # N
@@ -74,18 +66,17 @@ class LevelLinearizedStep(AbstractLinearizedStep):
         """Not known: that of these factors says nothing."""
         return None
 
-    @property
-    def _jacobians(self):
+    def _jacobians(self, counts: Counts):
         """B and C."""
-        counts, jacobian = self.counts, self.tangents.jacobian
+        jacobian = self.tangents.jacobian
         return jacobian[: counts.positions], jacobian[counts.positions - counts.both :]
 
-    def forward(self, previous, loads, row):
-        scheme, group, h, x, counts = self.scheme, self.group, self.h, self.x, self.counts
+    def forward(self, shared, node, previous, loads, row):
+        scheme, counts, group, h, x = shared.scheme, shared.counts, shared.system.group, node.h, self.x
         position, velocity = scheme.beta * h**2, scheme.gamma * h
         k_t, c_t, _, rate_stiffness = self.tangents
-        of_positions, of_rates = self._jacobians
-        dy = self.inverse_mass @ (self.curvature @ previous.w + loads.correction)
+        of_positions, of_rates = self._jacobians(counts)
+        dy = shared.inverse_mass @ (self.curvature @ previous.w + loads.correction)
         dx = h * previous.v + (h**2 * (0.5 - scheme.beta)) * previous.a + loads.x + position * dy
         w = group.Ad_inv_mv(group.exp(x), previous.w) + group.tangent_mv(x, dx) + row.w
         v = previous.v + (h * (1.0 - scheme.gamma)) * previous.a + loads.v + row.v
@@ -93,7 +84,7 @@ class LevelLinearizedStep(AbstractLinearizedStep):
         left = counts.as_rows(
             (loads.violation + of_positions @ w) / position, (loads.rate + of_rates @ v + rate_stiffness @ w) / velocity
         )
-        u, lam = self.factors.solve(row.a - loads.residual - (self.mass @ vdot + c_t @ v + k_t @ w), row.lam - left)
+        u, lam = self.factors.solve(row.a - loads.residual - (shared.mass @ vdot + c_t @ v + k_t @ w), row.lam - left)
         return Variation(
             w=w + group.tangent_mv(x, position * (u + self.normal @ lam[counts.multipliers :])),
             v=v + velocity * u,
@@ -102,25 +93,26 @@ class LevelLinearizedStep(AbstractLinearizedStep):
             a=u,
         )
 
-    def backward(self, c, loads):
-        scheme, group, h, x, m = self.scheme, self.group, self.h, self.x, self.counts.multipliers
+    def backward(self, shared, node, c, loads):
+        scheme, counts, group, h, x = shared.scheme, shared.counts, shared.system.group, node.h, self.x
+        m = counts.multipliers
         position, velocity = scheme.beta * h**2, scheme.gamma * h
         alpha_m, alpha_f = scheme.alpha_m, scheme.alpha_f
         k_t, c_t, _, rate_stiffness = self.tangents
-        of_positions, of_rates = self._jacobians
+        of_positions, of_rates = self._jacobians(counts)
         turned = position * group.tangent_rmv(x, c.w)
         mu_a, mu_lam = self.factors.solve(
             c.a + turned + velocity * c.v + scheme.inertia_factor * c.vdot,
             jnp.concatenate([c.lam[:m], c.lam[m:] + turned @ self.normal]),
             transposed=True,
         )
-        phi, rate = self.counts.apart(mu_lam)
+        phi, rate = counts.apart(mu_lam)
         phi, rate = phi / position, rate / velocity
         mu_w = c.w - mu_a @ k_t - phi @ of_positions - rate @ rate_stiffness
         mu_v = c.v - mu_a @ c_t - rate @ of_rates
-        mu_vdot = c.vdot - mu_a @ self.mass
+        mu_vdot = c.vdot - mu_a @ shared.mass
         mu_x = group.tangent_rmv(x, mu_w)
-        mu_y = position * (self.inverse_mass @ mu_x)
+        mu_y = position * (shared.inverse_mass @ mu_x)
         previous = Variation(
             w=group.Ad_inv_rmv(group.exp(x), mu_w) + mu_y @ self.curvature,
             v=h * mu_x + mu_v,
@@ -148,7 +140,14 @@ class Levels(AbstractEquations):
     def of(cls, scheme, system):
         require_independent(system, "A step with constraints of velocity level (`stabilized`, nonholonomic)")
         mass, counts = system.mass_matrix(), Counts.of(scheme, system)
-        return cls(scheme, counts, system, mass, jnp.linalg.inv(mass), system.coordinate_scale())
+        return cls(
+            scheme=scheme,
+            counts=counts,
+            system=system,
+            mass=mass,
+            inverse_mass=jnp.linalg.inv(mass),
+            scale=system.coordinate_scale(),
+        )
 
     @staticmethod
     def numbers(scheme, system):
@@ -177,12 +176,8 @@ class Levels(AbstractEquations):
 
         return function
 
-    @property
-    def unknowns(self):
-        return self.system.group.dim + self.counts.multipliers + self.counts.both
-
     def step(self, previous, node):
-        return LevelStep(self, previous, self._normal(previous, node), node.h)
+        return LevelStep(self, previous, node, self._normal(previous, node))
 
     def _normal(self, previous: State, node):
         if not self.counts.both:
@@ -195,12 +190,6 @@ class Levels(AbstractEquations):
         x = increment(self.scheme, previous, state.a + equations.correction(state.lam), h)
         at_state = equations.tangents(state.q, state.v, state.vdot, state.lam, node.t)
         return LevelLinearizedStep(
-            scheme=self.scheme,
-            group=system.group,
-            counts=self.counts,
-            mass=self.mass,
-            inverse_mass=self.inverse_mass,
-            h=h,
             x=x,
             tangents=at_state,
             normal=equations.normal,

@@ -15,6 +15,7 @@ and against the rows of E themselves.
 """
 
 import abc
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -23,6 +24,8 @@ import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
+
+from lgsens.dynamics import State
 
 
 class Variation(NamedTuple):
@@ -35,18 +38,35 @@ class Variation(NamedTuple):
     a: Float[Array, " k"]
     inner: Any = None
 
+    @classmethod
+    def of(cls, w, rest: State) -> "Variation":
+        """With all but w as in `rest`."""
+        return cls(w, rest.v, rest.vdot, rest.lam, rest.a, rest.inner)
+
+    @classmethod
+    def none(cls, states: State) -> "Variation":
+        """That of a state, or of stacked ones, which does not vary."""
+        return jax.tree.map(jnp.zeros_like, cls.of(states.v, states))
+
+
+class Node(NamedTuple):
+    """One step in time, or a tangent or cotangent of it."""
+
+    begin: Float[Array, ""]
+    t: Float[Array, ""]  # its end
+    h: Float[Array, ""]
+
 
 class AbstractLinearizedStep(eqx.Module):
     """The linearized equations of one step, with what solves them."""
 
     @abc.abstractmethod
-    def forward(self, previous: Variation, loads: Any, row: Variation) -> Variation:
-        """δ_{n+1} from δ_n, E_p p' and b."""
+    def forward(self, shared: Any, node: Node, previous: Variation, loads: Any, row: Variation) -> Variation:
+        """δ_{n+1} from δ_n, E_p p' and b; `shared`, what all steps share, is no part of what is stacked for each."""
 
-    def backward(self, c: Variation, loads: Any) -> tuple[Variation, Any, Variation]:
+    def backward(self, shared: Any, node: Node, c: Variation, loads: Any) -> tuple[Variation, Any, Variation]:
         """c_n, `c_loads` and μ from c, here by JAX's transposition of `forward`; `loads`: in shape."""
-        zeros = lambda tree: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), tree)
-        return jax.linear_transpose(self.forward, zeros(c), zeros(loads), zeros(c))(c)
+        return jax.linear_transpose(partial(self.forward, shared, node), c, loads, c)(c)
 
 
 class DenseLinearizedStep(AbstractLinearizedStep):
@@ -55,12 +75,12 @@ class DenseLinearizedStep(AbstractLinearizedStep):
     lu: tuple[Array, Array]  # of E_{y⁺}
     by_previous: Float[Array, "n n"]  # E_y
 
-    def forward(self, previous, loads, row):
+    def forward(self, shared, node, previous, loads, row):
         flat, unravel = ravel_pytree(row)
         rhs = flat - ravel_pytree(loads)[0] - self.by_previous @ ravel_pytree(previous)[0]
         return unravel(jsl.lu_solve(self.lu, rhs))
 
-    def backward(self, c, loads):
+    def backward(self, shared, node, c, loads):
         flat, unravel = ravel_pytree(c)
         mu = jsl.lu_solve(self.lu, flat, trans=1)
         return unravel(-(mu @ self.by_previous)), unravel(-mu), unravel(mu)

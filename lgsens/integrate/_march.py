@@ -10,8 +10,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from lgsens.dynamics import AbstractSystem, State
-from lgsens.integrate._grid import AbstractGrid, Node, with_first
-from lgsens.integrate._scheme import AbstractScheme, Stats
+from lgsens.integrate._grid import AbstractGrid, with_first
+from lgsens.integrate._linearized import Node
+from lgsens.integrate._scheme import AbstractScheme, Memory, Stats
 
 Output = Callable[[State, Any], Any]  # (state, t) ↦ pytree
 
@@ -30,13 +31,8 @@ class Walk(eqx.Module):
     def begin(self, grid: AbstractGrid, state: State, *, exact: bool = False) -> "Progress":
         """Before the first step; `exact`: every step will be linearized, and its exact matrix known."""
         node = Node(grid.t0, grid.t0 + grid.first_size, grid.first_size)
-        memory = self.scheme.memory(self.system, self.shared, state, node, grid.pace(), exact=exact)
+        memory = self.scheme.memory(self.shared, state, node, uneven=grid.h.ndim > 0, exact=exact)
         return Progress(state, memory, jnp.ones((), bool))
-
-    def remembering(self, progress: "Progress", linearized, node: Node, stats: Stats) -> tuple["Progress", Stats]:
-        """With what the linearization of the last step is good for in the next one."""
-        memory, stats = self.scheme.remembered(self.shared, progress.memory, linearized, node, stats)
-        return progress._replace(memory=memory), stats
 
     def take(self, progress: "Progress", begun: State, node: Node, active) -> tuple["Progress", Stats]:
         """A step that begins with `begun`; it ends the simulation if it does not converge."""
@@ -59,20 +55,22 @@ class Walk(eqx.Module):
             residual=jnp.where(quiet, 0.0, stats.residual),
             converged=jnp.where(quiet, True, stats.converged),
         )
-        return self.chosen(active, done, progress), stats
-
-    def chosen(self, which, done: "Progress", before: "Progress") -> "Progress":
-        """`done` where `which`, else `before`; what is large in the memory is that of `done` in any case."""
-        before = before._replace(memory=self.scheme.rejected(before.memory, done.memory))
-        return chosen(which, done, before)
+        return done.where(active, progress), stats
 
 
 class Progress(NamedTuple):
     """The last state, and what the next step needs of those before."""
 
     state: State
-    memory: Any
+    memory: Memory
     running: Bool[Array, ""]
+
+    def with_matrix(self, matrix) -> "Progress":
+        return self._replace(memory=self.memory._replace(matrix=matrix))
+
+    def where(self, which, before: "Progress") -> "Progress":
+        """This where `which`, else `before`; the matrix, which is large, is this one in any case."""
+        return selected(which, self, before.with_matrix(self.memory.matrix))
 
 
 class Mark(NamedTuple):
@@ -82,7 +80,7 @@ class Mark(NamedTuple):
     progress: Progress
 
 
-def chosen(which, one, other):
+def selected(which, one, other):
     """`one` where `which`, leaf by leaf, else `other`."""
     return jax.tree.map(lambda one, other: one if one is other else jnp.where(which, one, other), one, other)
 
@@ -117,14 +115,11 @@ def _marched(walk: Walk, grid: AbstractGrid, progress: Progress, output: Output)
 
 def first_mark(walk: Walk, grid: AbstractGrid, state0: State) -> Mark:
     """That of the beginning."""
-    progress = walk.begin(grid, state0)
-    return Mark(jnp.zeros_like(grid.t0), progress._replace(memory=walk.scheme.kept(progress.memory)))
+    return Mark(jnp.zeros_like(grid.t0), walk.begin(grid, state0).with_matrix(None))
 
 
 def march_on(walk: Walk, grid: AbstractGrid, mark: Mark, output: Output) -> tuple[Any, Mark, Stats]:
     """The steps of a grid that begins at a mark: `output(state, t)` after each; the mark that they reach."""
-    n, (state, kept, running) = mark
-    node = Node(grid.t0, grid.t0 + grid.first_size, grid.first_size)
-    memory = walk.scheme.restored(walk.system, walk.shared, kept, state, node)
-    outputs, end, stats = _marched(walk, grid, Progress(state, memory, running), output)
-    return outputs, Mark(n + grid.num_steps, end._replace(memory=walk.scheme.kept(end.memory))), stats
+    begin = mark.progress.with_matrix(walk.begin(grid, mark.progress.state).memory.matrix)
+    outputs, end, stats = _marched(walk, grid, begin, output)
+    return outputs, Mark(mark.n + grid.num_steps, end.with_matrix(None)), stats

@@ -22,27 +22,17 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.dynamics import State
-from lgsens.integrate._alpha import AbstractAlpha
-from lgsens.integrate._alpha_step import AbstractStep
+from lgsens.integrate._alpha import AbstractStep, Matrix
 from lgsens.integrate._guess import Guess
 from lgsens.integrate._lanes import in_any_lane, renewed_where
-from lgsens.integrate._pace import Weights
 from lgsens.integrate._scheme import Stats
 from lgsens.linear import LU
 
-Solver = Any  # factors
+Solver = Any  # factors; None: each iteration makes its own
 _MODIFIED_LIMIT = 12  # iterations; more cost as much as a full one
 _STALLED = 0.3  # that from which on two full iterations cost less
 _FASTEST = 0.02  # contractions of earlier steps, when the matrix was newer, are no better than this
 _ROUGH = 64  # ε: increments below measure no contraction, and are noise where they fall no longer
-
-
-class Chord(NamedTuple):
-    """The matrix that iterations of modified Newton share, in factors."""
-
-    solver: Solver
-    due: Bool[Array, ""]  # whether the step begins with a new one; after a step, whether it made one
-    kind: Any  # of factors
 
 
 class _Iterate(NamedTuple):
@@ -62,41 +52,34 @@ class _Iterate(NamedTuple):
 
 
 def take_step(
-    scheme: AbstractAlpha,
-    equations: AbstractStep,
-    scale: Float[Array, " k"],
-    previous: State,
-    guess: Guess,
-    weights: tuple[Weights, Weights],
-    chord: Chord | None,
-    running,
-    t,
-    h,
-) -> tuple[State, Guess, Stats, Chord | None]:
-    """The state at t = t_n + h, the guess for the next step, and what Newton did; NaN unless `running` and converged.
+    equations: AbstractStep, previous: State, guess: Guess, matrix: Matrix | None, due, running
+) -> tuple[State, Guess, Stats, Matrix | None, Bool[Array, ""] | bool]:
+    """The state at the end of the step, the guess for the next one, what Newton did, the matrix, and whether it is new.
 
-    `previous`, not resized, and `weights` of past u and λ: where the iteration starts. `chord` has the iteration matrix
-    of an earlier step, for modified Newton; it is returned with the last one made. None: full Newton only.
+    The state is NaN unless `running` and converged. `previous`, not resized: where the iteration starts. `matrix`: that
+    of an earlier step, for modified Newton, or a new one where it is `due`. None: full Newton only.
 
     Modified Newton, and the full Newton that takes over where it gives up, are rounds of one loop: a new matrix at the
     iterate where one is due, then iterations until the next is. What makes a matrix, nearly all that there is to
     compile, so is compiled once.
     """
+    scheme, scale, h = equations.shared.scheme, equations.shared.scale, equations.node.h
     eps = float(jnp.finfo(scale.dtype).eps)
     tolerance = max(scheme.tolerance, 64 * eps)
     round_off = max(1.0, len(scale) / 12) * eps
     target = max(tolerance**2, 0.04 * round_off)
     noise = max(_ROUGH, len(scale)) * eps
+    weights = guess.weights(h, scheme.delta)
     u, lam = guess.extrapolated(previous, weights)
-    kind = None if chord is None else chord.kind
+    kind = None if matrix is None else matrix.kind
 
-    def matrix(iterate: _Iterate, kind) -> tuple[Solver, Float[Array, ""]]:
-        return equations.factors(equations.motion(iterate.u, iterate.lam), iterate.lam, t, kind)
+    def factors(iterate: _Iterate, kind) -> tuple[Solver, Float[Array, ""]]:
+        return equations.factors(equations.motion(iterate.u, iterate.lam), iterate.lam, kind)
 
-    def corrected(solver: Solver | None, iterate: _Iterate) -> _Iterate:
+    def corrected(solver: Solver, iterate: _Iterate) -> _Iterate:
         motion = equations.motion(iterate.u, iterate.lam)
-        residual, violation = equations.defect(motion, iterate.lam, t)
-        solver, margin = matrix(iterate, LU) if solver is None else (solver, iterate.margin)
+        residual, violation = equations.defect(motion, iterate.lam)
+        solver, margin = factors(iterate, LU) if solver is None else (solver, iterate.margin)
         du, dlam = solver.solve(residual, violation)
         size, count = jnp.max(equations.change(du, dlam) * (scheme.beta * h**2) / scale), iterate.iterations + 1
         found = iterate._replace(
@@ -111,7 +94,7 @@ def take_step(
             return found
         # NaN compares false, and ends full Newton
         unfinished = (size > tolerance) & (count - iterate.modified < scheme.max_iterations)
-        return found._replace(going=unfinished) if chord is None else watched(found, iterate.increment, unfinished)
+        return found._replace(going=unfinished) if matrix is None else watched(found, iterate.increment, unfinished)
 
     def watched(iterate: _Iterate, last, unfinished) -> _Iterate:
         """After an iteration, with the increment of the one before: is modified Newton done, or does it give up?"""
@@ -147,7 +130,7 @@ def take_step(
     def round_of(carry: tuple[_Iterate, Solver]) -> tuple[_Iterate, Solver]:
         iterate, solver = carry
         due = in_any_lane(iterate.due & iterate.going)
-        solver, margin = renewed_where(due, lambda: matrix(iterate, kind), (solver, iterate.margin))
+        solver, margin = renewed_where(due, lambda: factors(iterate, kind), (solver, iterate.margin))
         return repeated(partial(corrected, solver), iterate._replace(due=no, margin=margin)), solver
 
     infinite, none, no = jnp.full((), jnp.inf, scale.dtype), jnp.zeros((), jnp.int32), jnp.zeros((), bool)
@@ -166,16 +149,17 @@ def take_step(
         going=running,
         margin=jnp.full((), jnp.nan, scale.dtype),
     )
-    if chord is None:
+    made = True
+    if matrix is None:
         iterate = repeated(partial(corrected, None), iterate)
     else:
-        due = in_any_lane(chord.due & running)  # where one lane of a batch makes a matrix, all have the time to
-        carry = iterate._replace(due=due), chord.solver
+        due = in_any_lane(due & running)  # where one lane of a batch makes a matrix, all have the time to
+        carry = iterate._replace(due=due), matrix.solver
         if scheme.iterations is None:
             iterate, solver = lax.while_loop(lambda carry: in_any_lane(carry[0].going), round_of, carry)
         else:
             iterate, solver = round_of(carry)
-        chord = Chord(solver, running & (due | iterate.full), kind)
+        made = running & (due | iterate.full)
     motion = equations.motion(iterate.u, iterate.lam)
     state = State(q=motion.q, v=motion.v, vdot=motion.vdot, lam=iterate.lam, a=iterate.u)
     finite = jnp.all(jnp.isfinite(iterate.u)) & jnp.all(jnp.isfinite(iterate.lam))
@@ -188,4 +172,7 @@ def take_step(
         converged=converged,
         margin=jnp.where(converged, iterate.margin, jnp.nan),
     )
-    return state, guess.after(previous, jnp.maximum(iterate.contraction, _FASTEST), weights), stats, chord
+    guess = guess.after(previous, jnp.maximum(iterate.contraction, _FASTEST), weights, h)
+    if matrix is not None:
+        matrix = matrix.after(solver, made, stats.iterations, h)
+    return state, guess, stats, matrix, made

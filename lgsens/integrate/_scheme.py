@@ -19,9 +19,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.dynamics import RESULTS, AbstractSystem, Initial, State
-from lgsens.integrate._grid import AbstractGrid, EqualGrid, Node
-from lgsens.integrate._linearized import AbstractLinearizedStep, DenseLinearizedStep, Variation
-from lgsens.integrate._pace import AbstractPace
+from lgsens.integrate._grid import AbstractGrid, EqualGrid
+from lgsens.integrate._linearized import AbstractLinearizedStep, DenseLinearizedStep, Node, Variation
 
 
 class Stats(NamedTuple):
@@ -59,6 +58,18 @@ class Start(NamedTuple):
             v=state.v if self.v_2 is None else state.v + h**2 * self.v_2,
             a=state.a if self.a_1 is None else state.a + h * self.a_1,
         )
+
+
+class Memory(NamedTuple):
+    """What the iteration of a step knows of those before it.
+
+    Attributes:
+        past: what is small; of the last step taken, and kept where a run is to go on from.
+        matrix: what is large; of the last step, taken or not, and not kept.
+    """
+
+    past: Any = None
+    matrix: Any = None
 
 
 class Stages(NamedTuple):
@@ -197,36 +208,22 @@ class AbstractScheme(AbstractIntegrator):
         """What all steps share."""
         return None
 
-    def memory(
-        self, system: AbstractSystem, shared: Any, state: State, node: Node, pace: AbstractPace, *, exact: bool = False
-    ) -> Any:
-        """What the iteration of the next step knows of the steps before, at the start.
+    def memory(self, shared: Any, state: State, node: Node, *, uneven: bool, exact: bool = False) -> Memory:
+        """What the iteration of the next step knows of the steps before, at the start; `uneven`: not all are equal.
 
         `exact`: that of runs in which `remembered` is told of the linearization of each step.
         """
-        return None
+        return Memory()
 
     def remembered(
-        self, shared: Any, memory: Any, linearized: AbstractLinearizedStep, node: Node, stats: Stats
-    ) -> tuple[Any, Stats]:
-        """What is to be remembered of the linearization of the last step."""
+        self, shared: Any, memory: Memory, linearized: Any, node: Node, stats: Stats
+    ) -> tuple[Memory, Stats]:
+        """With what the linearization of the last step is good for in the next one."""
         return memory, stats
 
-    def kept(self, memory: Any) -> Any:
-        """What is kept of it where a run is to go on from."""
-        return memory
-
-    def restored(self, system: AbstractSystem, shared: Any, kept: Any, state: State, node: Node) -> Any:
-        """`memory`, from what was kept of it."""
-        return kept
-
-    def rejected(self, before: Any, after: Any) -> Any:
-        """The memory where a step has been tried and is not taken."""
-        return before
-
     def take(
-        self, system: AbstractSystem, shared: Any, before: State, begun: State, memory: Any, node: Node, running
-    ) -> tuple[State, Any, Stats]:
+        self, system: AbstractSystem, shared: Any, before: State, begun: State, memory: Memory, node: Node, running
+    ) -> tuple[State, Memory, Stats]:
         """The state at the end of a step that begins with `begun` (`before`, resized), and what Newton did; NaN unless
         `running` and converged. Here: full Newton with the matrix of the equations."""
         scale = system.coordinate_scale()
@@ -273,13 +270,13 @@ class AbstractScheme(AbstractIntegrator):
         def of_previous(delta):
             return ravel_pytree(rows(self, system, node, _moved(system, previous, delta), state))[0]
 
-        zero, unravel = ravel_pytree(_none(previous))
+        zero, unravel = ravel_pytree(Variation.none(previous))
         by_previous = jax.jacfwd(lambda delta: of_previous(unravel(delta)))(zero)
         return DenseLinearizedStep(jsl.lu_factor(self._matrix(system, node, previous, state)), by_previous)
 
     def _matrix(self, system, node: Node, previous: State, state: State):
         """E_{y⁺}."""
-        zero, unravel = ravel_pytree(_none(state))
+        zero, unravel = ravel_pytree(Variation.none(state))
 
         def of_state(delta):
             return ravel_pytree(rows(self, system, node, previous, _moved(system, state, unravel(delta))))[0]
@@ -287,20 +284,14 @@ class AbstractScheme(AbstractIntegrator):
         return jax.jacfwd(of_state)(zero)
 
 
-def _none(state: State) -> Variation:
-    zeros = lambda tree: jax.tree.map(jnp.zeros_like, tree)
-    return Variation(jnp.zeros_like(state.v), *zeros((state.v, state.vdot, state.lam, state.a, state.inner)))
-
-
 def _moved(system: AbstractSystem, state: State, delta: Variation) -> State:
     """q exp(w̃), v + v', …"""
-    _, *rest = delta
-    parts = (state.v, state.vdot, state.lam, state.a, state.inner)
-    return State(system.group.retract(state.q, delta.w), *jax.tree.map(jnp.add, parts, tuple(rest)))
+    parts = jax.tree.map(jnp.add, tuple(Variation.of(state.v, state)[1:]), tuple(delta[1:]))
+    return State(system.group.retract(state.q, delta.w), *parts)
 
 
 def rows(scheme: AbstractScheme, system: AbstractSystem, node: Node, previous: State, state: State):
     """E as a `Variation`: its w is log(q_n exp(x̃)⁻¹ q_{n+1}), whose derivative is w' of q_{n+1} less that predicted."""
     left, group = scheme.equations(system, node, previous, state), system.group
     w = group.log(group.compose(group.inverse(left.q), state.q))
-    return Variation(w, left.v, left.vdot, left.lam, left.a, left.inner)
+    return Variation.of(w, left)

@@ -48,22 +48,23 @@ def margin_by_mass(system: AbstractSystem, mass: Matrix, jacobian: Matrix, scale
 
 
 class Watch(NamedTuple):
-    """The margin when it was last known, and its change per step then."""
+    """The margin when it was last known, its rate then, and when."""
 
     margin: Float[Array, ""]
     slope: Float[Array, ""]
+    t: Float[Array, ""]
 
     @classmethod
-    def first(cls, dtype) -> "Watch":
-        return cls(jnp.full((), jnp.inf, dtype), jnp.zeros((), dtype))
+    def first(cls, t) -> "Watch":
+        return cls(jnp.full((), jnp.inf, t.dtype), jnp.zeros((), t.dtype), t)
 
-    def after(self, margin, age) -> "Watch":
-        """With a margin known `age` steps later; the slope to the first one is −inf, which asks for another at once."""
-        return Watch(margin, (margin - self.margin) / age)
+    def after(self, margin, t) -> "Watch":
+        """With a margin known at t; the slope to the first one is −inf, which asks for another at once."""
+        return Watch(margin, (margin - self.margin) / (t - self.t), t)
 
-    def ends_within(self, steps):
-        """Whether the margin would be zero so many steps later."""
-        return self.margin + self.slope * steps <= 0.0
+    def ends_by(self, t, ahead):
+        """Whether the margin would be zero as late as `ahead` after t."""
+        return self.margin + self.slope * ((t - self.t) + ahead) <= 0.0
 
 
 def singular_steps(margins: Float[Array, " n"]):

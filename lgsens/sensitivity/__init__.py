@@ -1,8 +1,6 @@
 """Derivatives of the trajectory, derived by hand (paper, §6–7)."""
 
-from lgsens.sensitivity._continuous_method import ContinuousAdjoint as ContinuousAdjoint
 from lgsens.sensitivity._criterion_terms import Functional as Functional
-from lgsens.sensitivity._direct import direct_sweep as direct_sweep
 from lgsens.sensitivity._linearization import (
     Parameters as Parameters,
     configuration_cotangent as configuration_cotangent,
@@ -11,8 +9,10 @@ from lgsens.sensitivity._methods import (
     AbstractSensitivity as AbstractSensitivity,
     AdjointVariable as AdjointVariable,
     Autodiff as Autodiff,
+    ContinuousAdjoint as ContinuousAdjoint,
     ContinuousDirect as ContinuousDirect,
     DirectDifferentiation as DirectDifferentiation,
 )
 from lgsens.sensitivity._on_the_fly import direct_on_the_fly as direct_on_the_fly
 from lgsens.sensitivity._saved import SavedRun as SavedRun, saved_run as saved_run
+from lgsens.sensitivity._sweeps import direct_sweep as direct_sweep

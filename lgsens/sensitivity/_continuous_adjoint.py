@@ -33,10 +33,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import AbstractSystem, State, mass_scale
-from lgsens.integrate import GeneralizedAlpha
+from lgsens.integrate import GeneralizedAlpha, earlier, with_last
 from lgsens.sensitivity._criterion_terms import Functional, Point, gradients, near
-from lgsens.sensitivity._linear_alpha import Node, advance, start
-from lgsens.sensitivity._linearization import Parameters, pseudo_load_function
+from lgsens.sensitivity._linear_alpha import Motion, Node, advance, start
+from lgsens.sensitivity._linearization import Parameters
 
 
 class Cotangents(NamedTuple):
@@ -98,29 +98,22 @@ def continuous_adjoint_sweep(
     last, of_last = node(at(-1))
     final = _final_conditions(functional, p, system, at(-1), last, of_last)
     nodes = (last, node(at(-2))[0], node(at(-3))[0], node(at(-4))[0])
-    last_h = sizes[-1]
-    s = [(path.t[-1] - path.t[-1 - i]) / last_h for i in (1, 2, 3)]
-    motion = start(scheme, mass, nodes, s, final.mu, -final.mu_rate, last_h)
-    bar = final_cotangents(functional, p, system, at(-1), final.eta1, final.eta2)
-    bar = accumulated(bar, functional, p, system, at(-1), motion.x, motion.lam, last_h / 2)
+    s = [(path.t[-1] - path.t[-1 - i]) / sizes[-1] for i in (1, 2, 3)]
+    begin = start(scheme, mass, nodes, s, final.mu, -final.mu_rate, sizes[-1])
 
     # in the time that runs backwards a step of size h[n] leads to the n-th point, and follows one of size h[n + 1]
-    ratios = sizes / jnp.concatenate([sizes[1:], sizes[-1:]])
+    def step(motion: Motion, inputs):
+        point, h, ratio = inputs
+        motion = advance(scheme, mass, motion, node(point)[0], h, ratio)
+        return motion, (motion.x, motion.lam)
 
-    def sweep(carry, inputs):
-        motion, bar = carry
-        point, h, ratio, weight = inputs
-        here, _ = node(point)
-        motion = advance(scheme, mass, motion, here, h, ratio)
-        return (motion, accumulated(bar, functional, p, system, point, motion.x, motion.lam, weight)), None
+    inputs = (earlier(path), sizes, sizes / jnp.concatenate([sizes[1:], sizes[-1:]]))
+    motion, multipliers = lax.scan(step, begin, inputs, reverse=True)
+    multipliers = with_last(multipliers, (begin.x, begin.lam))
+    bar = final_cotangents(functional, p, system, at(-1), final.eta1, final.eta2)
+    bar = accumulated(bar, functional, p, system, path, *multipliers)
 
-    interior = jax.tree.map(lambda leaf: leaf[1:-1], path)
-    inputs = (interior, sizes[1:], ratios[1:], (sizes[1:] + sizes[:-1]) / 2)
-    (motion, bar), _ = lax.scan(sweep, (motion, bar), inputs, reverse=True)
     first, of = node(at(0))
-    motion = advance(scheme, mass, motion, first, sizes[0], ratios[0])
-    bar = accumulated(bar, functional, p, system, at(0), motion.x, motion.lam, sizes[0] / 2)
-
     rho = of.f_m.T + mass @ motion.x
     pi = of.f_c.T + first.damping @ motion.x - of.df_m.T + mass @ motion.rate  # μ̇ = −dμ/dτ
     pi = pi - group.ad(at(0).state.v).T @ rho
@@ -153,14 +146,21 @@ def final_cotangents(functional: Functional, p, system: AbstractSystem, point: P
     return jax.vmap(pull_back)((jnp.eye(values[0].shape[0], dtype=state.v.dtype), eta1.T, eta2.T))
 
 
-def accumulated(bar, functional: Functional, p, system: AbstractSystem, point: Point, mu, nu, weight):
-    """bar + weight (F_p + μᵀr_p + νᵀΦ_p), for every criterion."""
-    state = point.state
-    rate = near(functional.rate, p, system, state, point.t)
+def accumulated(bar, functional: Functional, p, system: AbstractSystem, path: Point, mu, nu):
+    """bar + ∫ (F_p + μᵀr_p + νᵀΦ_p) dt for every criterion, by the trapezoidal rule, from μ and ν of all points."""
 
-    def integrand(system, p):
-        return rate(p, system, state, point.t), *pseudo_load_function(state)(system, point.t)
+    def add(bar, inputs):
+        (state, t, *_), mu, nu, weight = inputs
+        rate = near(functional.rate, p, system, state, t)
 
-    values, pull_back = jax.vjp(integrand, system, p)
-    one = weight * jnp.eye(values[0].shape[0], dtype=mu.dtype)
-    return jax.tree.map(jnp.add, bar, jax.vmap(pull_back)((one, weight * mu.T, weight * nu.T)))
+        def integrand(system, p):
+            residual = system.residual(state.q, state.v, state.vdot, state.lam, t)
+            return rate(p, system, state, t), residual, system.constraint(state.q, t)
+
+        values, pull_back = jax.vjp(integrand, system, p)
+        one = weight * jnp.eye(values[0].shape[0], dtype=mu.dtype)
+        return jax.tree.map(jnp.add, bar, jax.vmap(pull_back)((one, weight * mu.T, weight * nu.T))), None
+
+    sizes = jnp.pad(jnp.diff(path.t), 1)
+    weights = (sizes[1:] + sizes[:-1]) / 2
+    return lax.scan(add, bar, (path, mu, nu, weights), reverse=True)[0]

@@ -23,7 +23,7 @@ from jax import lax
 from lgsens.dynamics import State, consistent_velocity, full_jacobian, kkt_solve
 from lgsens.integrate import GeneralizedAlpha, Variation, earlier, later, with_first
 from lgsens.sensitivity._linear_alpha import Motion, Node, advance, started
-from lgsens.sensitivity._linearization import Parameters, node_tangent, pseudo_load_function
+from lgsens.sensitivity._linearization import Parameters, node_tangent
 
 
 def continuous_direct_sweep(
@@ -38,7 +38,8 @@ def continuous_direct_sweep(
         t, d_t = grid.node(place).t, node_tangent(grid, d.grid, place, d_place).t
         k_t, c_t, jacobian = system.tangents(state.q, state.v, state.vdot, state.lam, t)
         bracket = group.ad(state.v)
-        loads = pseudo_load_function(state)
+        residual = lambda system, t: system.residual(state.q, state.v, state.vdot, state.lam, t)
+        loads = lambda system, t: (residual(system, t), system.constraint(state.q, t))
         r_p, phi_p = jax.jvp(loads, (system, t), (d.system, d_t))[1]
         return Node(
             damping=c_t + mass @ bracket,
@@ -53,7 +54,9 @@ def continuous_direct_sweep(
     def sweep(previous: Motion, inputs):
         state, place, d_place, link = inputs
         h = grid.node(place).h
-        current = advance(scheme, mass, previous, node(state, place, d_place), h, link.ratio)
+        current = advance(
+            scheme, mass, previous, node(state, place, d_place), h, 1.0 if link.ratio is None else link.ratio
+        )
         current = link.unless_empty(current, previous)
         return current, current
 

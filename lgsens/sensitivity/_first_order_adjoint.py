@@ -31,6 +31,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk, mass_scale
+from lgsens.integrate import with_last
 from lgsens.linear import Factors
 from lgsens.sensitivity._continuous_adjoint import (
     Cotangents,
@@ -70,20 +71,19 @@ def first_order_adjoint_sweep(path: Point, parameters: Parameters, functional: F
     at = lambda n: jax.tree.map(lambda leaf: leaf[n], path)
     eta, mu, eta1, eta2 = _final_conditions(functional, p, system, at(-1), *equations(at(-1)))
     (near, far), (mu1, mu2), (nu1, nu2) = _start(mass, eta, equations(at(-2)), equations(at(-3)), h)
-    bar = final_cotangents(functional, p, system, at(-1), eta1, eta2)
-    # ν_f by extrapolation: it belongs to one end point, whose weight is h/2
-    for n, of_r, of_phi, weight in ((-1, mu, 2.0 * nu1 - nu2, h / 2), (-2, mu1, nu1, h), (-3, mu2, nu2, h)):
-        bar = accumulated(bar, functional, p, system, at(n), of_r, of_phi, weight)
 
-    def sweep(carry, point: Point):
-        near, far, bar = carry
+    def step(carry, point: Point):
+        near, far = carry
         eta, mu, nu = advance(far, near, point)
-        return (far, eta, accumulated(bar, functional, p, system, point, mu, nu, h)), None
+        return (far, eta), (mu, nu)
 
-    interior = jax.tree.map(lambda leaf: leaf[1:-3], path)
-    (near, far, bar), _ = lax.scan(sweep, (near, far, bar), interior, reverse=True)
-    (eta_q, eta_v), mu, nu = advance(far, near, at(0))
-    bar = accumulated(bar, functional, p, system, at(0), mu, nu, h / 2)
+    before = jax.tree.map(lambda leaf: leaf[:-3], path)
+    (_, (eta_q, eta_v)), multipliers = lax.scan(step, (near, far), before, reverse=True)
+    # ν_f by extrapolation: it belongs to one end point, whose weight is h/2
+    for of_r_and_phi in ((mu2, nu2), (mu1, nu1), (mu, 2.0 * nu1 - nu2)):
+        multipliers = with_last(multipliers, of_r_and_phi)
+    bar = final_cotangents(functional, p, system, at(-1), eta1, eta2)
+    bar = accumulated(bar, functional, p, system, path, *multipliers)
     return Cotangents(-eta_q.T, -eta_v.T, *bar)
 
 

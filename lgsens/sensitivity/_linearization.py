@@ -21,8 +21,8 @@ import jax.numpy as jnp
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate import (
     AbstractGrid,
-    AbstractLink,
     AbstractScheme,
+    Link,
     Node,
     Variation,
     earlier,
@@ -43,7 +43,7 @@ class Step(NamedTuple):
     """One converged step: where it is, how it follows the one before, what it begins with, and its end."""
 
     place: Any
-    link: AbstractLink
+    link: Link
     begun: State
     state: State
 
@@ -86,22 +86,12 @@ def matvec(scheme: AbstractScheme, states: State, parameters: Parameters, delta:
     return with_first(jax.tree.map(lambda leaf: leaf[0], delta), jax.vmap(row)(*every)), d
 
 
-def pseudo_load_function(state: State):
-    """p ↦ (r, Φ) at a fixed state: its JVP is (r_p p', Φ_p p'), its VJP their transposes."""
-
-    def loads(system: AbstractSystem, t):
-        return system.residual(state.q, state.v, state.vdot, state.lam, t), system.constraint(state.q, t)
-
-    return loads
-
-
 # Conversion between Lie-algebra coordinates and the arrays of q: the only place where it happens.
 
 
 def to_algebra(group, state: State, tangent: State) -> Variation:
     """The Lie-algebra coordinates of a tangent of a state's arrays."""
-    w = group.from_ambient(state.q, tangent.q)
-    return Variation(w, tangent.v, tangent.vdot, tangent.lam, tangent.a, tangent.inner)
+    return Variation.of(group.from_ambient(state.q, tangent.q), tangent)
 
 
 def to_ambient(group, state: State, delta: Variation) -> State:
@@ -112,7 +102,7 @@ def to_ambient(group, state: State, delta: Variation) -> State:
 def cotangent_to_algebra(group, state: State, cotangent: State) -> Variation:
     """The transpose of `to_ambient`: what a cotangent of the arrays says of the coordinates."""
     (w,) = jax.linear_transpose(lambda w: group.to_ambient(state.q, w), state.v)(cotangent.q)
-    return Variation(w, cotangent.v, cotangent.vdot, cotangent.lam, cotangent.a, cotangent.inner)
+    return Variation.of(w, cotangent)
 
 
 def cotangent_to_ambient(group, state: State, delta: Variation) -> State:
@@ -123,9 +113,3 @@ def cotangent_to_ambient(group, state: State, delta: Variation) -> State:
 def configuration_cotangent(group, q, w):
     """The cotangent of the arrays of q that acts as w acts on Lie-algebra coordinates."""
     return jax.linear_transpose(lambda dq: group.from_ambient(q, dq), q)(w)[0]
-
-
-def zeros_like(states: State) -> Variation:
-    """A variation of a state, or of stacked ones, that is none: the rows of b that a first derivative leaves zero."""
-    zeros = jax.tree.map(jnp.zeros_like, (states.v, states.v, states.vdot, states.lam, states.a, states.inner))
-    return Variation(*zeros)

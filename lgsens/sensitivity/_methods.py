@@ -6,6 +6,7 @@ Both rules are module-level functions of explicit arguments, and keep states onl
 import abc
 import dataclasses
 from functools import partial
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -13,11 +14,13 @@ import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
+from lgsens._validate import require_setting
 from lgsens.dynamics import State, require_independent
-from lgsens.integrate import AbstractScheme, GeneralizedAlpha, Stats, earlier, states_of, with_first
-from lgsens.sensitivity._adjoint import adjoint_sweep
+from lgsens.integrate import AbstractScheme, GeneralizedAlpha, Stats, Variation, earlier, states_of, with_first
+from lgsens.sensitivity._continuous_adjoint import Cotangents, continuous_adjoint_sweep
 from lgsens.sensitivity._continuous_direct import continuous_direct_sweep
-from lgsens.sensitivity._direct import direct_sweep
+from lgsens.sensitivity._criterion_terms import Functional, OfState, derivative_terms, plain_terms, points
+from lgsens.sensitivity._first_order_adjoint import first_order_adjoint_sweep
 from lgsens.sensitivity._linearization import (
     Parameters,
     cotangent_to_algebra,
@@ -25,8 +28,10 @@ from lgsens.sensitivity._linearization import (
     matvec,
     to_algebra,
     to_ambient,
-    zeros_like,
 )
+from lgsens.sensitivity._sweeps import adjoint_sweep, direct_sweep
+
+_TREATMENTS = ("state", "derivatives", "first_order", None)
 
 
 class AbstractSensitivity(eqx.Module):
@@ -42,7 +47,25 @@ class AbstractSensitivity(eqx.Module):
         """
 
 
-class DirectDifferentiation(AbstractSensitivity):
+class AbstractDiscrete(AbstractSensitivity):
+    """The derivative of the numerical trajectory itself, from all of its states or from those of some steps."""
+
+    checkpoints: str | int | None = eqx.field(static=True, default=None, kw_only=True)
+
+    def __check_init__(self):
+        given = self.checkpoints
+        valid = given in (None, "sqrt") or (isinstance(given, int) and not isinstance(given, bool) and given > 0)
+        require_setting(self, "checkpoints", valid, "None, 'sqrt' or a number of states, at least 1")
+
+    def _require_all_states(self) -> None:
+        if self.checkpoints is not None:
+            raise ValueError(
+                f"{type(self).__name__}: `checkpoints` = {self.checkpoints!r} is for `simulate(…, save=…)`: a "
+                "trajectory has all its states anyway. Ask for what the criterion needs with `save`, or leave it out."
+            )
+
+
+class DirectDifferentiation(AbstractDiscrete):
     """The hand-derived linearization L of the scheme, in both modes; the default.
 
     Forward mode (`jvp`, `jacfwd`) is the direct differentiation method of §6.2, forward substitution with L; JAX
@@ -57,17 +80,12 @@ class DirectDifferentiation(AbstractSensitivity):
     Raises `ValueError` for other `checkpoints`, and for a trajectory, which has all states anyway, with any.
     """
 
-    checkpoints: str | int | None = eqx.field(static=True, default=None, kw_only=True)
-
-    def __check_init__(self):
-        _check_checkpoints(self)
-
     def trajectory(self, scheme, state0, parameters, found=None):
-        _refuse_checkpoints(self)
+        self._require_all_states()
         return _decoded(_direct_trajectory(scheme, state0, parameters, found))
 
 
-class AdjointVariable(AbstractSensitivity):
+class AdjointVariable(AbstractDiscrete):
     """The backward sweep with Lᵀ as an explicit `custom_vjp`: reverse mode only, first derivatives only.
 
     The same numbers as `DirectDifferentiation` in reverse mode, from a rule that JAX does not take apart.
@@ -79,31 +97,9 @@ class AdjointVariable(AbstractSensitivity):
     Raises `ValueError` as `DirectDifferentiation`.
     """
 
-    checkpoints: str | int | None = eqx.field(static=True, default=None, kw_only=True)
-
-    def __check_init__(self):
-        _check_checkpoints(self)
-
     def trajectory(self, scheme, state0, parameters, found=None):
-        _refuse_checkpoints(self)
+        self._require_all_states()
         return _decoded(_adjoint_trajectory(scheme, state0, parameters, found))
-
-
-def _check_checkpoints(method: DirectDifferentiation | AdjointVariable) -> None:
-    given = method.checkpoints
-    if given in (None, "sqrt") or (isinstance(given, int) and not isinstance(given, bool) and given > 0):
-        return
-    raise ValueError(
-        f"{type(method).__name__}: `checkpoints` must be None, 'sqrt' or a number of states, at least 1, got {given!r}."
-    )
-
-
-def _refuse_checkpoints(method: DirectDifferentiation | AdjointVariable) -> None:
-    if method.checkpoints is not None:
-        raise ValueError(
-            f"{type(method).__name__}: `checkpoints` = {method.checkpoints!r} is for `simulate(…, save=…)`: a "
-            "trajectory has all its states anyway. Ask for what the criterion needs with `save`, or leave it out."
-        )
 
 
 class ContinuousDirect(AbstractSensitivity):
@@ -115,7 +111,7 @@ class ContinuousDirect(AbstractSensitivity):
     """
 
     def trajectory(self, scheme, state0, parameters, found=None):
-        require_positions("ContinuousDirect", parameters)
+        _require_positions("ContinuousDirect", parameters)
         return _decoded(_continuous_trajectory(scheme, state0, parameters))
 
 
@@ -131,7 +127,60 @@ class Autodiff(AbstractSensitivity):
         return _decoded(_run(scheme.for_autodiff(), state0, parameters))
 
 
-def require_positions(method: str, parameters: Parameters) -> None:
+class ContinuousAdjoint(eqx.Module):
+    """The adjoint equations of motion, integrated backwards (§7); a method of `differentiate`.
+
+    Second order, but not the derivative of the numerical trajectory, whose own adjoint is `AdjointVariable`. It needs
+    F and G apart, and where F depends on accelerations, one of the treatments that §7.2 lists:
+
+    Arguments:
+        accelerations: "state" expresses v̇ and λ through q and v (eq. 41; F and G may use both); "derivatives"
+            computes v̈ and v⃛ by additional differential equations; "first_order" solves the first-order adjoint
+            equations of Bestle & Seybold (1992), extended to the Lie group, by BDF2; None leaves eqs. (39)–(43) as
+            they are, for criteria without accelerations. Only "state" keeps second order for F of v̇ and λ; it
+            also costs most. Criteria that use neither v̇ nor λ are the same in "state",
+            "derivatives" and None, and cost the same.
+
+    At least 4 steps. Raises `ValueError` for another treatment. Source: Sonneville & Brüls (2014), §7.
+    """
+
+    LEAST_STEPS: ClassVar[int] = 4
+
+    accelerations: str | None = eqx.field(static=True, default="state")
+
+    def __check_init__(self):
+        require_setting(self, "accelerations", self.accelerations in _TREATMENTS, f"one of {_TREATMENTS}")
+
+    def cotangents(
+        self,
+        scheme: AbstractScheme,
+        states: State,
+        parameters: Parameters,
+        functional: Functional,
+        p,
+        *,
+        uses: tuple[bool, bool],
+    ) -> Cotangents:
+        """dΨ as it acts on the initial state, the system and p; `uses`: whether F and G use v̇ or λ."""
+        _require_positions("ContinuousAdjoint", parameters)
+        scheme = _linear_scheme(scheme)
+        t, h = parameters.grid.times(), parameters.grid.h
+        if self.accelerations != "state" and h.ndim:
+            raise ValueError(
+                f"ContinuousAdjoint({self.accelerations!r}) takes differences in equal steps: leave GivenSteps and "
+                "AdaptiveSteps out, or take ContinuousAdjoint('state'), DirectDifferentiation() or AdjointVariable()."
+            )
+        derivatives = uses[0] and self.accelerations in ("derivatives", None)
+        path = points(scheme, states, t, h, derivatives=derivatives)
+        if self.accelerations == "first_order":
+            return first_order_adjoint_sweep(path, parameters, functional, p)
+        if self.accelerations == "state":
+            functional = Functional(*(OfState(f) if used else f for f, used in zip(functional, uses)))
+        terms = derivative_terms if derivatives else plain_terms
+        return continuous_adjoint_sweep(scheme, path, parameters, functional, p, terms)
+
+
+def _require_positions(method: str, parameters: Parameters) -> None:
     """Raise `ValueError` where the constraints of a motion are not those of the paper: of positions, independent."""
     require_independent(parameters.system, method)
     if parameters.system.num_velocity_rows:
@@ -141,7 +190,7 @@ def require_positions(method: str, parameters: Parameters) -> None:
         )
 
 
-def linear_scheme(scheme: AbstractScheme) -> GeneralizedAlpha:
+def _linear_scheme(scheme: AbstractScheme) -> GeneralizedAlpha:
     """What integrates linear equations along a motion: index 3, with the numbers of its scheme where it has them."""
     return dataclasses.replace(scheme, stabilized=False) if isinstance(scheme, GeneralizedAlpha) else GeneralizedAlpha()
 
@@ -205,8 +254,9 @@ def _direct_rule(scheme, primals, tangents):
     # not differentiated is one: a zero. Cut from one vector, all depend on all.
     flat, unravel = _raveled((to_algebra(group, state0, d_state0), d_parameters))
     first, d_parameters = unravel(flat)
-    b = with_first(first, earlier(zeros_like(states)))
+    b = with_first(first, earlier(Variation.none(states)))
 
+    @partial(jax.jit, inline=True)  # traced once for L and for Lᵀ
     def matrix(unknown):
         """L (δ, p'), of which every part seems to depend on the states: so none is constant in second derivatives."""
         nothing = 0.0 * states.v[0, 0]
@@ -239,7 +289,7 @@ def _continuous_rule(scheme, primals, tangents):
     group = parameters.system.group
     physical = partial(scheme.physical, parameters.system)
     first = to_algebra(group, physical(state0), physical(d_state0))
-    delta = continuous_direct_sweep(linear_scheme(scheme), states, parameters, first, d_parameters)
+    delta = continuous_direct_sweep(_linear_scheme(scheme), states, parameters, first, d_parameters)
     d_states = jax.vmap(partial(to_ambient, group))(states, delta)
     return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
 

@@ -25,7 +25,6 @@ from lgsens.sensitivity._linearization import (
     place_tangents,
     to_algebra,
     to_ambient,
-    zeros_like,
 )
 
 
@@ -52,7 +51,7 @@ def direct_on_the_fly(
     )(directions)
     system, grid = parameters
     group, walk = system.group, Walk.of(scheme, system)
-    none = zeros_like(state0)
+    none = Variation.none(state0)
 
     def with_derivative(function, state: State, t, delta: Variation):
         """f (c,) and f' (p, c)."""
@@ -71,13 +70,15 @@ def direct_on_the_fly(
         link, begun = grid.link(scheme, place, progress.state), grid.begun(scheme, place, progress.state)
         progress, stats = walk.on(grid, progress, place)
         linearized = scheme.linearized(system, walk.shared, node, begun, progress.state)
-        progress, stats = walk.remembering(progress, linearized, node, stats)
+        memory, stats = scheme.remembered(walk.shared, progress.memory, linearized, node, stats)
+        progress = progress._replace(memory=memory)
 
         def along(delta, d: Parameters, d_place):
             d_node = node_tangent(grid, d.grid, place, d_place)
             loads = scheme.loads(walk.shared, begun, progress.state)
             _, of_parameters = jax.jvp(loads, (system, node), (d.system, d_node))
-            return link.unless_empty(linearized.forward(link.begun(delta, d_place), of_parameters, none), delta)
+            current = linearized.forward(walk.shared, node, link.begun(delta, d_place), of_parameters, none)
+            return link.unless_empty(current, delta)
 
         delta = jax.vmap(along)(delta, d, d_places)
         rate = with_derivative(functional.rate, progress.state, node.t, delta)

@@ -33,17 +33,14 @@ from lgsens.integrate import (
     march_on,
     with_first,
 )
-from lgsens.sensitivity._adjoint import adjoint_sweep
-from lgsens.sensitivity._blocks import padded
-from lgsens.sensitivity._direct import direct_sweep
 from lgsens.sensitivity._linearization import (
     Parameters,
     cotangent_to_algebra,
     cotangent_to_ambient,
     to_algebra,
     to_ambient,
-    zeros_like,
 )
+from lgsens.sensitivity._sweeps import adjoint_sweep, direct_sweep
 
 Output = Callable[..., Any]  # (system, state, t) ↦ pytree
 
@@ -65,14 +62,15 @@ class Segments(NamedTuple):
     def count(self) -> int:
         return -(-self.num_steps // self.length)
 
-    @property
-    def filling(self) -> int:
-        return self.count * self.length - self.num_steps
-
     def split(self, rows: Any) -> Any:
         """Rows of steps 1 … n by segment; zeros after the last one."""
-        shape = lambda leaf: leaf.reshape(self.count, self.length, *leaf.shape[1:])
-        return jax.tree.map(shape, padded(rows, self.filling, repeat=False))
+        filling = self.count * self.length - self.num_steps
+
+        def shaped(leaf):
+            filled = jnp.concatenate([leaf, jnp.zeros((filling, *leaf.shape[1:]), leaf.dtype)])
+            return filled.reshape(self.count, self.length, *leaf.shape[1:])
+
+        return jax.tree.map(shaped, rows)
 
     def joined(self, rows: Any) -> Any:
         """The rows of steps 1 … n."""
@@ -139,7 +137,7 @@ def direct_in_segments(output: Output, scheme, segments: Segments, marks: Mark, 
     def segment(delta: Variation, inputs):
         mark, own, d_own = inputs
         found, _, _ = _integrated(scheme, segments, Parameters(system, own), mark)
-        b = jax.tree.map(lambda zeros, leaf: zeros.at[0].set(leaf), zeros_like(found.states), delta)
+        b = jax.tree.map(lambda zeros, leaf: zeros.at[0].set(leaf), Variation.none(found.states), delta)
         deltas, _ = direct_sweep(scheme, found.states, Parameters(system, own), b, Parameters(d.system, d_own))
         d_states = jax.vmap(partial(to_ambient, group))(found.states, deltas)
         _, d_outputs = jax.jvp(

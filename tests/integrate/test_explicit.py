@@ -11,10 +11,10 @@ from helpers import EPS
 import lgsens as lg
 from lgsens.dynamics import initial_state
 from lgsens.examples import spinning_top
-from lgsens.integrate import EqualGrid, UnevenGrid, states_of
+from lgsens.integrate import EqualGrid, UnevenGrid, Variation, states_of
 from lgsens.sensitivity import Parameters, direct_sweep
-from lgsens.sensitivity._adjoint import adjoint_sweep
-from lgsens.sensitivity._linearization import matvec, zeros_like
+from lgsens.sensitivity._linearization import matvec
+from lgsens.sensitivity._sweeps import adjoint_sweep
 
 TSIT5 = lg.IndexReducedODE()
 GIVEN = lg.GivenSteps([1.0, 2.0, 0.0, 1.5, 1.0], TSIT5)
@@ -65,7 +65,7 @@ def test_the_sweeps_solve_the_linearized_equations(uneven):
 
     parameters = Parameters(system, grid)
     states, _ = jax.jit(lambda: states_of(TSIT5, *parameters, state0))()
-    b, c = (random_like((zeros_like(states), parameters), rng) for _ in range(2))
+    b, c = (random_like((Variation.none(states), parameters), rng) for _ in range(2))
     delta, product, mu = found(state0, parameters, b, c)
     for actual, expected in zip(jax.tree.leaves(product), jax.tree.leaves(b)):
         np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9)

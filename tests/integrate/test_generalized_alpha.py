@@ -13,7 +13,7 @@ import lgsens as lg
 from lgsens.dynamics import State
 from lgsens.examples import heavy_top, spatial_chain, spinning_top
 from lgsens.integrate import EqualGrid, states_of
-from lgsens.integrate._alpha_step import Wear
+from lgsens.integrate._alpha import Wear
 
 HEAVY = json.loads((Path(__file__).parents[1] / "data" / "heavy_top_bruls2012.json").read_text())
 

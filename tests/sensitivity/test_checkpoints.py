@@ -113,7 +113,7 @@ def test_segments_are_the_long_run():
 def test_division(num_steps, checkpoints, expected):
     segments = Segments.of(num_steps, checkpoints)
     assert (segments.length, segments.count) == expected
-    assert 0 <= segments.filling < segments.length
+    assert 0 <= segments.count * segments.length - num_steps < segments.length
 
 
 @pytest.mark.parametrize("kind", [DIRECT, ADJOINT])

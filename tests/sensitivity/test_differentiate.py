@@ -9,7 +9,7 @@ from helpers import equations, says
 import lgsens as lg
 from lgsens.examples import spinning_top
 from lgsens.linear import LU
-from lgsens.sensitivity._blocks import Blocks
+from lgsens.sensitivity._sweeps import Blocks
 
 SIDE = lg.Criterion(integrand=lambda s, p: s.body("top").position[0] ** 2)
 SETTINGS = {"t1": 0.2, "num_steps": 40}

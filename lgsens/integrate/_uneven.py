@@ -1,7 +1,7 @@
-"""Steps under error control.
+"""Steps of different sizes: given ones, and those that error control finds.
 
-With v̈ ≈ (a_{n+1} − a_n)/h, a_n that of this step, the increment of eq. (27) misses the true one by e = h³ c (see
-`missed_increment`), at no cost. The error of a step is measured by the largest
+Error control. With v̈ ≈ (a_{n+1} − a_n)/h, a_n that of this step, the increment of eq. (27) misses the true one by
+e = h³ c (see `missed_increment`), at no cost. The error of a step is measured by the largest
 
     |e_i|/s_i,     s = 1 rad or the length of the scene,
 
@@ -23,26 +23,90 @@ Mathematics 185 (2006), doi:10.1016/j.cam.2005.03.008 (limiter).
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from lgsens._validate import as_float, is_concrete, require, require_setting
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
-from lgsens.integrate._grid import Node, UnevenGrid, with_first
+from lgsens.integrate._grid import UnevenGrid, with_first
 from lgsens.integrate._lanes import in_any_lane
-from lgsens.integrate._march import Progress, Walk, chosen
-from lgsens.integrate._pace import UnevenPace
+from lgsens.integrate._linearized import Node
+from lgsens.integrate._march import Progress, Walk, selected
 from lgsens.integrate._scheme import AbstractIntegrator, AbstractScheme, Laid, Start, Stats, scheme_of
 
 _AIM = 0.5  # θ: few steps are rejected
 _LIMIT = 1.0  # κ: no step is more than 2.6 times as long as the one before
 _ATTEMPTS = 20  # at one step
 _LEAST = 1e-6  # errors below this fraction of the tolerance count as so large
+
+
+class GivenSteps(AbstractIntegrator):
+    """Steps of given sizes: an integrator of `simulate`.
+
+        t_{n+1} = t_n + (t1 − t0) f_n,   f = fractions/Σ fractions
+
+    Arguments:
+        fractions: the sizes of the steps, relative to each other, shape (num_steps,), not negative, the first positive.
+            A step of size 0 repeats the state.
+        integrator: the scheme, `GeneralizedAlpha` or another one.
+
+    `GivenSteps.of(trajectory)` has those of a trajectory: the grid that error control found for one design serves
+    those nearby, and what is computed on it is as smooth in the parameters as on equal steps. The trajectory is of
+    second order where sizes change smoothly; where they jump by a factor r, multipliers are off by O(r² − 1) h for some
+    steps. Derivatives are exact, those by `fractions`, t0 and t1 too.
+
+    Raises `ValueError` for fractions of another shape or sign.
+    """
+
+    fractions: Float[Array, " n"]
+    integrator: AbstractScheme = eqx.field(static=True, default=GeneralizedAlpha())
+
+    def __init__(self, fractions, integrator: AbstractScheme = GeneralizedAlpha()):
+        self.fractions = as_float(fractions, None, "GivenSteps: `fractions`")
+        self.integrator = scheme_of("GivenSteps", integrator)
+        if self.fractions.ndim != 1 or not self.fractions.size:
+            raise ValueError(f"GivenSteps: `fractions` must have shape (num_steps,), got {self.fractions.shape}.")
+        require(
+            lambda sizes: np.all(np.isfinite(sizes)) and np.all(sizes >= 0.0) and sizes[0] > 0.0,
+            "GivenSteps: `fractions` must be finite, not negative, and the first one positive.",
+            self.fractions,
+        )
+
+    @classmethod
+    def of(cls, trajectory: Any, integrator: AbstractScheme = GeneralizedAlpha()) -> "GivenSteps":
+        """The steps of a trajectory; those of size 0 are left out, unless it is traced."""
+        sizes = lax.stop_gradient(jnp.diff(trajectory.t))
+        if is_concrete(sizes):
+            sizes = np.asarray(sizes)[np.asarray(sizes) > 0.0]
+        return cls(sizes, integrator)
+
+    @property
+    def num_steps(self) -> int:
+        return self.fractions.shape[0]
+
+    @property
+    def scheme(self):
+        return self.integrator
+
+    @property
+    def equal_steps(self):
+        return False
+
+    def check(self, num_steps):
+        if self.num_steps != num_steps:
+            raise ValueError(
+                f"`num_steps` = {num_steps}, but GivenSteps has {self.num_steps}; give `integrator.num_steps`."
+            )
+
+    def lay(self, system, start, jerk, t0, t1, num_steps):
+        return Laid(UnevenGrid.first(t0, (t1 - t0) * (self.fractions / jnp.sum(self.fractions))))
 
 
 class AdaptiveSteps(AbstractIntegrator):
@@ -79,10 +143,10 @@ class AdaptiveSteps(AbstractIntegrator):
 
     def __check_init__(self):
         scheme_of("AdaptiveSteps", self.integrator)
-        if not isinstance(self.tolerance, int | float) or not 0.0 < self.tolerance < math.inf:
-            raise ValueError(f"AdaptiveSteps: `tolerance` must be positive, got {self.tolerance!r}; try 1e-6.")
-        if not isinstance(self.longest, int | float) or not 0.0 < self.longest <= 1.0:
-            raise ValueError(f"AdaptiveSteps: `longest` must be in (0, 1], got {self.longest!r}; 0.02 is the default.")
+        valid = isinstance(self.tolerance, int | float) and 0.0 < self.tolerance < math.inf
+        require_setting(self, "tolerance", valid, "positive", "; try 1e-6")
+        valid = isinstance(self.longest, int | float) and 0.0 < self.longest <= 1.0
+        require_setting(self, "longest", valid, "in (0, 1]", "; 0.02 is the default")
 
     @property
     def scheme(self):
@@ -95,21 +159,19 @@ class AdaptiveSteps(AbstractIntegrator):
     def lay(self, system, start, jerk, t0, t1, num_steps):
         mean = (t1 - t0) / num_steps
         # What error control decides has no derivative: its sizes, as parts of the interval, are constants of the run.
-        frozen = jax.lax.stop_gradient((system, start, jerk, t0, mean))
-        found = jax.lax.stop_gradient(integrate_controlled(self, num_steps, *frozen))
-        grid = UnevenGrid.first(t0, found.h / frozen[4] * mean)
-        return Laid(grid, (found.states, Stats(*found.stats[: len(Stats._fields)])), found.stats, found.finished)
+        frozen = lax.stop_gradient((system, start, jerk, t0, mean))
+        found = lax.stop_gradient(_controlled_steps(self, num_steps, *frozen))
+        sizes, states, stats, reached = found
+        grid = UnevenGrid.first(t0, sizes / frozen[4] * mean)
+        return Laid(grid, (states, Stats(*stats[: len(Stats._fields)])), stats, reached)
 
 
 class ControlledStats(NamedTuple):
     """What Newton and the error control did in each step.
 
     Attributes:
-        iterations: Newton's iterations, those of rejected attempts included, shape (n,), int32; 0 after the last step.
-        increment: the last increment of each step, relative as in `GeneralizedAlpha.tolerance`, shape (n,).
-        residual: the largest entry of the residual r before that increment [N or N m], shape (n,).
-        converged: whether each step converged, shape (n,), bool.
-        margin: as in `Stats`, shape (n,).
+        iterations, increment, residual, converged, margin: as in `Stats`, shape (n,); iterations are those of rejected
+            attempts too, and 0 after the last step.
         error: the estimated error of each step, relative as in `AdaptiveSteps.tolerance`, shape (n,).
         rejected: attempts with a longer step before each, shape (n,), int32.
         steps: the number of steps that t1 took, shape (), int32.
@@ -125,15 +187,6 @@ class ControlledStats(NamedTuple):
     steps: Int[Array, ""]
 
 
-class Controlled(NamedTuple):
-    """The steps found: sizes (n,), states (n+1), and whether they reach the end."""
-
-    h: Float[Array, " n"]
-    states: State
-    stats: ControlledStats
-    finished: Bool[Array, ""]
-
-
 class _Trial(NamedTuple):
     """A step of size h, tried, and where it leads."""
 
@@ -145,12 +198,12 @@ class _Trial(NamedTuple):
     trying: Bool[Array, ""]
 
 
-def integrate_controlled(
+def _controlled_steps(
     settings: AdaptiveSteps, num_steps: int, system: AbstractSystem, first: Start, jerk, t0, h
-) -> Controlled:
-    """At most `num_steps` steps from t0 to t0 + num_steps h; those not needed have size 0 and repeat the last state.
+) -> tuple[Float[Array, " n"], State, ControlledStats, Bool[Array, ""]]:
+    """Sizes, states and statistics of at most `num_steps` steps from t0 on, and whether they reach t0 + num_steps h.
 
-    `jerk`: v̈ at t0, from which the first size is taken.
+    Those not needed have size 0 and repeat the last state. `jerk`: v̈ at t0, from which the first size is taken.
     """
     scheme, total = settings.integrator, num_steps * h
     walk, scale = Walk.of(scheme, system), system.coordinate_scale()
@@ -173,9 +226,9 @@ def integrate_controlled(
 
         def begins(trial: _Trial) -> tuple[Progress, Float[Array, ""]]:
             """A first step begins with the state that belongs to its size, another with what earlier trials leave."""
-            state = chosen(n == 0, first.at(system, trial.h), progress.state)
-            memory = scheme.rejected(progress.memory, trial.done.memory)
-            return Progress(state, memory, progress.running), jnp.where(n == 0, trial.h, size)
+            state = selected(n == 0, first.at(system, trial.h), progress.state)
+            begin = progress._replace(state=state).with_matrix(trial.done.memory.matrix)
+            return begin, jnp.where(n == 0, trial.h, size)
 
         def attempt(trial: _Trial) -> _Trial:
             start, size = begins(trial)
@@ -195,9 +248,8 @@ def integrate_controlled(
             )
             stats = stats._replace(iterations=trial.stats.iterations + stats.iterations, converged=done.running)
             new = _Trial(jnp.where(again, h * shorter, h), done, stats, error, rejected, again)
-            kept = walk.chosen(trial.trying, done, trial.done)
-            others = chosen(trial.trying, new._replace(done=None), trial._replace(done=None))
-            return others._replace(done=kept)
+            others = selected(trial.trying, new._replace(done=None), trial._replace(done=None))
+            return others._replace(done=done.where(trial.trying, trial.done))
 
         none = jnp.zeros((), jnp.int32)
         stats = Stats(none, h * 0.0, h * 0.0, progress.running, jnp.nan * h)
@@ -205,7 +257,7 @@ def integrate_controlled(
             lambda trial: in_any_lane(trial.trying), attempt, _Trial(wanted, progress, stats, h * 0.0, none, active)
         )
         _, size = begins(trial)
-        progress = walk.chosen(active, trial.done, progress)
+        progress = trial.done.where(active, progress)
         error = jnp.maximum(trial.error, _LEAST)
         rho = (_AIM / error * _AIM / before) ** (1.0 / 12.0) * (size / trial.h) ** 0.25
         grown = trial.h * (1.0 + _LIMIT * jnp.arctan((rho - 1.0) / _LIMIT))
@@ -217,11 +269,11 @@ def integrate_controlled(
     expected = relative(first.state.v, first.state.vdot, jerk, h)
     guess = h * jnp.minimum(1.0, (_AIM / jnp.maximum(expected, _LEAST)) ** (1.0 / 3.0))
     begun = first.at(system, guess)
-    memory = scheme.memory(system, walk.shared, begun, Node(t0, t0 + guess, guess), UnevenPace.first(h.dtype))
+    memory = scheme.memory(walk.shared, begun, Node(t0, t0 + guess, guess), uneven=True)
     running = jnp.all(jnp.isfinite(begun.a))
     begin = (Progress(begun, memory, running), guess, guess, jnp.full((), _AIM, h.dtype), h * 0.0)
     (*_, elapsed), (sizes, later, newton, errors, rejected) = lax.scan(step, begin, jnp.arange(num_steps))
     states = with_first(first.at(system, sizes[0]), later)
     taken = jnp.sum((sizes > 0.0) & newton.converged).astype(jnp.int32)
     stats = ControlledStats(*newton, errors, rejected, taken)
-    return Controlled(sizes, states, stats, elapsed >= total)
+    return sizes, states, stats, elapsed >= total
