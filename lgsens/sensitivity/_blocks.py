@@ -12,10 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-# Of the factors of a block: 128 kB in double precision, so that those of a batch of trajectories stay in a core's cache
-# too. With 2**17, alone as fast, 16 quarter-cars at once took 149 instead of 110 µs per step and gradient.
-_NUMBERS = 2**14
-_LONGEST = 64
+from lgsens.linear import tuned
 
 
 class Blocks(NamedTuple):
@@ -27,7 +24,7 @@ class Blocks(NamedTuple):
     @classmethod
     def of(cls, num_steps: int, numbers: int) -> "Blocks":
         """Blocks for factors of `numbers` numbers; without padding where a divisor is near."""
-        longest = max(1, min(num_steps, _LONGEST, _NUMBERS // numbers))
+        longest = max(1, min(num_steps, tuned.BLOCK_STEPS, tuned.BLOCK_NUMBERS // numbers))
         divisors = [n for n in range((longest + 1) // 2, longest + 1) if num_steps % n == 0]
         length = divisors[-1] if divisors else longest
         return cls(length, -num_steps % length)
