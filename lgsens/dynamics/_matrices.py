@@ -11,8 +11,7 @@ from jaxtyping import Array, Float
 
 from lgsens.dynamics._constraints import full_jacobian
 from lgsens.dynamics._redundant import refined, softness
-from lgsens.dynamics._state import Tangents
-from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem
+from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem, Tangents
 from lgsens.linear import LU, Factors, Matrix, SparseMatrix, tuned
 
 

@@ -120,30 +120,20 @@ def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tupl
             raise _exception(int(result), values, names, note)
         return tree
 
+    result, details = lax.stop_gradient((result, details))
     if _failures_as_nan.value:
-        passed = lax.stop_gradient(result) == RESULTS.successful
-        return jax.tree.map(lambda leaf: _poisoned(passed, leaf), tree)
-
-    def fail(operands):
+        passed = result == RESULTS.successful
+    else:
         shape = jax.ShapeDtypeStruct((), bool)
-        return jax.pure_callback(host, shape, *operands, vmap_method="broadcast_all")
-
-    operands = lax.stop_gradient((result, details))
-    passed = lax.cond(result != RESULTS.successful, fail, lambda _: jnp.ones((), bool), operands)
-    return jax.tree.map(lambda leaf: _poisoned(passed, leaf), tree)
+        fail = lambda *operands: jax.pure_callback(host, shape, *operands, vmap_method="broadcast_all")
+        passed = lax.cond(result != RESULTS.successful, fail, lambda *_: jnp.ones((), bool), result, details)
+    # Leaves depend on the callback, which is therefore not removed. A product and no selection: the derivatives of a
+    # failure are NaN too, where those of a selection would be zero.
+    poison = lambda leaf: leaf * jnp.where(passed, 1.0, jnp.nan).astype(leaf.dtype)
+    return jax.tree.map(lambda leaf: poison(leaf) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, tree)
 
 
 def _value(array: Any) -> Any:
     while isinstance(array, Tracer) and hasattr(array, "primal"):
         array = array.primal
     return array
-
-
-def _poisoned(passed, leaf):
-    """`leaf` if `passed`, else NaN; it depends on the callback, which is therefore not removed.
-
-    A product and no selection: the derivatives of a failure are NaN too, where those of a selection would be zero.
-    """
-    return (
-        leaf * jnp.where(passed, 1.0, jnp.nan).astype(leaf.dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
-    )
