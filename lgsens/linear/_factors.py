@@ -51,11 +51,8 @@ class Factors(eqx.Module):
         m = lower.shape[0]
         corner = None if softness is None else -(scale**2) * softness
         if not isinstance(dynamic, SparseMatrix):
-            above = jnp.concatenate([dynamic, scale * upper], axis=1)
-            below = jnp.concatenate(
-                [scale * lower, jnp.zeros((m, m), dynamic.dtype) if corner is None else jnp.diag(corner)], axis=1
-            )
-            values = jnp.concatenate([above, below])
+            below = jnp.zeros((m, m), dynamic.dtype) if corner is None else jnp.diag(corner)
+            values = jnp.block([[dynamic, scale * upper], [scale * lower, below]])
             numbers = values.size
             factors = partial(factors_of, kind=kind, mixed=mixed)
         else:
