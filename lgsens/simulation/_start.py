@@ -49,7 +49,7 @@ def initial_state(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) 
     Differentiable, by the implicit function theorem. Raises `ValueError` as said under `throw`; inside
     `jit`, JAX's runtime error with the same message.
     """
-    return _start(_initial_jit, model, t0, throw)
+    return _found_state(_initial_jit, model, t0, throw)
 
 
 def equilibrium(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) -> State:
@@ -65,7 +65,7 @@ def equilibrium(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) ->
     those closest to the reference. Raises `SimulationError` if none is found; inside `jit`, JAX's runtime
     error with the same message.
     """
-    return _start(_equilibrium_jit, model, t0, throw)
+    return _found_state(_equilibrium_jit, model, t0, throw)
 
 
 @eqx.filter_jit
@@ -78,7 +78,7 @@ def _equilibrium_jit(system, t0) -> Initial:
     return _equilibrium(system, t0)
 
 
-def _start(find: Callable[..., Initial], model: Model | AbstractSystem, t0, throw: bool) -> State:
+def _found_state(find: Callable[..., Initial], model: Model | AbstractSystem, t0, throw: bool) -> State:
     system, t0 = as_system(model), as_float(t0, (), "`t0`")
     initial = find(system, t0)
     if not throw:
