@@ -24,11 +24,11 @@ class AbstractDirectProduct(AbstractLieGroup):
         """The coordinates of each factor."""
 
     @abc.abstractmethod
-    def _join(self, pieces):
+    def _join(self, pieces) -> Any:
         """The coordinates of the product from those of each factor."""
 
     @abc.abstractmethod
-    def _diagonal(self, blocks):
+    def _diagonal(self, blocks) -> Any:
         """The matrix of the product from those of each factor."""
 
     @abc.abstractmethod
