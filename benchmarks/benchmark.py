@@ -29,9 +29,9 @@ def _rounds(text: str) -> int:
     return count
 
 
-# before jax and numpy are imported; without YNN fusions, as lgsens does it, for every rival in JAX
+# before jax and numpy are imported; without YNN fusions of sums, as lgsens does it, for every rival in JAX
 SINGLE_THREAD = {
-    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false --xla_cpu_experimental_ynn_fusion_type=",
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false --xla_cpu_experimental_ynn_fusion_type=-reduce",
     "PJRT_NPROC": "1",  # XLA's own pool: its threads wait for each other in small programs
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",

@@ -8,7 +8,7 @@ group, Multibody System Dynamics, 2014). SI units; `jax.config.update("jax_enabl
 
 import importlib
 
-from lgsens._xla import without_ynn_fusions
+from lgsens._xla import without_wrong_sums
 from lgsens.analysis import (
     ConstraintRank as ConstraintRank,
     Growth as Growth,
@@ -101,7 +101,7 @@ _NAMESPACES = (
     "testing",
 )  # imported when first used: optax and matplotlib take their time
 
-without_ynn_fusions()
+without_wrong_sums()
 
 
 def __getattr__(name: str):

@@ -1,10 +1,21 @@
-"""XLA's settings that results depend on.
+"""What XLA has to be told for results to be right.
 
-From jaxlib 0.10.2 on, XLA hands small products and sums on a CPU to YNNPACK ("YNN fusions"), and what comes back can be
-wrong without a word: `Σ (A x)²` over more than 16,384 vectors x in jaxlib 0.10.2 (jax-ml/jax issue 39103), the sum of
-(A B) ∘ A with a constant matrix B up to 0.12.0, the newest that was looked at. They are slow besides: thirty
-directional derivatives of a quarter-car take 3 times as long with them. So they are off, for every program of a process
-that imports lgsens before JAX computes anything.
+From jaxlib 0.10.2 on XLA hands sums on a CPU to YNNPACK ("YNN fusions"), alone or with the product before them, and
+what comes back can be wrong without a word. Measured, the largest error relative to the largest result:
+
+    jaxlib                                    0.10.0, 0.10.1    0.10.2        0.11.0        0.12.0
+    Σ (A x)², 40,000 vectors x                round-off         6e-3          round-off     round-off
+    Σ (A B) ∘ A, constant B                   round-off         1e180         0.9           0.9
+    Σ a b along one of seven or eight axes    round-off         the process ends            round-off
+
+(jax-ml/jax issues 39103, 40412, 39257). Without sums ("-reduce") all of them are right, and thirty directional
+derivatives of a quarter-car take 0.5 to 0.7 of the time. Products may stay there: they are right, and take as long.
+
+What has the least reach? `jax.jit(…, compiler_options=…)` is for one function, but JAX accepts it on the outermost jit
+alone and raises elsewhere; that one is the user's, `jax.grad` or `jax.vmap` around lgsens. What remains is XLA_FLAGS,
+which XLA reads once, when a process computes first. So this one option is added there, for the versions that are wrong
+and no other, unless the user's flags name it or JAX has started. It holds for the process, other users of JAX in it and
+those that it starts.
 """
 
 import os
@@ -12,28 +23,30 @@ import warnings
 
 from jaxlib.version import __version_info__ as _VERSION
 
-_FUSIONS = "--xla_cpu_experimental_ynn_fusion_type"
-# XLA ends the process at an option that it does not know: these versions know it
-_FIRST, _UNKNOWN = (0, 10), (0, 13)
+_OPTION = "--xla_cpu_experimental_ynn_fusion_type"
+_WITHOUT_SUMS = f"{_OPTION}=-reduce"
+# The versions that are wrong; those after them are not known yet, and XLA ends the process at an option unknown to it.
+_FIRST, _AFTER = (0, 10, 2), (0, 13)
 
 
-def without_ynn_fusions() -> None:
-    """Turns YNN fusions off in XLA_FLAGS, unless those say what to do with them.
+def without_wrong_sums() -> None:
+    """Adds `-reduce` of the YNN fusions to XLA_FLAGS, unless those say what to do with them or the version is right.
 
     Warns where JAX has read XLA_FLAGS already.
     """
     flags = os.environ.get("XLA_FLAGS", "")
-    if not _FIRST <= _VERSION[:2] < _UNKNOWN or _FUSIONS in flags:
+    if not _FIRST <= _VERSION < _AFTER or _OPTION in flags:
         return
     # there is no public way to ask
     from jax._src.xla_bridge import backends_are_initialized
 
     if backends_are_initialized():
         warnings.warn(
-            "JAX computed something before lgsens was imported, and so uses XLA's YNN fusions, whose results are wrong "
-            f"in rare cases (jax-ml/jax issue 39103). Import lgsens first, or start Python with XLA_FLAGS={_FUSIONS}=",
+            "JAX computed something before lgsens was imported, and so uses XLA's YNN fusions of sums, whose results "
+            "are wrong in rare cases (jax-ml/jax issue 39103). Import lgsens first, or start Python with "
+            f"XLA_FLAGS={_WITHOUT_SUMS}",
             RuntimeWarning,
             stacklevel=3,
         )
         return
-    os.environ["XLA_FLAGS"] = f"{flags} {_FUSIONS}=".strip()
+    os.environ["XLA_FLAGS"] = f"{flags} {_WITHOUT_SUMS}".strip()

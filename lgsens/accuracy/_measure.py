@@ -16,9 +16,9 @@ from lgsens.accuracy._programs import Program, Study, failed
 from lgsens.accuracy._reference import Reference, converge
 from lgsens.accuracy._setting import Build, Function, Setting, ladder
 from lgsens.accuracy._table import Row, Table
+from lgsens.linear import tuned
 
 _LEAST_ROUNDS = 5
-_TOGETHER = 8  # programs at a time: Linux gives a process 65,530 memory maps, and a large scene takes thousands each
 
 
 def work_precision(
@@ -76,8 +76,8 @@ def work_precision(
         if reference is None:
             reference = converge(study, min(setting.num_steps for setting in settings), done)
         rows = []
-        for i in range(0, len(settings), _TOGETHER):
-            rows += _measured(study, settings[i : i + _TOGETHER], reference, rounds, bar.update)
+        for i in range(0, len(settings), tuned.PROGRAMS_TOGETHER):
+            rows += _measured(study, settings[i : i + tuned.PROGRAMS_TOGETHER], reference, rounds, bar.update)
             jax.clear_caches()
     return Table(tuple(rows), reference, rounds)
 

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 from lgsens._validate import as_count
+from lgsens.linear import tuned
 from lgsens.sensitivity import AdjointVariable, DirectDifferentiation
 
 
@@ -20,8 +21,7 @@ class Costs(NamedTuple):
     adjoint_per_criterion: float
 
 
-# The top with four parameters and five criteria, by benchmarks/methods.py; the four-bar differs by less than the noise.
-TYPICAL = Costs(direct_fixed=2.0, direct_per_parameter=0.12, adjoint_fixed=2.1, adjoint_per_criterion=0.09)
+TYPICAL = Costs(**tuned.TYPICAL_COSTS)
 
 
 class Advice(NamedTuple):

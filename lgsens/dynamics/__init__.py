@@ -48,10 +48,11 @@ from lgsens.dynamics._redundant import (
     softness as softness,
 )
 from lgsens.dynamics._results import RESULTS as RESULTS
-from lgsens.dynamics._state import State as State, Tangents as Tangents
 from lgsens.dynamics._system import (
     AbstractSparseSystem as AbstractSparseSystem,
     AbstractSystem as AbstractSystem,
+    State as State,
+    Tangents as Tangents,
     autodiff_constraint_jacobian as autodiff_constraint_jacobian,
     autodiff_tangents as autodiff_tangents,
 )

@@ -16,8 +16,7 @@ from jax import lax
 from lgsens.dynamics._initial import Initial
 from lgsens.dynamics._matrices import mass_scale
 from lgsens.dynamics._results import RESULTS
-from lgsens.dynamics._state import State
-from lgsens.dynamics._system import AbstractSystem
+from lgsens.dynamics._system import AbstractSystem, State
 
 _MAX_ITERATIONS = 60
 

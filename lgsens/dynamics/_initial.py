@@ -12,8 +12,7 @@ from lgsens.dynamics._constraints import fixed_velocity_rate, prescribed_velocit
 from lgsens.dynamics._matrices import ConstrainedMass, constraint_jacobian, factorized, for_once
 from lgsens.dynamics._redundant import softness
 from lgsens.dynamics._results import RESULTS
-from lgsens.dynamics._state import State
-from lgsens.dynamics._system import AbstractSystem
+from lgsens.dynamics._system import AbstractSystem, State
 from lgsens.linear import Factors, Inverse, Matrix, SparseMatrix, diagonal
 
 _MAX_ITERATIONS = 30
@@ -133,28 +132,22 @@ def _shortest(matrix, rhs):
     return jnp.linalg.pinv(matrix, rtol=1e-8 if matrix.dtype == jnp.float64 else 1e-4) @ rhs
 
 
-def independence(jacobian: Float[Array, "m k"]) -> Float[Array, ""]:
-    """How far the rows of B are from dependent: the smallest |R_ii| of the QR of the unit rows, 1 when orthogonal."""
-    m, k = jacobian.shape
-    if m > k:
-        return jnp.zeros((), jacobian.dtype)
-    if m == 0:
-        return jnp.ones((), jacobian.dtype)
-    unit = jacobian / jnp.maximum(jnp.linalg.norm(jacobian, axis=1), jnp.finfo(jacobian.dtype).tiny)[:, None]
-    return jnp.min(jnp.abs(jnp.diagonal(jnp.linalg.qr(unit.T, mode="r"))))
-
-
 def is_redundant(system: AbstractSystem, jacobian: Matrix) -> Bool[Array, ""]:
     """Whether rows of B are linearly dependent; B from `constraint_jacobian`.
 
-    Redundant rows leave |R_ii| of `independence` at round-off, independent ones near a singular configuration well
-    above it. Sparse: the complements of [[I, B̂ᵀ], [B̂, 0]], B̂ with unit rows, are −R_ii² or combinations of them;
+    In the QR of B̂, B with unit rows, redundant rows leave |R_ii| at round-off, independent ones near a singular
+    configuration well above it. Sparse: the complements of [[I, B̂ᵀ], [B̂, 0]] are −R_ii² or combinations of them;
     round-off leaves nothing of those below eps^0.8.
     """
     (jacobian,) = for_once(lax.stop_gradient(jacobian))
+    dtype = jacobian.dtype
     if not isinstance(jacobian, SparseMatrix):
-        return independence(jacobian) < jnp.finfo(jacobian.dtype).eps ** 0.6
-    dtype, ones = jacobian.dtype, jnp.ones(jacobian.shape[1], jacobian.dtype)
+        m, k = jacobian.shape
+        if m == 0 or m > k:
+            return jnp.asarray(m > k)
+        unit = jacobian / jnp.maximum(jnp.linalg.norm(jacobian, axis=1), jnp.finfo(dtype).tiny)[:, None]
+        return jnp.min(jnp.abs(jnp.diagonal(jnp.linalg.qr(unit.T, mode="r")))) < jnp.finfo(dtype).eps ** 0.6
+    ones = jnp.ones(jacobian.shape[1], dtype)
     unit = jacobian.with_unit_rows()
     factors = factorized(system, diagonal(ones), unit.T, unit, jnp.ones((), dtype), Inverse, once=True, exact=True)
     return ~(factors.largest_inverse() < jnp.finfo(dtype).eps ** -0.8)  # NaN is redundant

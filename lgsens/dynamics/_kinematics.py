@@ -31,8 +31,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from lgsens.dynamics._state import State
-from lgsens.dynamics._system import AbstractSystem
+from lgsens.dynamics._system import AbstractSystem, State
 
 _MAX_ITERATIONS = 40
 

@@ -11,11 +11,8 @@ from jaxtyping import Array, Float
 
 from lgsens.dynamics._constraints import full_jacobian
 from lgsens.dynamics._redundant import refined, softness
-from lgsens.dynamics._state import Tangents
-from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem
-from lgsens.linear import LU, Factors, Matrix, SparseMatrix
-
-_FEW = 200  # unknowns: an LU of 0.3 ms
+from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem, Tangents
+from lgsens.linear import LU, Factors, Matrix, SparseMatrix, tuned
 
 
 def _sparse(system: AbstractSystem) -> AbstractSparseSystem | None:
@@ -90,7 +87,7 @@ def factorized(
 
 def for_once(*matrices: Matrix) -> tuple[Matrix, ...]:
     """Matrices that are factorized once in a run, as arrays where that takes less than the blocks take to compile."""
-    few = sum(matrix.shape[0] for matrix in matrices) <= _FEW
+    few = sum(matrix.shape[0] for matrix in matrices) <= tuned.DENSE_ONCE
     return tuple(m.dense() if few and isinstance(m, SparseMatrix) else m for m in matrices)
 
 

@@ -26,11 +26,9 @@ from lgsens.integrate._alpha import AbstractStep, Matrix
 from lgsens.integrate._guess import Guess
 from lgsens.integrate._lanes import in_any_lane, renewed_where
 from lgsens.integrate._scheme import Stats
-from lgsens.linear import LU
+from lgsens.linear import LU, tuned
 
 Solver = Any  # factors; None: each iteration makes its own
-_MODIFIED_LIMIT = 12  # iterations; more cost as much as a full one
-_STALLED = 0.3  # that from which on two full iterations cost less
 _FASTEST = 0.02  # contractions of earlier steps, when the matrix was newer, are no better than this
 _ROUGH = 64  # ε: increments below measure no contraction, and are noise where they fall no longer
 
@@ -107,8 +105,8 @@ def take_step(
         contraction = jnp.where(jnp.isfinite(contraction), contraction, 1.0)
         rough = (size <= noise) & (size > 0.25 * before)
         settled = ~full & ((last * contraction**2 <= target) | rough)
-        fast = (count < 4) | (contraction < _STALLED)  # by then the second pair is measured
-        gives_up = ~full & ~settled & ~(fast & (count < _MODIFIED_LIMIT))
+        fast = (count < 4) | (contraction < tuned.CHORD_CONTRACTION)  # by then the second pair is measured
+        gives_up = ~full & ~settled & ~(fast & (count < tuned.CHORD_ITERATIONS))
         astray = gives_up & (contraction >= 1.0)
         return iterate._replace(
             u=jnp.where(astray, u, iterate.u),

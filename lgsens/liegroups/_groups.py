@@ -8,6 +8,7 @@ from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
 from ._base import AbstractLieGroup
+from ._products import AbstractDirectProduct
 from ._rotation import SO3
 
 
@@ -91,21 +92,15 @@ class Pose(NamedTuple):
     orientation: Float[Array, "3 3"]
 
 
-_POSITION = Rn(3)
-_ORIENTATION = SO3()
-_TRANSLATION, _ROTATION = slice(0, 3), slice(3, 6)  # the coordinates of a pose
-_ROTATION_BLOCK, _TRANSLATION_BLOCK = slice(0, 3), slice(3, 7)  # the matrix of a pose, eq. (20)
+_FACTORS = Rn(3), SO3()
 
 
-def _split(x):
-    return x[_TRANSLATION], x[_ROTATION]
-
-
-class R3xSO3(AbstractLieGroup):
+class R3xSO3(AbstractDirectProduct):
     """The direct product `R^3 × SO(3)`, `k = 6`: an element is a `Pose`.
 
     Coordinates are `[u, Ω]`: three of translation in the inertial frame (for a velocity `u = ẋ` [m/s]), then
     three of rotation in the body frame (`Ω~ = R^T Ṙ` [rad/s]). Not SE(3): `exp` does not couple the two.
+    The matrix is the 7×7 one of eq. (20), the rotation block first.
 
     Source: paper, §3.2 and eq. (20); Brüls, Arnold & Cardona 2011.
     """
@@ -115,61 +110,20 @@ class R3xSO3(AbstractLieGroup):
         return 6
 
     def identity(self, dtype=None):
-        return Pose(_POSITION.identity(dtype), _ORIENTATION.identity(dtype))
+        return Pose(*(group.identity(dtype) for group in _FACTORS))
 
-    def compose(self, p, q):
-        return Pose(p.position + q.position, _ORIENTATION.compose(p.orientation, q.orientation))
+    def _each(self, method, *args):
+        return Pose(*(getattr(group, method)(*arg) for group, *arg in zip(_FACTORS, *args)))
 
-    def inverse(self, q):
-        return Pose(-q.position, _ORIENTATION.inverse(q.orientation))
+    def _split(self, x):
+        return x[:3], x[3:]
 
-    def exp(self, x):
-        u, r = _split(x)
-        return Pose(u, _ORIENTATION.exp(r))
+    def _join(self, pieces):
+        return jnp.concatenate(pieces)
 
-    def log(self, q):
-        return jnp.concatenate([q.position, _ORIENTATION.log(q.orientation)])
+    def _diagonal(self, blocks):
+        translation, rotation = blocks
+        return block_diag(rotation, translation)
 
-    def wedge(self, x):
-        u, r = _split(x)
-        return block_diag(_ORIENTATION.wedge(r), _POSITION.wedge(u))
-
-    def vee(self, X):
-        u = _POSITION.vee(X[_TRANSLATION_BLOCK, _TRANSLATION_BLOCK])
-        r = _ORIENTATION.vee(X[_ROTATION_BLOCK, _ROTATION_BLOCK])
-        return jnp.concatenate([u, r])
-
-    def matrix(self, q):
-        """The 7×7 matrix of eq. (20), the rotation block first."""
-        return block_diag(_ORIENTATION.matrix(q.orientation), _POSITION.matrix(q.position))
-
-    def ad_mv(self, x, y):
-        (u, r), (w, s) = _split(x), _split(y)
-        return jnp.concatenate([_POSITION.ad_mv(u, w), _ORIENTATION.ad_mv(r, s)])
-
-    def Ad_inv_mv(self, q, w):
-        u, r = _split(w)
-        return jnp.concatenate([u, _ORIENTATION.Ad_inv_mv(q.orientation, r)])
-
-    def Ad_inv_rmv(self, q, w):
-        u, r = _split(w)
-        return jnp.concatenate([u, _ORIENTATION.Ad_inv_rmv(q.orientation, r)])
-
-    def tangent_mv(self, x, y):
-        u, r = _split(y)
-        return jnp.concatenate([u, _ORIENTATION.tangent_mv(x[_ROTATION], r)])
-
-    def tangent_rmv(self, x, y):
-        u, r = _split(y)
-        return jnp.concatenate([u, _ORIENTATION.tangent_rmv(x[_ROTATION], r)])
-
-    def tangent_inv_mv(self, x, y):
-        u, r = _split(y)
-        return jnp.concatenate([u, _ORIENTATION.tangent_inv_mv(x[_ROTATION], r)])
-
-    def to_ambient(self, q, w):
-        u, r = _split(w)
-        return Pose(u, _ORIENTATION.to_ambient(q.orientation, r))
-
-    def from_ambient(self, q, dq):
-        return jnp.concatenate([dq.position, _ORIENTATION.from_ambient(q.orientation, dq.orientation)])
+    def _blocks(self, X):
+        return X[3:, 3:], X[:3, :3]

@@ -74,7 +74,7 @@ class Poses(AbstractLieGroup):
         return _numbered(self.free)
 
     @property
-    def _chosen(self) -> np.ndarray:
+    def _own(self) -> np.ndarray:
         """The coordinates of the power that this group has, shape (k,)."""
         return np.flatnonzero(self.index.ravel() >= 0)
 
@@ -97,21 +97,15 @@ class Poses(AbstractLieGroup):
         """Where the three rotations of the bodies that have them are in x, shape (bodies, 3)."""
         return self.index[self._turning, _ROTATION]
 
-    def _rotated(self, y, new):
-        """y with the rotations of the bodies that have three replaced by `new`, shape (bodies, 3)."""
+    def _rotated(self, method, arguments, at, y, others):
+        """`others` with the rotations of bodies that have three replaced by `method(argument, those of y)`; `at`: where
+        theirs are among the arguments."""
+        if not len(self._turning):
+            return others
+        rotations = jax.vmap(method)(arguments[at], y[self._turns])
         source = np.arange(self.dim)
         source[self._turns.ravel()] = self.dim + np.arange(self._turns.size)
-        return jnp.concatenate([y, new.ravel()])[source]
-
-    def _at_orientation(self, function, q, w):
-        if not len(self._turning):
-            return w
-        return self._rotated(w, jax.vmap(function)(q.orientation[self._turning], w[self._turns]))
-
-    def _at_increment(self, function, x, y):
-        if not len(self._turning):
-            return y
-        return self._rotated(y, jax.vmap(function)(x[self._turns], y[self._turns]))
+        return jnp.concatenate([others, rotations.ravel()])[source]
 
     @property
     def dim(self):
@@ -133,41 +127,38 @@ class Poses(AbstractLieGroup):
         return Pose(rows[:, _TRANSLATION], jax.vmap(_ORIENTATION.exp)(rows[:, _ROTATION]))
 
     def log(self, q):
-        return self._all.log(q)[self._chosen]
+        return self._all.log(q)[self._own]
 
     def wedge(self, x):
         return self._all.wedge(self.rows(x).ravel())
 
     def vee(self, X):
-        return self._all.vee(X)[self._chosen]
+        return self._all.vee(X)[self._own]
 
     def matrix(self, q):
         return self._all.matrix(q)
 
     def ad_mv(self, x, y):
-        zero = jnp.zeros_like(y)
-        if not len(self._turning):
-            return zero
-        return self._rotated(zero, jax.vmap(_ORIENTATION.ad_mv)(x[self._turns], y[self._turns]))
+        return self._rotated(_ORIENTATION.ad_mv, x, self._turns, y, jnp.zeros_like(y))
 
     def Ad_inv_mv(self, q, w):
-        return self._at_orientation(_ORIENTATION.Ad_inv_mv, q, w)
+        return self._rotated(_ORIENTATION.Ad_inv_mv, q.orientation, self._turning, w, w)
 
     def Ad_inv_rmv(self, q, w):
-        return self._at_orientation(_ORIENTATION.Ad_inv_rmv, q, w)
+        return self._rotated(_ORIENTATION.Ad_inv_rmv, q.orientation, self._turning, w, w)
 
     def tangent_mv(self, x, y):
-        return self._at_increment(_ORIENTATION.tangent_mv, x, y)
+        return self._rotated(_ORIENTATION.tangent_mv, x, self._turns, y, y)
 
     def tangent_rmv(self, x, y):
-        return self._at_increment(_ORIENTATION.tangent_rmv, x, y)
+        return self._rotated(_ORIENTATION.tangent_rmv, x, self._turns, y, y)
 
     def tangent_inv_mv(self, x, y):
-        return self._at_increment(_ORIENTATION.tangent_inv_mv, x, y)
+        return self._rotated(_ORIENTATION.tangent_inv_mv, x, self._turns, y, y)
 
     def to_ambient(self, q, w):
         rows = self.rows(w)
         return Pose(rows[:, _TRANSLATION], jax.vmap(_ORIENTATION.to_ambient)(q.orientation, rows[:, _ROTATION]))
 
     def from_ambient(self, q, dq):
-        return self._all.from_ambient(q, dq)[self._chosen]
+        return self._all.from_ambient(q, dq)[self._own]

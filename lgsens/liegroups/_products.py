@@ -1,6 +1,8 @@
 """Direct products: of different groups, and of many copies of one."""
 
+import abc
 import itertools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,26 +12,85 @@ from jax.scipy.linalg import block_diag
 from ._base import AbstractLieGroup
 
 
+class AbstractDirectProduct(AbstractLieGroup):
+    """A direct product: each operation is that of the factors, side by side."""
+
+    @abc.abstractmethod
+    def _each(self, method: str, *args: Any) -> Any:
+        """A method of every factor; arguments and results are elements of the product, or as `_split` returns them."""
+
+    @abc.abstractmethod
+    def _split(self, x) -> Any:
+        """The coordinates of each factor."""
+
+    @abc.abstractmethod
+    def _join(self, pieces) -> Any:
+        """The coordinates of the product from those of each factor."""
+
+    @abc.abstractmethod
+    def _diagonal(self, blocks) -> Any:
+        """The matrix of the product from those of each factor."""
+
+    @abc.abstractmethod
+    def _blocks(self, X) -> Any:
+        """The matrices of each factor."""
+
+    def compose(self, p, q):
+        return self._each("compose", p, q)
+
+    def inverse(self, q):
+        return self._each("inverse", q)
+
+    def exp(self, x):
+        return self._each("exp", self._split(x))
+
+    def log(self, q):
+        return self._join(self._each("log", q))
+
+    def wedge(self, x):
+        return self._diagonal(self._each("wedge", self._split(x)))
+
+    def vee(self, X):
+        return self._join(self._each("vee", self._blocks(X)))
+
+    def matrix(self, q):
+        return self._diagonal(self._each("matrix", q))
+
+    def ad_mv(self, x, y):
+        return self._join(self._each("ad_mv", self._split(x), self._split(y)))
+
+    def Ad_inv_mv(self, q, w):
+        return self._join(self._each("Ad_inv_mv", q, self._split(w)))
+
+    def Ad_inv_rmv(self, q, w):
+        return self._join(self._each("Ad_inv_rmv", q, self._split(w)))
+
+    def tangent_mv(self, x, y):
+        return self._join(self._each("tangent_mv", self._split(x), self._split(y)))
+
+    def tangent_rmv(self, x, y):
+        return self._join(self._each("tangent_rmv", self._split(x), self._split(y)))
+
+    def tangent_inv_mv(self, x, y):
+        return self._join(self._each("tangent_inv_mv", self._split(x), self._split(y)))
+
+    def to_ambient(self, q, w):
+        return self._each("to_ambient", q, self._split(w))
+
+    def from_ambient(self, q, dq):
+        return self._join(self._each("from_ambient", q, dq))
+
+
 def _slices(sizes):
     return [slice(end - size, end) for size, end in zip(sizes, itertools.accumulate(sizes))]
 
 
-def _pieces(x, sizes):
-    """Cuts coordinates in consecutive pieces of the given sizes."""
-    if x.shape != (sum(sizes),):  # slicing alone would silently accept coordinates that are too long
-        raise ValueError(f"Product: the coordinates have shape {x.shape}; expected ({sum(sizes)},).")
-    return [x[part] for part in _slices(sizes)]
-
-
-def _diagonal_blocks(X, sizes):
+def _diagonal_blocks(X, groups):
+    sizes = [jax.eval_shape(lambda group=group: group.matrix(group.identity())).shape[0] for group in groups]
     return [X[part, part] for part in _slices(sizes)]
 
 
-def _matrix_size(group):
-    return jax.eval_shape(lambda: group.matrix(group.identity())).shape[0]
-
-
-class Product(AbstractLieGroup):
+class Product(AbstractDirectProduct):
     """The direct product of groups: an element is the tuple of theirs, coordinates are concatenated in order.
 
     Arguments: `groups`, a tuple of Lie groups.
@@ -45,69 +106,31 @@ class Product(AbstractLieGroup):
                 raise ValueError(f"Product: `groups[{i}]` is not a Lie group (such as SO3()); got {group!r}.")
 
     @property
-    def _dims(self):
-        return [group.dim for group in self.groups]
-
-    def _each(self, method, *args):
-        return tuple(getattr(group, method)(*arg) for group, *arg in zip(self.groups, *args))
-
-    def _joined(self, method, *args):
-        return jnp.concatenate(self._each(method, *args))
-
-    @property
     def dim(self):
-        return sum(self._dims)
+        return sum(group.dim for group in self.groups)
 
     def identity(self, dtype=None):
         return tuple(group.identity(dtype) for group in self.groups)
 
-    def compose(self, p, q):
-        return self._each("compose", p, q)
+    def _each(self, method, *args):
+        return tuple(getattr(group, method)(*arg) for group, *arg in zip(self.groups, *args))
 
-    def inverse(self, q):
-        return self._each("inverse", q)
+    def _split(self, x):
+        if x.shape != (self.dim,):  # slicing alone would silently accept coordinates that are too long
+            raise ValueError(f"Product: the coordinates have shape {x.shape}; expected ({self.dim},).")
+        return [x[part] for part in _slices([group.dim for group in self.groups])]
 
-    def exp(self, x):
-        return self._each("exp", _pieces(x, self._dims))
+    def _join(self, pieces):
+        return jnp.concatenate(pieces)
 
-    def log(self, q):
-        return self._joined("log", q)
+    def _diagonal(self, blocks):
+        return block_diag(*blocks)
 
-    def wedge(self, x):
-        return block_diag(*self._each("wedge", _pieces(x, self._dims)))
-
-    def vee(self, X):
-        return self._joined("vee", _diagonal_blocks(X, [_matrix_size(group) for group in self.groups]))
-
-    def matrix(self, q):
-        return block_diag(*self._each("matrix", q))
-
-    def ad_mv(self, x, y):
-        return self._joined("ad_mv", _pieces(x, self._dims), _pieces(y, self._dims))
-
-    def Ad_inv_mv(self, q, w):
-        return self._joined("Ad_inv_mv", q, _pieces(w, self._dims))
-
-    def Ad_inv_rmv(self, q, w):
-        return self._joined("Ad_inv_rmv", q, _pieces(w, self._dims))
-
-    def tangent_mv(self, x, y):
-        return self._joined("tangent_mv", _pieces(x, self._dims), _pieces(y, self._dims))
-
-    def tangent_rmv(self, x, y):
-        return self._joined("tangent_rmv", _pieces(x, self._dims), _pieces(y, self._dims))
-
-    def tangent_inv_mv(self, x, y):
-        return self._joined("tangent_inv_mv", _pieces(x, self._dims), _pieces(y, self._dims))
-
-    def to_ambient(self, q, w):
-        return self._each("to_ambient", q, _pieces(w, self._dims))
-
-    def from_ambient(self, q, dq):
-        return self._joined("from_ambient", q, dq)
+    def _blocks(self, X):
+        return _diagonal_blocks(X, self.groups)
 
 
-class Power(AbstractLieGroup):
+class Power(AbstractDirectProduct):
     """The direct product of `n` copies of one group, each operation one `jax.vmap` over them.
 
     An element is the group's pytree with a leading axis `n` on each leaf; coordinates, shape (n*d,), are
@@ -125,12 +148,6 @@ class Power(AbstractLieGroup):
         if not isinstance(self.n, int) or self.n < 1:
             raise ValueError(f"Power: `n` is the number of copies, a positive Python integer; got {self.n!r}.")
 
-    def _rows(self, x):
-        return x.reshape(self.n, self.group.dim)
-
-    def _blocks(self, method, *args):
-        return block_diag(*jax.vmap(method)(*args))
-
     @property
     def dim(self):
         return self.n * self.group.dim
@@ -139,48 +156,17 @@ class Power(AbstractLieGroup):
         one = self.group.identity(dtype)
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (self.n, *leaf.shape)), one)
 
-    def compose(self, p, q):
-        return jax.vmap(self.group.compose)(p, q)
+    def _each(self, method, *args):
+        return jax.vmap(getattr(self.group, method))(*args)
 
-    def inverse(self, q):
-        return jax.vmap(self.group.inverse)(q)
+    def _split(self, x):
+        return x.reshape(self.n, self.group.dim)
 
-    def exp(self, x):
-        return jax.vmap(self.group.exp)(self._rows(x))
+    def _join(self, pieces):
+        return pieces.reshape(-1)
 
-    def log(self, q):
-        return jax.vmap(self.group.log)(q).reshape(-1)
+    def _diagonal(self, blocks):
+        return block_diag(*blocks)
 
-    def wedge(self, x):
-        return self._blocks(self.group.wedge, self._rows(x))
-
-    def vee(self, X):
-        blocks = _diagonal_blocks(X, [_matrix_size(self.group)] * self.n)
-        return jax.vmap(self.group.vee)(jnp.stack(blocks)).reshape(-1)
-
-    def matrix(self, q):
-        return self._blocks(self.group.matrix, q)
-
-    def ad_mv(self, x, y):
-        return jax.vmap(self.group.ad_mv)(self._rows(x), self._rows(y)).reshape(-1)
-
-    def Ad_inv_mv(self, q, w):
-        return jax.vmap(self.group.Ad_inv_mv)(q, self._rows(w)).reshape(-1)
-
-    def Ad_inv_rmv(self, q, w):
-        return jax.vmap(self.group.Ad_inv_rmv)(q, self._rows(w)).reshape(-1)
-
-    def tangent_mv(self, x, y):
-        return jax.vmap(self.group.tangent_mv)(self._rows(x), self._rows(y)).reshape(-1)
-
-    def tangent_rmv(self, x, y):
-        return jax.vmap(self.group.tangent_rmv)(self._rows(x), self._rows(y)).reshape(-1)
-
-    def tangent_inv_mv(self, x, y):
-        return jax.vmap(self.group.tangent_inv_mv)(self._rows(x), self._rows(y)).reshape(-1)
-
-    def to_ambient(self, q, w):
-        return jax.vmap(self.group.to_ambient)(q, self._rows(w))
-
-    def from_ambient(self, q, dq):
-        return jax.vmap(self.group.from_ambient)(q, dq).reshape(-1)
+    def _blocks(self, X):
+        return jnp.stack(_diagonal_blocks(X, [self.group] * self.n))

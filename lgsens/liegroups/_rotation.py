@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from ._base import AbstractLieGroup
 from ._coefficients import c1, c2, c3, horner, inverse_tangent_coefficient
 
-# arctan(√m)/√m = Σ_j (-m)^j / (2j+1). `_log` calls it with m ≤ tan²(π/16) = 0.0396, where the first term left
+# arctan(√m)/√m = Σ_j (-m)^j / (2j+1). `SO3.log` calls it with m ≤ tan²(π/16) = 0.0396, where the first term left
 # out of the second derivative, n (n-1) m^(n-2) / (2n+1), is 9e-17 for n = 14, against 2/5 for the whole.
 _ARCTAN = tuple((-1) ** j / (2 * j + 1) for j in range(14))
 
@@ -83,13 +83,6 @@ def turn_back(rotation: Float[Array, "3 3"], x: Float[Array, "3"]) -> Float[Arra
     return jnp.sum(rotation * x[:, None], axis=0)
 
 
-def _exp(x):
-    # I + c_1 x~ + c_2 x~² with x~² = x xᵀ - s I: no matrix product.
-    s = _dot(x, x)
-    a, b = c1(s), c2(s)
-    return (1.0 - b * s) * jnp.eye(3, dtype=x.dtype) + skew(a * x) + (b * x)[:, None] * x[None, :]
-
-
 def _quaternion(R):
     # The row of 4 p pᵀ with the largest diagonal entry (≥ 1, Shepperd 1978) is p up to a factor, free of
     # cancellation; normalizing it needs no other branch.
@@ -98,16 +91,6 @@ def _quaternion(R):
     row = lax.dynamic_index_in_dim(rows, jnp.argmax(jnp.diagonal(rows)), keepdims=False)
     # Of the two quaternions ±p, the one with θ ≤ π. At θ = π both have cos θ/2 = 0 and this picks one.
     return row * lax.rsqrt(_dot(row, row)) * jnp.where(row[0] < 0.0, -1.0, 1.0).astype(R.dtype)
-
-
-def _log(R):
-    # tan(φ/2) = tan φ / (1 + √(1 + tan² φ)), along the axis n: from the quaternion to tan(θ/4) n, tan(θ/8) n
-    # and tan(θ/16) n. There one short series serves all angles up to π: no switch, no singular square root.
-    p = _quaternion(R)
-    y = p[1:] / (1.0 + p[0])
-    for _ in range(2):
-        y = y / (1.0 + jnp.sqrt(1.0 + _dot(y, y)))
-    return 16.0 * horner(_ARCTAN, _dot(y, y)) * y
 
 
 class SO3(AbstractLieGroup):
@@ -137,7 +120,10 @@ class SO3(AbstractLieGroup):
 
         `x`: rotation vector [rad], shape (3,).
         """
-        return _exp(x)
+        # I + c_1 x~ + c_2 x~² with x~² = x xᵀ - s I: no matrix product.
+        s = _dot(x, x)
+        a, b = c1(s), c2(s)
+        return (1.0 - b * s) * jnp.eye(3, dtype=x.dtype) + skew(a * x) + (b * x)[:, None] * x[None, :]
 
     def log(self, q):
         """The rotation vector [rad], shape (3,), `|x| ≤ π`, with `exp(x~) = q`.
@@ -145,7 +131,13 @@ class SO3(AbstractLieGroup):
         Accurate to round-off, absolute near `π` and relative near 0. At an angle of exactly `π` both `x` and
         `-x` are right: this is one of the two, and there the map jumps from one to the other.
         """
-        return _log(q)
+        # tan(φ/2) = tan φ / (1 + √(1 + tan² φ)), along the axis n: from the quaternion to tan(θ/4) n, tan(θ/8) n
+        # and tan(θ/16) n. There one short series serves all angles up to π: no switch, no singular square root.
+        p = _quaternion(q)
+        y = p[1:] / (1.0 + p[0])
+        for _ in range(2):
+            y = y / (1.0 + jnp.sqrt(1.0 + _dot(y, y)))
+        return 16.0 * horner(_ARCTAN, _dot(y, y)) * y
 
     def wedge(self, x):
         return skew(x)

@@ -5,6 +5,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from lgsens.linear import tuned
+
 
 class LU(eqx.Module):
     """P S = L U, and S⁻ᵀ = Pᵀ L⁻ᵀ U⁻ᵀ.
@@ -23,7 +25,7 @@ class LU(eqx.Module):
 
     def solve(self, rhs, *, transposed: bool = False):
         """S⁻¹ rhs or S⁻ᵀ rhs, one column or several."""
-        if rhs.ndim == 1 and rhs.shape[0] <= _SHORT:
+        if rhs.ndim == 1 and rhs.shape[0] <= tuned.SUBSTITUTED_ROWS:
             return lax.platform_dependent(
                 self,
                 rhs,
@@ -38,27 +40,15 @@ class LU(eqx.Module):
         return triangular(self.lu, triangular(self.lu, rhs[self.permutation], True, False), False, False)
 
 
-_SHORT = 64  # rows, up to which `_substituted` was measured; that of many columns is LAPACK's
-
-
 def _triangular(lu, rhs, of_lower: bool, transposed: bool):
     """L⁻¹ rhs or U⁻¹ rhs, or that with the transpose, by LAPACK."""
-    return lax.linalg.triangular_solve(
-        lu,
-        rhs.reshape(rhs.shape[0], -1),
-        left_side=True,
-        lower=of_lower,
-        transpose_a=transposed,
-        unit_diagonal=of_lower,
-    ).reshape(rhs.shape)
+    columns = rhs if rhs.ndim == 2 else rhs[:, None]
+    kind = {"left_side": True, "lower": of_lower, "transpose_a": transposed, "unit_diagonal": of_lower}
+    return lax.linalg.triangular_solve(lu, columns, **kind).reshape(rhs.shape)
 
 
 def _substituted(lu, rhs, of_lower: bool, transposed: bool):
-    """The same of one column by substitution, column after column of the triangle.
-
-    XLA makes one function of a loop around it, but not of one that calls LAPACK, and then each of its operations is
-    begun by itself: the gradient of the quarter-car (37 rows left) takes 0.92 of the time.
-    """
+    """The same of one column by substitution, column after column of the triangle."""
     size = rhs.shape[0]
     places, columns = jnp.arange(size), lu if transposed else lu.T
     downwards = of_lower != transposed
@@ -102,12 +92,7 @@ class Inverse(eqx.Module):
 
     @classmethod
     def of(cls, matrix) -> "Inverse":
-        lu, pivots, _ = lax.linalg.lu(matrix)
-        # P S = L U, so S⁻ᵀ = Pᵀ L⁻ᵀ U⁻ᵀ
-        eye = jnp.eye(lu.shape[0], dtype=lu.dtype)
-        rows = lax.linalg.triangular_solve(lu, eye, left_side=True, lower=False, transpose_a=True)
-        rows = lax.linalg.triangular_solve(lu, rows, left_side=True, lower=True, transpose_a=True, unit_diagonal=True)
-        return cls(rows[_permutation(pivots, inverse=True)])
+        return cls(LU.of(matrix).solve(jnp.eye(matrix.shape[0], dtype=matrix.dtype), transposed=True))
 
     def solve(self, rhs, *, transposed: bool = False):
         """S⁻¹ rhs or S⁻ᵀ rhs, one column or several."""

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lgsens.linear import tuned
 from lgsens.linear._block_factors import BlockFactors, BlockMatrix
 from lgsens.linear._dense import LU, Inverse
 from lgsens.linear._elimination import Elimination
@@ -16,11 +17,6 @@ from lgsens.linear._mixed import factors_of, rounded_inverse
 from lgsens.linear._sparse import SparseMatrix
 
 Matrix = Any  # a SparseMatrix or an array
-
-# Numbers in an inverse from which on it is rounded: a quarter of a megabyte, that of 70 links. Steps of chains of 128
-# and 512 links then take 0.96 and 0.91 of the time; smaller scenes gain nothing, unless the inverses of many runs share
-# the caches of a core: batches of quarter-cars (3769 numbers) take 0.9 of the time, those of tops (81) would take 1.05.
-_MANY, _MANY_IN_A_BATCH = 2**15, 2**10
 
 _in_a_batch = jax.make_user_context(False)  # JAX keys its caches on it
 
@@ -55,18 +51,15 @@ class Factors(eqx.Module):
         m = lower.shape[0]
         corner = None if softness is None else -(scale**2) * softness
         if not isinstance(dynamic, SparseMatrix):
-            above = jnp.concatenate([dynamic, scale * upper], axis=1)
-            below = jnp.concatenate(
-                [scale * lower, jnp.zeros((m, m), dynamic.dtype) if corner is None else jnp.diag(corner)], axis=1
-            )
-            values = jnp.concatenate([above, below])
+            below = jnp.zeros((m, m), dynamic.dtype) if corner is None else jnp.diag(corner)
+            values = jnp.block([[dynamic, scale * upper], [scale * lower, below]])
             numbers = values.size
             factors = partial(factors_of, kind=kind, mixed=mixed)
         else:
             assert plan is not None
             numbers, (values, rows, columns) = plan.numbers, _bordered(dynamic, upper, lower, scale, corner)
             factors = lambda values: factors_of(BlockMatrix.of(plan, values, rows, columns), kind, mixed=mixed)
-        many = numbers >= (_MANY_IN_A_BATCH if _in_a_batch.value else _MANY)
+        many = numbers >= (tuned.ROUNDED_NUMBERS_IN_A_BATCH if _in_a_batch.value else tuned.ROUNDED_NUMBERS)
         if kind is Inverse and values.dtype == jnp.float64 and many and not (mixed or exact):
             return cls(rounded_inverse(values, factors), scale)
         return cls(factors(values), scale)

@@ -4,6 +4,7 @@ import math
 
 import equinox as eqx
 
+from lgsens.linear import tuned
 from lgsens.linear._elimination import Elimination
 from lgsens.linear._ordering import Graph, levels, of_one_shape
 
@@ -16,6 +17,10 @@ class AbstractLinearSolver(eqx.Module):
     """
 
     mixed: eqx.AbstractVar[bool]
+
+    def __check_init__(self):
+        if not isinstance(self.mixed, bool):
+            raise ValueError(f"{type(self).__name__}: `mixed` must be True or False, got {self.mixed!r}.")
 
 
 class DenseLU(AbstractLinearSolver):
@@ -33,9 +38,6 @@ class DenseLU(AbstractLinearSolver):
 
     mixed: bool = eqx.field(static=True, default=False, kw_only=True)
 
-    def __check_init__(self):
-        _check_mixed(self)
-
 
 class BlockSparse(AbstractLinearSolver):
     """Block elimination on the graph of bodies and joints: time grows with the size of trees and chains.
@@ -51,19 +53,11 @@ class BlockSparse(AbstractLinearSolver):
 
     mixed: bool = eqx.field(static=True, default=False, kw_only=True)
 
-    def __check_init__(self):
-        _check_mixed(self)
-
-
-def _check_mixed(solver: AbstractLinearSolver) -> None:
-    if not isinstance(solver.mixed, bool):
-        raise ValueError(f"{type(solver).__name__}: `mixed` must be True or False, got {solver.mixed!r}.")
-
 
 def elimination(solver: AbstractLinearSolver | None, graph: Graph) -> Elimination | None:
     """The plan of `BlockSparse` for a graph, or None for a dense LU; `solver` None: the cheaper one."""
     size = sum(map(len, graph.nodes))
-    if isinstance(solver, DenseLU) or (solver is None and size < _SMALLEST):
+    if isinstance(solver, DenseLU) or (solver is None and size < tuned.SMALLEST_SPARSE):
         return None
     found = [levels(graph, early=early) for early in (False, True)]
     dense = Elimination([], size)
@@ -71,13 +65,8 @@ def elimination(solver: AbstractLinearSolver | None, graph: Graph) -> Eliminatio
     best = min(sparse, key=_cost, default=dense)
     if solver is None and _cost(dense) <= _cost(best):
         return None
-    # limit 1.06: a chain of 512 links compiles in 0.73 of the time, with a gradient in 0.8, and runs no slower; with a
-    # limit of 1.1 its gradient takes 1.05 of the time
-    steps, once = _with_loop(best, 1.06), _with_loop(best, math.inf)
+    steps, once = _with_loop(best, tuned.LOOP_COST), _with_loop(best, math.inf)
     return best if once is best else Elimination(steps.levels, size, steps.looped, once)
-
-
-_MANY_LEVELS = 4  # that a loop pays for: it compiles about as long as two, and four of 64 links gain little
 
 
 def _with_loop(plan: Elimination, limit: float) -> Elimination:
@@ -85,7 +74,7 @@ def _with_loop(plan: Elimination, limit: float) -> Elimination:
 
     A level of many clusters is several in the loop, one of few is filled up.
     """
-    for first in range(len(plan.levels) - _MANY_LEVELS + 1):
+    for first in range(len(plan.levels) - tuned.LOOP_LEVELS + 1):
         head, tail = plan.levels[:first], plan.levels[first:]
         equal = [of_one_shape(tail, count, plan.size) for count in sorted({len(own) for own, _ in tail})]
         found = min((Elimination([*head, *some], plan.size, len(some)) for some in equal), key=_cost)
@@ -94,18 +83,12 @@ def _with_loop(plan: Elimination, limit: float) -> Elimination:
     return plan
 
 
-# Times in µs on a core of 3 GHz, from batches of LAPACK's LU and inverses, of products, and of scatters in XLA. What a
-# level costs whatever its size is from the quarter-car (94 unknowns) and a chain of 8 links (88): a level and an LU of
-# the rest take 0.79 and 0.83 of a dense LU in a run, 0.68 and 0.67 with the gradient.
-_SMALLEST = 64  # unknowns; below, an LU takes less time than its dispatch could be shortened
-
-
 def _cost(plan: Elimination) -> float:
-    """The estimated time of one factorization and one solve."""
+    """The estimated time [µs] of one factorization and one solve."""
     n = len(plan.rest)
-    total = 1e-3 * n**2 + 4e-5 * n**3
+    total = tuned.DENSE_SQUARE * n**2 + tuned.DENSE_CUBE * n**3
     for own, boundary in plan.levels:
         count, p, q = len(own), own.shape[1], boundary.shape[1]
         flops = 4 * p**3 + 4 * p**2 * q + 2 * p * q**2
-        total += 8.0 + count * (0.3 + flops / 8e3 + 1.5e-3 * (q**2 + p**2 + 2 * p * q))
+        total += tuned.LEVEL + count * (tuned.CLUSTER + flops / tuned.FLOPS + tuned.ENTRY * (p + q) ** 2)
     return total

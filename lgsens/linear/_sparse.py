@@ -18,6 +18,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens.linear import tuned
+
 
 class Pattern:
     """Where the blocks of one stack are; static, and equal only to itself: make it once for each topology.
@@ -192,8 +194,7 @@ def added(arrays: Sequence[tuple[Any, np.ndarray]], size: int, dtype=None) -> Fl
     if table is None:
         return scattered(values)
 
-    # With a scatter in it XLA does not make one function of an iteration of Newton's method, which halves the time of a
-    # small scene (README, "Small scenes on a CPU"). The derivative is the scatter's, whose transpose is a gather.
+    # The derivative is the scatter's, whose transpose is a gather.
     @jax.custom_jvp
     def gathered(values):
         return jnp.sum(jnp.concatenate([values, jnp.zeros(1, values.dtype)])[table], axis=0)
@@ -224,7 +225,7 @@ def _table(places: np.ndarray, values: np.ndarray, size: int, *, nowhere: int) -
     """Which values each place has, `nowhere` after the last of them, shape (most, size); None: mostly nowhere."""
     counts = np.bincount(places, minlength=size)
     most = int(counts.max(initial=0))
-    if most * size > 8 * len(places) + 64:
+    if most * size > tuned.GATHERED_PER_NUMBER * len(places) + tuned.GATHERED_ALWAYS:
         return None
     order = np.argsort(places, kind="stable")
     rank = np.arange(len(places)) - (np.cumsum(counts) - counts)[places[order]]  # among those of one place

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PyTree
 
 from lgsens._progress import progress_bar
 from lgsens._validate import as_count
+from lgsens.linear import tuned
 from lgsens.optimize import _forward_steps, _reverse_steps
 from lgsens.optimize._augmented_lagrangian import Row
 from lgsens.optimize._box import Box, checked_box
@@ -20,7 +21,6 @@ from lgsens.optimize._checkpoint import Checkpoint, columns
 Problem = Callable[[PyTree], tuple[Float[Array, ""], Array]]
 Carry = _forward_steps.Carry | _reverse_steps.Carry
 REASONS = ("steps", "converged", "stalled", "infeasible")
-FEW = 40  # variables: their Jacobian costs little more than a gradient in reverse mode
 
 
 class History(NamedTuple):
@@ -197,7 +197,7 @@ def prepared(
         f, g = flat_fun(x)
         return f, g.ravel()
 
-    few = shape[1].size > 0 and x.size <= FEW
+    few = shape[1].size > 0 and x.size <= tuned.FORWARD_VARIABLES
     method: Any = _forward_steps if (few if forward is None else forward) else _reverse_steps
     step = method.make_step(in_a_row, box, tolerances)
     return lambda x: method.start(box.scaled(x), shape[1].size), step, shape[1].shape

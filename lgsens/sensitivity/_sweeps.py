@@ -26,12 +26,8 @@ from jax import lax
 
 from lgsens.dynamics import State
 from lgsens.integrate import AbstractScheme, Variation, earlier, later, with_first
+from lgsens.linear import tuned
 from lgsens.sensitivity._linearization import Parameters, Step, node_tangent, place_tangents, steps
-
-# Of the factors of a block: 128 kB in double precision, so that those of a batch of trajectories stay in a core's cache
-# too. With 2**17, alone as fast, 16 quarter-cars at once took 149 instead of 110 µs per step and gradient.
-_NUMBERS = 2**14
-_LONGEST = 64
 
 
 class Blocks(NamedTuple):
@@ -43,7 +39,7 @@ class Blocks(NamedTuple):
     @classmethod
     def of(cls, num_steps: int, numbers: int) -> "Blocks":
         """Blocks for factors of `numbers` numbers; without padding where a divisor is near."""
-        longest = max(1, min(num_steps, _LONGEST, _NUMBERS // numbers))
+        longest = max(1, min(num_steps, tuned.BLOCK_STEPS, tuned.BLOCK_NUMBERS // numbers))
         divisors = [n for n in range((longest + 1) // 2, longest + 1) if num_steps % n == 0]
         length = divisors[-1] if divisors else longest
         return cls(length, -num_steps % length)

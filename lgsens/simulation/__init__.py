@@ -13,16 +13,19 @@ from lgsens.simulation._richardson import (
     richardson as richardson,
 )
 from lgsens.simulation._simulate import (
-    as_system as as_system,
     check_integrator as check_integrator,
-    equilibrium as equilibrium,
-    initial_state as initial_state,
     interval as interval,
     outcome as outcome,
     run as run,
     simulate as simulate,
 )
-from lgsens.simulation._start import Begin as Begin, begin as begin
+from lgsens.simulation._start import (
+    Begin as Begin,
+    as_system as as_system,
+    begin as begin,
+    equilibrium as equilibrium,
+    initial_state as initial_state,
+)
 from lgsens.simulation._trajectory import (
     AbstractMotion as AbstractMotion,
     BodyMotion as BodyMotion,

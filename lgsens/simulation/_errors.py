@@ -44,64 +44,54 @@ def left_null_space(jacobian: np.ndarray) -> tuple[np.ndarray, int]:
     return left[:, rank:], rank
 
 
-def describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> str:
-    """The message of a failure; `details` are those that `details_of` collects."""
+def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> str:
+    """The message of a failure; `details` are those of `outcome`, or what else the code wants to know."""
     code = RESULTS(result)
-    if code is RESULTS.assembly_failed:
-        violation = np.abs(details["violation"])
-        worst = int(np.argmax(np.where(np.isfinite(violation), violation, np.inf)))
-        return f"{code.message} Left over: |Φ| = {violation[worst]:.3g}, largest in joint {names[worst]!r}."
     if code is RESULTS.redundant_constraints:
         return f"{code.message} Joints involved: {redundant_names(details['jacobian'], names)}."
-    if code is RESULTS.newton_failed:
-        step, run = int(details["step"]), _RUNS[int(details.get("run", 0))]
-        return (
-            f"{code.message} It failed at step {step} of {int(details['num_steps'])}{run}, "
-            f"t = {details['time']:.6g} s, after {int(details['iterations'])} iterations: last increment "
-            f"{details['increment']:.3g} (tolerance {details['tolerance']:.3g}), "
-            f"residual {details['residual']:.3g}. "
-            "`throw=False` returns the data up to the step before."
-        )
-    if code is RESULTS.singular_configuration:
-        return (
-            f"{code.message} It does so about step {int(details['step'])} of {int(details['num_steps'])}, "
-            f"t = {details['time']:.6g} s. `throw=False` returns the data, which follow one branch."
-        )
-    if code is RESULTS.turn_not_resolved:
-        num_steps, turn = int(details["num_steps"]), float(details["turn"])
-        return (
-            f"{code.message} It turns by {turn:.3g} rad in step {int(details['step'])} of {num_steps}, "
-            f"t = {details['time']:.6g} s: try num_steps = {np.ceil(num_steps * turn / 0.3):.0f}. "
-            "`throw=False` returns the data."
-        )
-    if code is RESULTS.position_failed:
-        violation = np.abs(details["violation"])
-        worst = int(np.argmax(np.where(np.isfinite(violation), violation, np.inf)))
-        return (
-            f"{code.message} It failed at position {int(details['position'])}, driven values "
-            f"{np.array2string(details['values'], precision=6)}, t = {details['time']:.6g} s. Left over: |Φ| = {violation[worst]:.3g}, largest in "
-            f"joint {names[worst]!r}."
-        )
-    if code is RESULTS.steps_exhausted:
-        return (
-            f"{code.message} It came to t = {details['time']:.6g} s of {details['t1']:.6g} s in "
-            f"{int(details['num_steps'])} steps. `throw=False` returns these."
-        )
-    if code is RESULTS.integration_failed:
-        return (
-            f"{code.message} It failed in interval {int(details['step'])} of {int(details['num_steps'])}, from "
-            f"t = {details['begin']:.6g} s on, in {int(details['iterations'])} steps. "
-            "`throw=False` returns the data before."
-        )
-    return code.message
+    step, num_steps = int(details.get("step", 0)), int(details.get("num_steps", 0))
+    place, time = f"step {step} of {num_steps}", f"t = {details.get('time', 0.0):.6g} s"
+    violation, worst = np.abs(details["violation"]), ""
+    if violation.size:
+        i = int(np.argmax(np.where(np.isfinite(violation), violation, np.inf)))
+        worst = f"Left over: |Φ| = {violation[i]:.3g}, largest in joint {names[i]!r}."
+    match code:
+        case RESULTS.assembly_failed:
+            more = worst
+        case RESULTS.newton_failed:
+            more = (
+                f"It failed at {place}{_RUNS[int(details.get('run', 0))]}, {time}, after {int(details['iterations'])} "
+                f"iterations: last increment {details['increment']:.3g} (tolerance {details['tolerance']:.3g}), "
+                f"residual {details['residual']:.3g}. `throw=False` returns the data up to the step before."
+            )
+        case RESULTS.singular_configuration:
+            more = f"It does so about {place}, {time}. `throw=False` returns the data, which follow one branch."
+        case RESULTS.turn_not_resolved:
+            turn = float(details["turn"])
+            more = (
+                f"It turns by {turn:.3g} rad in {place}, {time}: try num_steps = "
+                f"{np.ceil(num_steps * turn / 0.3):.0f}. `throw=False` returns the data."
+            )
+        case RESULTS.position_failed:
+            driven = np.array2string(details["values"], precision=6)
+            more = f"It failed at position {int(details['position'])}, driven values {driven}, {time}. {worst}"
+        case RESULTS.steps_exhausted:
+            more = f"It came to {time} of {details['t1']:.6g} s in {num_steps} steps. `throw=False` returns these."
+        case RESULTS.integration_failed:
+            more = (
+                f"It failed in interval {step} of {num_steps}, from t = {details['begin']:.6g} s on, in "
+                f"{int(details['iterations'])} steps. `throw=False` returns the data before."
+            )
+        case _:
+            more = ""
+    return f"{code.message} {more}".strip()
 
 
 def _exception(result: int, details: dict[str, Any], names: tuple[str, ...], note: str) -> Exception:
     bad_input = (RESULTS.assembly_failed, RESULTS.redundant_constraints, RESULTS.position_failed)
     kind = ValueError if result in bad_input else SimulationError
-    if result != RESULTS.redundant_constraints:
-        note = ""
-    return kind(f"{note} {describe(result, details, names)}".strip())
+    note = note if result == RESULTS.redundant_constraints else ""
+    return kind(f"{note} {_describe(result, details, names)}".strip())
 
 
 def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tuple[str, ...], note: str = "") -> Any:
@@ -130,30 +120,20 @@ def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tupl
             raise _exception(int(result), values, names, note)
         return tree
 
+    result, details = lax.stop_gradient((result, details))
     if _failures_as_nan.value:
-        passed = lax.stop_gradient(result) == RESULTS.successful
-        return jax.tree.map(lambda leaf: _poisoned(passed, leaf), tree)
-
-    def fail(operands):
+        passed = result == RESULTS.successful
+    else:
         shape = jax.ShapeDtypeStruct((), bool)
-        return jax.pure_callback(host, shape, *operands, vmap_method="broadcast_all")
-
-    operands = lax.stop_gradient((result, details))
-    passed = lax.cond(result != RESULTS.successful, fail, lambda _: jnp.ones((), bool), operands)
-    return jax.tree.map(lambda leaf: _poisoned(passed, leaf), tree)
+        fail = lambda *operands: jax.pure_callback(host, shape, *operands, vmap_method="broadcast_all")
+        passed = lax.cond(result != RESULTS.successful, fail, lambda *_: jnp.ones((), bool), result, details)
+    # Leaves depend on the callback, which is therefore not removed. A product and no selection: the derivatives of a
+    # failure are NaN too, where those of a selection would be zero.
+    poison = lambda leaf: leaf * jnp.where(passed, 1.0, jnp.nan).astype(leaf.dtype)
+    return jax.tree.map(lambda leaf: poison(leaf) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, tree)
 
 
 def _value(array: Any) -> Any:
     while isinstance(array, Tracer) and hasattr(array, "primal"):
         array = array.primal
     return array
-
-
-def _poisoned(passed, leaf):
-    """`leaf` if `passed`, else NaN; it depends on the callback, which is therefore not removed.
-
-    A product and no selection: the derivatives of a failure are NaN too, where those of a selection would be zero.
-    """
-    return (
-        leaf * jnp.where(passed, 1.0, jnp.nan).astype(leaf.dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
-    )

@@ -138,9 +138,9 @@ def extrapolate_runs(system: AbstractSystem, coarse: Run, fine: Run) -> Run:
     result = jnp.where(coarse.result == RESULTS.successful, fine.result, coarse.result)
     stats = jax.tree.map(lambda first, second: jnp.concatenate([first, second]), coarse.stats, fine.stats)
     if isinstance(coarse, Saved):
-        missing = lambda rough, better: better + _missing(rough, better) if _is_float(better) else better
-        halved = jax.tree.map(lambda leaf: leaf[::2], fine.values)
-        values = jax.tree.map(missing, coarse.values, halved)
+        is_float = lambda leaf: jnp.issubdtype(leaf.dtype, jnp.floating)
+        better = lambda rough, fine: fine + _missing(rough, fine) if is_float(fine) else fine
+        values = jax.tree.map(lambda rough, fine: better(rough, fine[::2]), coarse.values, fine.values)
         final, _ = _extrapolated(system, coarse.final, fine.final)
         return Saved(coarse.t, values, final, result, stats)
     halved = jax.tree.map(lambda leaf: leaf[::2], fine.states)
@@ -155,7 +155,3 @@ def _extrapolated(system, rough: State, better: State) -> tuple[State, StateErro
     acceleration = better.vdot + vdot
     state = State(group.retract(better.q, w), better.v + v, acceleration, better.lam + lam, acceleration)
     return state, StateError(w, v, vdot, lam)
-
-
-def _is_float(leaf) -> bool:
-    return jnp.issubdtype(leaf.dtype, jnp.floating)

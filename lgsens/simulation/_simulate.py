@@ -1,4 +1,4 @@
-"""`simulate`, `initial_state` and `equilibrium`: the model in, a trajectory or a state out."""
+"""`simulate`: the model in, a trajectory out."""
 
 import warnings
 from collections.abc import Callable
@@ -9,16 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from lgsens._validate import as_count, as_float, require
-from lgsens.dynamics import (
-    RESULTS,
-    AbstractSystem,
-    Initial,
-    State,
-    equilibrium as _equilibrium,
-    full_jacobian,
-    initial_state as _initial,
-    unsteady_rate,
-)
+from lgsens.dynamics import RESULTS, AbstractSystem, State, unsteady_rate
 from lgsens.integrate import (
     AbstractIntegrator,
     AbstractScheme,
@@ -33,83 +24,8 @@ from lgsens.sensitivity import AbstractSensitivity, DirectDifferentiation, Param
 from lgsens.simulation._errors import throw_if_failed
 from lgsens.simulation._index_reduced_ode import integrate_ode
 from lgsens.simulation._richardson import extrapolate_runs
-from lgsens.simulation._start import Begin, begin
+from lgsens.simulation._start import Begin, as_system, begin
 from lgsens.simulation._trajectory import Instant, Saved, Trajectory
-
-
-def as_system(model: Model | AbstractSystem) -> AbstractSystem:
-    if isinstance(model, Model):
-        return model.system()
-    if isinstance(model, AbstractSystem):
-        return model
-    raise ValueError(f"`model` must be a Model or an AbstractSystem, got {type(model).__name__}.")
-
-
-def warn_of_single_precision(system: AbstractSystem) -> None:
-    if jax.tree.leaves(system)[0].dtype == jnp.float32:
-        warnings.warn(
-            "lgsens runs in single precision: positions carry seven digits, accelerations lose them as 1/h². Call "
-            'jax.config.update("jax_enable_x64", True) before the model is built.',
-            stacklevel=3,
-        )
-
-
-def initial_state(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) -> State:
-    """The consistent initial state of a model: q, v, v̇, λ, and a = v̇ (paper eqs. 18–19).
-
-    The reference configuration is assembled if a joint asks for it (a `DistanceJoint` with a length), velocities
-    are projected on those that the joints allow, accelerations and multipliers solve
-
-        [[M, Bᵀ], [B, 0]] [v̇; λ] = [−f + ad(v)ᵀMv; −Ḃ v].
-
-    Arguments:
-        model: the scene, or an `AbstractSystem`.
-        t0: initial time [s], shape ().
-        throw: raise if the mechanism cannot be assembled or has redundant constraints.
-
-    Differentiable, by the implicit function theorem. Raises `ValueError` as said under `throw`; inside
-    `jit`, JAX's runtime error with the same message.
-    """
-    system = as_system(model)
-    t0 = as_float(t0, (), "`t0`")
-    initial = _initial_jit(system, t0)
-    return _checked(system, initial, t0, throw)
-
-
-def equilibrium(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) -> State:
-    """The static equilibrium near the reference configuration: f(q, 0, t0) + Bᵀλ = 0, Φ(q) = 0.
-
-    Arguments:
-        model: the scene, or an `AbstractSystem`. Its velocities are ignored.
-        t0: the time at which time-dependent forces are taken [s], shape ().
-        throw: raise if no equilibrium is found.
-
-    Returns the state at rest there, to be used as `state0` of `simulate`. Differentiable, by the implicit
-    function theorem; where a body turns freely (a wheel on its hinge) both the state and its derivative are
-    those closest to the reference. Raises `SimulationError` if none is found; inside `jit`, JAX's runtime
-    error with the same message.
-    """
-    system = as_system(model)
-    t0 = as_float(t0, (), "`t0`")
-    return _checked(system, _equilibrium_jit(system, t0), t0, throw)
-
-
-@eqx.filter_jit
-def _initial_jit(system, t0) -> Initial:
-    return _initial(system, t0)._replace(factors=None)
-
-
-@eqx.filter_jit
-def _equilibrium_jit(system, t0) -> Initial:
-    return _equilibrium(system, t0)
-
-
-def _checked(system: AbstractSystem, initial: Initial, t0, throw: bool) -> State:
-    if not throw:
-        return initial.state
-    details = {"violation": initial.violation, "jacobian": full_jacobian(system, initial.state.q, t0)}
-    return throw_if_failed(initial.state, initial.result, details, system.constraint_names)
-
 
 Save = Callable[[Instant], Any]
 
@@ -186,7 +102,12 @@ def simulate(
     Source: Sonneville & Brüls (2014), §4 and §6.2.
     """
     system = as_system(model)
-    warn_of_single_precision(system)
+    if jax.tree.leaves(system)[0].dtype == jnp.float32:
+        warnings.warn(
+            "lgsens runs in single precision: positions carry seven digits, accelerations lose them as 1/h². Call "
+            'jax.config.update("jax_enable_x64", True) before the model is built.',
+            stacklevel=2,
+        )
     num_steps = as_count(num_steps, "num_steps", " (it is static)")
     by_diffrax = _by_diffrax(integrator)
     if not by_diffrax:
@@ -231,9 +152,8 @@ def interval(t0, t1):
 
 @eqx.filter_jit
 def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, save):
-    initial = None if state0 is not None else _initial(system, t0)
-    start = begin(integrator.scheme, system, t0, state0, initial)
-    return run(system, start, t0, t1, num_steps, integrator, sensitivity, save)
+    begun = begin(integrator.scheme, system, t0, state0)
+    return run(system, begun, t0, t1, num_steps, integrator, sensitivity, save)
 
 
 def outcome(scheme: AbstractScheme, begun: Begin, stats: Stats, turns, t, laid: Laid):

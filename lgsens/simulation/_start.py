@@ -1,14 +1,90 @@
-"""The initial state of a model, as a scheme starts from it."""
+"""How a simulation starts: the system of a model, its consistent initial state or equilibrium, and a scheme's start."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from lgsens.dynamics import RESULTS, AbstractSystem, Initial, State, constraint_jacobian, initial_state
+from lgsens._validate import as_float
+from lgsens.dynamics import (
+    RESULTS,
+    AbstractSystem,
+    Initial,
+    State,
+    constraint_jacobian,
+    equilibrium as _equilibrium,
+    full_jacobian,
+    initial_state as _initial,
+)
 from lgsens.integrate import AbstractScheme, Start
 from lgsens.linear import Matrix
+from lgsens.model import Model
+from lgsens.simulation._errors import throw_if_failed
+
+
+def as_system(model: Model | AbstractSystem) -> AbstractSystem:
+    if isinstance(model, Model):
+        return model.system()
+    if isinstance(model, AbstractSystem):
+        return model
+    raise ValueError(f"`model` must be a Model or an AbstractSystem, got {type(model).__name__}.")
+
+
+def initial_state(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) -> State:
+    """The consistent initial state of a model: q, v, v̇, λ, and a = v̇ (paper eqs. 18–19).
+
+    The reference configuration is assembled if a joint asks for it (a `DistanceJoint` with a length), velocities
+    are projected on those that the joints allow, accelerations and multipliers solve
+
+        [[M, Bᵀ], [B, 0]] [v̇; λ] = [−f + ad(v)ᵀMv; −Ḃ v].
+
+    Arguments:
+        model: the scene, or an `AbstractSystem`.
+        t0: initial time [s], shape ().
+        throw: raise if the mechanism cannot be assembled or has redundant constraints.
+
+    Differentiable, by the implicit function theorem. Raises `ValueError` as said under `throw`; inside
+    `jit`, JAX's runtime error with the same message.
+    """
+    return _found_state(_initial_jit, model, t0, throw)
+
+
+def equilibrium(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) -> State:
+    """The static equilibrium near the reference configuration: f(q, 0, t0) + Bᵀλ = 0, Φ(q) = 0.
+
+    Arguments:
+        model: the scene, or an `AbstractSystem`. Its velocities are ignored.
+        t0: the time at which time-dependent forces are taken [s], shape ().
+        throw: raise if no equilibrium is found.
+
+    Returns the state at rest there, to be used as `state0` of `simulate`. Differentiable, by the implicit
+    function theorem; where a body turns freely (a wheel on its hinge) both the state and its derivative are
+    those closest to the reference. Raises `SimulationError` if none is found; inside `jit`, JAX's runtime
+    error with the same message.
+    """
+    return _found_state(_equilibrium_jit, model, t0, throw)
+
+
+@eqx.filter_jit
+def _initial_jit(system, t0) -> Initial:
+    return _initial(system, t0)._replace(factors=None)
+
+
+@eqx.filter_jit
+def _equilibrium_jit(system, t0) -> Initial:
+    return _equilibrium(system, t0)
+
+
+def _found_state(find: Callable[..., Initial], model: Model | AbstractSystem, t0, throw: bool) -> State:
+    system, t0 = as_system(model), as_float(t0, (), "`t0`")
+    initial = find(system, t0)
+    if not throw:
+        return initial.state
+    details = {"violation": initial.violation, "jacobian": full_jacobian(system, initial.state.q, t0)}
+    return throw_if_failed(initial.state, initial.result, details, system.constraint_names)
 
 
 class Begin(NamedTuple):
@@ -30,7 +106,7 @@ def begin(
         jacobian, start = constraint_jacobian(system, state0.q, t0), Start(scheme.resumed(system, state0, t0))
         none = jnp.zeros((), jnp.int32)
         return Begin(start, jnp.zeros_like(state0.v), state0.v, none, system.constraint(state0.q, t0), jacobian)
-    initial = initial_state(system, t0) if initial is None else initial
+    initial = _initial(system, t0) if initial is None else initial
     usable = initial.result == RESULTS.successful
     start = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), scheme.start(system, initial, t0))
     jacobian = constraint_jacobian(system, initial.state.q, t0)

@@ -19,16 +19,10 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
 from lgsens.dynamics import RESULTS
-from lgsens.linear import many_runs
+from lgsens.linear import many_runs, tuned
 from lgsens.simulation import Saved, Trajectory, failures_as_nan
 
 AXIS = "designs"
-# The most lanes per device. What the lanes of a batch carry around their loops should stay in the caches of a core
-# (`benchmarks/sweep.py`: 256 tops of 2 kB, 24 to 32 quarter-cars of 80 kB are the fastest); elsewhere memory decides.
-CACHE = 2 * 2**20  # bytes
-LANES = 256
-LANES_ELSEWHERE = 8192
-FREE_SHARE = 0.5  # of the memory that is free, what a batch may take
 
 
 class Program(NamedTuple):
@@ -124,13 +118,13 @@ def compile_batch(
         return spread.lower(*shapes).compile()
 
     started = time.perf_counter()
-    lanes = LANES_ELSEWHERE
+    lanes = tuned.LANES_ELSEWHERE
     if devices[0].platform == "cpu":
-        lanes = min(LANES, max(1, CACHE // max(traced.carried, 1)))
+        lanes = min(tuned.LANES, max(1, tuned.LANE_CACHE // max(traced.carried, 1)))
     size = even(count, batch_size or lanes * len(devices), len(devices))
     program = compiled(size)
     if batch_size is None:
-        fits = _smallest(free_memory(devices) * FREE_SHARE / max(memory(program), 1.0))
+        fits = _smallest(free_memory(devices) * tuned.FREE_SHARE / max(memory(program), 1.0))
         if fits < 1.0 and size > len(devices):
             size = even(count, int(size * fits), len(devices))
             program = compiled(size)

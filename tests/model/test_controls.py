@@ -91,7 +91,6 @@ def test_every_way_to_solve_has_the_same_states(how):
     """Other integrators to their own order, another solver and merged parts to round-off of Newton."""
     integrators = {"stabilized": lg.GeneralizedAlpha(stabilized=True), "index reduced": lg.IndexReducedODE()}
     options = {"sparse": {"linear_solver": lg.BlockSparse()}, "merged": {"merge_fixed": True}}.get(how, {})
-    plain = how in options or not options
     found = jax.jit(lambda p: controlled(p, 100, integrators.get(how), **options))(GAINS)
     if how in integrators:
         np.testing.assert_allclose(found, exact(), rtol=2e-2, atol=1e-3)

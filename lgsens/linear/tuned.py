@@ -1,0 +1,69 @@
+"""Every constant that was tuned to a machine, and how it was measured.
+
+Measured on two cores of 3 GHz in double precision; times are ratios to those without, in one run. On another machine
+results are the same but for round-off, and times may have their optimum elsewhere: `benchmarks/chain.py`, `loops.py`,
+`sweep.py` and `methods.py` measure them. What XLA is told for results to be right is in `lgsens._xla`.
+"""
+
+# Block elimination or a dense LU (`_solvers`). Times in µs, from batches of LAPACK's LU and inverses, of products, and
+# of scatters in XLA. What a level costs whatever its size is from the quarter-car (94 unknowns) and a chain of 8 links
+# (88): a level and an LU of the rest take 0.79 and 0.83 of a dense LU in a run, 0.68 and 0.67 with the gradient.
+SMALLEST_SPARSE = 64  # unknowns; below, an LU takes less time than its dispatch could be shortened
+DENSE_SQUARE, DENSE_CUBE = 1e-3, 4e-5  # factors and a solution of n unknowns, by n² and n³
+LEVEL, CLUSTER, ENTRY = 8.0, 0.3, 1.5e-3  # of a level, of a cluster in it, of a number in its blocks
+FLOPS = 8e3  # in a µs
+
+# Levels in a loop (`_solvers`): the cost that it may add, and how many levels it has. A chain of 512 links compiles in
+# 0.73 of the time, with a gradient in 0.8, and runs no slower; with a limit of 1.1 its gradient takes 1.05 of the time.
+# A loop compiles about as long as two levels, and four of 64 links gain little.
+LOOP_COST = 1.06
+LOOP_LEVELS = 4
+
+# Matrices that are factorized once in a run are dense up to so many unknowns (`dynamics._matrices`): an LU of 0.3 ms is
+# less than blocks take to compile.
+DENSE_ONCE = 200
+
+# Rows up to which one right-hand side is solved by substitution in a loop of our own instead of LAPACK (`_dense`). XLA
+# makes one function of a loop around it, but not of one that calls LAPACK, and then each of its operations is begun by
+# itself: the gradient of the quarter-car (37 rows left) takes 0.92 of the time. Not measured beyond.
+SUBSTITUTED_ROWS = 64
+
+# Numbers in an inverse from which on it is rounded to single precision (`_factors`): a quarter of a megabyte, that of
+# 70 links. Steps of chains of 128 and 512 links then take 0.96 and 0.91 of the time; small ones gain only where
+# inverses of many runs share the caches of a core: batches of quarter-cars (3769 numbers) take 0.9 of the time,
+# those of tops (81) would take 1.05.
+ROUNDED_NUMBERS, ROUNDED_NUMBERS_IN_A_BATCH = 2**15, 2**10
+
+# Sums by place are gathered, not scattered, up to so many entries of the table, for each number and whatever their
+# count (`_sparse.added`). With a scatter in it XLA does not make one function of an iteration of Newton's method: a
+# step of the reduced quarter-car takes 25 instead of 13.5 µs, of the top 10.9 instead of 5.3.
+GATHERED_PER_NUMBER, GATHERED_ALWAYS = 8, 64
+
+# Chord iterations cost a tenth of a full one (`integrate._newton`): after so many, or where they contract by less, full
+# ones cost no more.
+CHORD_ITERATIONS, CHORD_CONTRACTION = 12, 0.3
+
+# Numbers and steps of a block of a sweep (`sensitivity._blocks`): factors of 128 kB, so that those of a batch of
+# trajectories stay in a core's cache too. With 2**17, alone as fast, 16 quarter-cars at once took 149 instead of 110 µs
+# per step and gradient.
+BLOCK_NUMBERS, BLOCK_STEPS = 2**14, 64
+
+# What value and gradient cost in simulations (`criteria.direct_or_adjoint`): the top with four parameters and five
+# criteria, by benchmarks/methods.py; the four-bar differs by less than the noise.
+TYPICAL_COSTS = {
+    "direct_fixed": 2.0,
+    "direct_per_parameter": 0.12,
+    "adjoint_fixed": 2.1,
+    "adjoint_per_criterion": 0.09,
+}
+FORWARD_VARIABLES = 40  # of `optimize.minimize`: their Jacobian costs little more than a gradient in reverse mode
+
+# The most lanes per device of a sweep (`sweeps._batches`). What they carry around their loops should stay in the caches
+# of a core (benchmarks/sweep.py: 256 tops of 2 kB, 24 to 32 quarter-cars of 80 kB are the fastest); elsewhere memory
+# decides.
+LANE_CACHE = 2 * 2**20  # bytes
+LANES, LANES_ELSEWHERE = 256, 8192
+FREE_SHARE = 0.5  # of the memory that is free, what a batch may take
+
+# Programs that `accuracy` keeps at a time: Linux gives a process 65,530 memory maps, a large scene takes thousands.
+PROGRAMS_TOGETHER = 8
