@@ -54,7 +54,6 @@ from lgsens.integrate import (
     EqualGrid,
     GeneralizedAlpha,
     IndexReducedODE,
-    UnevenGrid,
     Variation,
 )
 from lgsens.sensitivity import Parameters, direct_sweep
@@ -104,11 +103,7 @@ def error_estimate(trajectory: Trajectory, integrator: AbstractIntegrator = Gene
     scheme = integrator.scheme
     by_defects = isinstance(scheme, GeneralizedAlpha) and not scheme.stabilized and integrator.equal_steps
     found = (_estimated if by_defects else refined_error)(scheme, trajectory)
-    return (
-        found
-        if isinstance(valid, bool | np.bool_)
-        else jax.tree.map(lambda leaf: jnp.where(valid, leaf, jnp.nan), found)
-    )
+    return found if is_concrete(valid) else jax.tree.map(lambda leaf: jnp.where(valid, leaf, jnp.nan), found)
 
 
 def _is_by(integrator: AbstractIntegrator, trajectory: Trajectory):
@@ -131,7 +126,7 @@ def _is_by(integrator: AbstractIntegrator, trajectory: Trajectory):
     differ = xp.abs(left - right) > 1e3 * eps * xp.nanmax(xp.abs(a), initial=0.0)
     same = ~xp.any(taken[:, None] & differ)
     equal = xp.ptp(h) <= 1e-6 * h.mean() + 16 * eps * xp.abs(t).max()
-    return same & (equal | (not integrator.equal_steps))
+    return xp.asarray(same & (equal | (not integrator.equal_steps)))
 
 
 @eqx.filter_jit

@@ -1,6 +1,6 @@
 """The error of a run on any steps by any scheme, from a second run in twice as many.
 
-On sizes h_n = ε θ(n ε) of a smooth function θ what a scheme of order p computes has the errors ε^p e(t) + O(ε^{p+1}), so
+On sizes h_n = ε θ(n ε), θ smooth, what a scheme of order p computes has the errors ε^p e(t) + O(ε^{p+1}), so that
 
     true ≈ ψ + (ψ' − ψ) 2^p/(2^p − 1),     in a Lie group: q exp(w̃),  w = log(q⁻¹ q') 2^p/(2^p − 1)
 

@@ -107,10 +107,13 @@ def test_bad_input():
         ValueError, match=r"not one of GeneralizedAlpha\(\) in equal steps; give the one that it is from"
     ):
         error_estimate(trajectory)
-    with pytest.raises(ValueError, match="`integrator` must be a GeneralizedAlpha"):
-        error_estimate(trajectory, lg.IndexReducedODE())
-    with pytest.raises(ValueError, match="for index 3; leave `stabilized` out"):
-        error_estimate(trajectory, lg.GeneralizedAlpha(stabilized=True))
+    for other in (lg.IndexReducedODE(), lg.GeneralizedAlpha(stabilized=True), lg.GivenSteps(jnp.ones(5))):
+        with pytest.raises(ValueError, match="`integrator`: the trajectory is not one of"):
+            error_estimate(trajectory, other)
+    with pytest.raises(ValueError, match="`integrator` must be a GeneralizedAlpha or another"):
+        error_estimate(trajectory, "alpha")
+    with pytest.raises(ValueError, match="with `rtol` = 1e-06 diffrax chooses the steps"):
+        error_estimate(trajectory, lg.IndexReducedODE(rtol=1e-6))
     with pytest.raises(ValueError, match="at least 3 steps, got 2"):
         error_estimate(lg.simulate(build(P), t1=T1, num_steps=2))
 
@@ -126,6 +129,10 @@ def test_what_is_not_by_the_scheme_is_nan_under_jit():
     assert all(jnp.isnan(leaf).all() for leaf in jax.tree.leaves(traced(uneven)))
     with pytest.raises(ValueError, match="in equal steps"):
         error_estimate(uneven)
+    grid = lg.GivenSteps.of(uneven)
+    found = jax.jit(lambda run: error_estimate(run, grid))(uneven)
+    for traced, expected in zip(jax.tree.leaves(found), jax.tree.leaves(error_estimate(uneven, grid))):
+        np.testing.assert_allclose(traced, expected, rtol=1e-9)  # differences of values 1e3 times as large
 
 
 @pytest.mark.slow  # derivatives of a linearization, in both modes
