@@ -101,8 +101,10 @@ def error_estimate(trajectory: Trajectory, integrator: AbstractIntegrator = Gene
         valid,
     )
     scheme = integrator.scheme
-    by_defects = isinstance(scheme, GeneralizedAlpha) and not scheme.stabilized and integrator.equal_steps
-    found = (_estimated if by_defects else refined_error)(scheme, trajectory)
+    if isinstance(scheme, GeneralizedAlpha) and not scheme.stabilized and integrator.equal_steps:
+        found = _estimated(scheme, trajectory)
+    else:
+        found = refined_error(scheme, trajectory)
     return found if is_concrete(valid) else jax.tree.map(lambda leaf: jnp.where(valid, leaf, jnp.nan), found)
 
 

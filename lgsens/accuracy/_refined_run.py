@@ -37,7 +37,8 @@ def refined_error(scheme: AbstractScheme, trajectory: Trajectory) -> StateError:
     states, system, t = trajectory.states, trajectory.system, trajectory.t
     h = jnp.diff(t)
     filled = UnevenGrid.first(t[0], h).places().h  # the size before, where a step is empty
-    ratio = jnp.exp(0.5 * jnp.clip(jnp.gradient(jnp.log(filled)), -_MOST, _MOST))
+    trend = jnp.asarray(jnp.gradient(jnp.log(filled)))
+    ratio = jnp.exp(0.5 * jnp.clip(trend, -_MOST, _MOST))
     sizes = (h[:, None] * jnp.stack([1.0 / (1.0 + ratio), ratio / (1.0 + ratio)], axis=1)).reshape(-1)
     first = jax.tree.map(lambda leaf: leaf[0], states)
     own = (sizes[0] / h[0]) ** 2
