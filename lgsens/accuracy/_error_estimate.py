@@ -65,20 +65,21 @@ _LEAST_STEPS = 3
 def error_estimate(trajectory: Trajectory, integrator: AbstractIntegrator = GeneralizedAlpha()) -> StateError:
     """What is to be added to a trajectory to make it better by an order.
 
-        true ≈ v + e.v,  v̇ + e.vdot,  λ + e.lam,  q exp(ẽ.w);     −e solves L e = b, the scheme's defects its load
+        true ≈ v + e.v,  v̇ + e.vdot,  λ + e.lam,  q exp(ẽ.w)
 
     Arguments:
         trajectory: a motion in three steps or more. One that has its own estimate (`Richardson`) is answered with that.
         integrator: the one that it is from; this is checked as far as a and v̇ tell.
 
-    From this one run for `GeneralizedAlpha` of index 3 in equal steps. For every other integrator from a second run
+    Of `GeneralizedAlpha` of index 3 in equal steps from this one run: −e solves L e = b, the scheme's defects its load,
+    at the price of one more parameter in forward mode. Of every other integrator from a second run
     that divides each step in two, those that `AdaptiveSteps` chose too (`_refined_run.py`).
 
     The estimate is the leading term of the error in the motion, h^p times a function of time, p the order of the
     scheme, right up to O(h^{p+1}). It does not see round-off, Newton's tolerance, the trapezoidal rule of a criterion,
     forces that jump between two steps, a step with which the scheme does not resolve the motion at all, or the
-    transients (−ρ∞)ⁿ h² of v̇ and λ in the first steps; of `GivenSteps` and `AdaptiveSteps` it is what the sizes are, a
-    smooth function of time or not. The configuration and the velocity at t0 count as exact.
+    transients (−ρ∞)ⁿ h² of v̇ and λ in the first steps. Where sizes of steps are no smooth function of time, errors of
+    v̇ and λ of index 3 are told in part only. The configuration and the velocity at t0 count as exact.
 
     Returns a `StateError` on the times of the trajectory; `corrected` adds it. Raises `ValueError` for a trajectory by
     another integrator, in unequal steps where the integrator has equal ones, or with too few steps; under a trace the

@@ -119,7 +119,7 @@ def plot(table: Table, targets: Sequence[float] = (), *, by: str = "seconds", ti
     """
     check_by(by)
     found = {target: recommend(table, target, by=by).row for target in targets}
-    panels, chosen = {}, {target: {} for target, row in found.items() if row is not None}
+    panels, marked = {}, {target: {} for target, row in found.items() if row is not None}
     for quantity, member in (("Ψ", "value_error"), ("dΨ/dp", "gradient_error")):
         own, series = getattr(table.reference, member), {}
         places = {id(row): (1e3 * getattr(row, by), max(getattr(row, member), own)) for row in table if not row.failure}
@@ -127,7 +127,7 @@ def plot(table: Table, targets: Sequence[float] = (), *, by: str = "seconds", ti
             if not row.failure:
                 series.setdefault(row.setting.curve, []).append(places[id(row)])
         panels[quantity] = {name: plotting.WorkPrecision(*zip(*points)) for name, points in series.items()}
-        for target in chosen:
-            chosen[target][quantity] = places[id(found[target])]
+        for target in marked:
+            marked[target][quantity] = places[id(found[target])]
     cost = "time [ms]" if by == "seconds" else "processor time [ms]"
-    return plotting.work_precision_panels(panels, chosen, cost=cost, title=title)
+    return plotting.work_precision_panels(panels, marked, cost=cost, title=title)
