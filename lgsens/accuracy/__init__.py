@@ -9,8 +9,7 @@
 
 from lgsens.accuracy._error_estimate import corrected as corrected, error_estimate as error_estimate
 from lgsens.accuracy._measure import work_precision as work_precision
-from lgsens.accuracy._plot import plot as plot
-from lgsens.accuracy._recommend import Recommendation as Recommendation, recommend as recommend
+from lgsens.accuracy._recommend import Recommendation as Recommendation, plot as plot, recommend as recommend
 from lgsens.accuracy._reference import Reference as Reference
 from lgsens.accuracy._setting import Setting as Setting, grid as grid, ladder as ladder
 from lgsens.accuracy._table import Row as Row, Table as Table

@@ -28,12 +28,7 @@ _CHUNK = 64  # states that are evaluated together: one compilation for all numbe
 
 
 class Quality(NamedTuple):
-    """Attributes:
-    violation: max |Φ| over all times [m, –].
-    energy_drift: max |δ| over the largest of T and |∫P dt| [–]; None where nothing moves.
-    iterations: Newton's iterations per step, or steps tried per output interval; None where it is not said.
-    unfinished: steps that did not converge or were not reached.
-    """
+    """As in a `Row` of the table."""
 
     violation: float
     energy_drift: float | None

@@ -1,5 +1,7 @@
 """The error of one generalized-α run, from the run itself: its defects, propagated by its own linearization.
 
+(Other runs are estimated by `_refined_run.py`.)
+
 Let the true motion take the place of the numerical one in eqs. (24)–(29), with the algorithmic acceleration that
 eq. (29) gives a smooth motion, Δ = α_m − α_f,
 
@@ -44,63 +46,90 @@ import jax.numpy as jnp
 import numpy as np
 
 from lgsens._validate import is_concrete, require
+from lgsens.accuracy._refined_run import refined_error
 from lgsens.dynamics import AbstractSystem, State, full_jacobian, kkt_solve, split_velocity
-from lgsens.integrate import EqualGrid, GeneralizedAlpha, Variation
+from lgsens.integrate import (
+    AbstractAlpha,
+    AbstractIntegrator,
+    EqualGrid,
+    GeneralizedAlpha,
+    IndexReducedODE,
+    Variation,
+)
 from lgsens.sensitivity import Parameters, direct_sweep
 from lgsens.simulation import StateError, Trajectory
 
 _LEAST_STEPS = 3
 
 
-def error_estimate(trajectory: Trajectory, integrator: GeneralizedAlpha = GeneralizedAlpha()) -> StateError:
-    """What is to be added to a trajectory of generalized-α to make it better by an order, from this one run.
+def error_estimate(trajectory: Trajectory, integrator: AbstractIntegrator = GeneralizedAlpha()) -> StateError:
+    """What is to be added to a trajectory to make it better by an order.
 
-        true ≈ v + e.v,  v̇ + e.vdot,  λ + e.lam,  q exp(ẽ.w);     −e solves L e = b, the scheme's defects its load
+        true ≈ v + e.v,  v̇ + e.vdot,  λ + e.lam,  q exp(ẽ.w)
 
     Arguments:
-        trajectory: a motion by `GeneralizedAlpha` in three steps or more. One that has its own estimate
-            (`Richardson`) is answered with that.
-        integrator: the one that it is from; this is checked.
+        trajectory: a motion in three steps or more. One that has its own estimate (`Richardson`) is answered with that.
+        integrator: the one that it is from; this is checked as far as a and v̇ tell.
 
-    The estimate is the leading term of the error in the motion, h² times a function of time, right up to O(h³). It
-    does not see round-off, Newton's tolerance, the trapezoidal rule of a criterion, forces that jump between two steps,
-    a step with which the scheme does not resolve the motion at all, or the transients (−ρ∞)ⁿ h² of v̇ and λ in the first
-    steps. The configuration and the velocity at t0 count as exact.
+    Of `GeneralizedAlpha` of index 3 in equal steps from this one run: −e solves L e = b, the scheme's defects its load,
+    at the price of one more parameter in forward mode. Of every other integrator from a second run
+    that divides each step in two, those that `AdaptiveSteps` chose too (`_refined_run.py`).
+
+    The estimate is the leading term of the error in the motion, h^p times a function of time, p the order of the
+    scheme, right up to O(h^{p+1}). It does not see round-off, Newton's tolerance, the trapezoidal rule of a criterion,
+    forces that jump between two steps, a step with which the scheme does not resolve the motion at all, or the
+    transients (−ρ∞)ⁿ h² of v̇ and λ in the first steps. Where sizes of steps are no smooth function of time, errors of
+    v̇ and λ of index 3 are told in part only. The configuration and the velocity at t0 count as exact.
 
     Returns a `StateError` on the times of the trajectory; `corrected` adds it. Raises `ValueError` for a trajectory by
-    another integrator, in unequal steps, or with too few steps; under a trace the first two give NaN.
+    another integrator, in unequal steps where the integrator has equal ones, or with too few steps; under a trace the
+    first two give NaN. `IndexReducedODE` with `rtol` has steps inside those of the trajectory, which are not known.
     """
     if trajectory.error is not None:
         return trajectory.error
-    states, num_steps = trajectory.states, trajectory.t.shape[0] - 1
-    if not isinstance(integrator, GeneralizedAlpha):
-        raise ValueError(f"`integrator` must be a GeneralizedAlpha, got {integrator!r}.")
-    if integrator.stabilized:
-        raise ValueError("`integrator`: the estimate is for index 3; leave `stabilized` out, or halve the step to see.")
+    num_steps = trajectory.t.shape[0] - 1
+    if not isinstance(integrator, AbstractIntegrator):
+        raise ValueError(f"`integrator` must be a GeneralizedAlpha or another integrator, got {integrator!r}.")
+    integrator.scheme.require_steps()
     if num_steps < _LEAST_STEPS:
         raise ValueError(f"`error_estimate` needs at least {_LEAST_STEPS} steps, got {num_steps}.")
-    scheme, eps = integrator, float(jnp.finfo(states.v.dtype).eps)
-
-    def is_by_scheme(t, a, vdot):
-        """Whether the steps are equal and eq. (29) holds, up to round-off and to what is NaN after a failure."""
-        xp = np if isinstance(t, np.ndarray) else jnp
-        left = (1.0 - scheme.alpha_m) * a[1:] + scheme.alpha_m * a[:-1]
-        right = (1.0 - scheme.alpha_f) * vdot[1:] + scheme.alpha_f * vdot[:-1]
-        h = xp.diff(t)
-        equal = xp.ptp(h) <= 1e-6 * h.mean() + 16 * eps * xp.abs(t).max()
-        return equal & ~xp.any(xp.abs(left - right) > 1e3 * eps * xp.nanmax(xp.abs(a), initial=0.0))
-
-    given = jax.lax.stop_gradient((trajectory.t, states.a, states.vdot))
+    valid = _is_by(integrator, trajectory)
     require(
-        is_by_scheme,
-        f"`integrator`: the trajectory is not one of {integrator!r} in equal steps; give the one that it is from.",
-        *given,
+        bool,
+        f"`integrator`: the trajectory is not one of {integrator!r}"
+        f"{' in equal steps' if integrator.equal_steps else ''}; give the one that it is from (`GivenSteps.of` has the "
+        "steps of a trajectory).",
+        valid,
     )
-    found = _estimated(scheme, trajectory)
-    if is_concrete(*given):
-        return found
-    valid = is_by_scheme(*given)
-    return jax.tree.map(lambda leaf: jnp.where(valid, leaf, jnp.nan), found)
+    scheme = integrator.scheme
+    if isinstance(scheme, GeneralizedAlpha) and not scheme.stabilized and integrator.equal_steps:
+        found = _estimated(scheme, trajectory)
+    else:
+        found = refined_error(scheme, trajectory)
+    return found if is_concrete(valid) else jax.tree.map(lambda leaf: jnp.where(valid, leaf, jnp.nan), found)
+
+
+def _is_by(integrator: AbstractIntegrator, trajectory: Trajectory):
+    """Whether steps are equal if they should be, and eq. (29) or a = v̇ holds, up to round-off and what is NaN."""
+    t, a, vdot = jax.lax.stop_gradient((trajectory.t, trajectory.states.a, trajectory.states.vdot))
+    xp = jnp
+    if is_concrete(t, a, vdot):  # inside `jit` operations of JAX are traced even so
+        xp, (t, a, vdot) = np, map(np.asarray, (t, a, vdot))
+    scheme, eps, h = integrator.scheme, float(jnp.finfo(vdot.dtype).eps), xp.diff(t)
+    before = xp.concatenate([h[:1], h[:-1]])
+    taken = (h > 0.0) & (before > 0.0)
+    left, right = a[1:], a[1:]
+    if isinstance(scheme, AbstractAlpha):
+        ratio = xp.where(taken, h / xp.where(taken, before, 1.0), 1.0)
+        begun = scheme.resized(vdot[:-1], a[:-1], ratio[:, None])
+        left = (1.0 - scheme.alpha_m) * a[1:] + scheme.alpha_m * begun
+        right = (1.0 - scheme.alpha_f) * vdot[1:] + scheme.alpha_f * vdot[:-1]
+    elif isinstance(scheme, IndexReducedODE):
+        right = vdot[1:]
+    differ = xp.abs(left - right) > 1e3 * eps * xp.nanmax(xp.abs(a), initial=0.0)
+    same = ~xp.any(taken[:, None] & differ)
+    equal = xp.ptp(h) <= 1e-6 * h.mean() + 16 * eps * xp.abs(t).max()
+    return xp.asarray(same & (equal | (not integrator.equal_steps)))
 
 
 @eqx.filter_jit

@@ -86,23 +86,19 @@ def _measured(
     study: Study, settings: Sequence[Setting], reference: Reference, rounds: int, done: Callable[[], Any]
 ) -> list[Row]:
     """The rows of a few settings, that take turns."""
-    rows, programs = [], []
+    found = []
     for setting in settings:
-        row, program = _evaluated(study, setting, reference)
-        rows.append(row)
-        programs.append(program)
+        found.append(_evaluated(study, setting, reference))
         done()
-    running = [i for i, row in enumerate(rows) if not row.failure]
-    clock: dict[int, list[float]] = {i: [] for i in running}
-    processor: dict[int, list[float]] = {i: [] for i in running}
+    rows = [row for row, _ in found]
+    times = {i: [] for i, row in enumerate(rows) if not row.failure}
     for _ in range(rounds):
-        for i in running:
+        for i, taken in times.items():
             started, busy = time.perf_counter(), time.process_time()
-            programs[i]()
-            clock[i].append(time.perf_counter() - started)
-            processor[i].append(time.process_time() - busy)
-    for i in running:
-        seconds, cpu_seconds = statistics.median(clock[i]), statistics.median(processor[i])
+            found[i][1]()
+            taken.append((time.perf_counter() - started, time.process_time() - busy))
+    for i, taken in times.items():
+        seconds, cpu_seconds = map(statistics.median, zip(*taken))
         rows[i] = dataclasses.replace(rows[i], seconds=seconds, cpu_seconds=cpu_seconds)
     return rows
 
@@ -118,13 +114,11 @@ def _evaluated(study: Study, setting: Setting, reference: Reference) -> tuple[Ro
     value_error, gradient_error = found.relative(reference.evaluated)
     row = Row(
         setting,
-        failure=found.failure,
         compile_seconds=program.compile_seconds,
         temporary_bytes=program.temporary_bytes,
-        value=found.value,
-        gradient=found.gradient,
         value_error=value_error,
         gradient_error=gradient_error,
+        **found._asdict(),
         **about._asdict(),
     )
     return row, program

@@ -166,7 +166,7 @@ def converge(study: Study, coarsest: int, progress: Callable[[], Any] = lambda: 
             implicit = of_scheme(levels)
             if _agree(explicit, implicit):
                 break
-    return _chosen(explicit, implicit)
+    return _better_of(explicit, implicit)
 
 
 def _agree(one: _Route, other: _Route) -> bool:
@@ -176,7 +176,7 @@ def _agree(one: _Route, other: _Route) -> bool:
     return all(gap <= _AGREEMENT * (a + b) for gap, a, b in zip(gaps, one.error, other.error))
 
 
-def _chosen(one: _Route, other: _Route) -> Reference:
+def _better_of(one: _Route, other: _Route) -> Reference:
     best, second = sorted((one, other), key=lambda route: max(route.error))
     if not max(best.error) <= _TRUSTED:
         raise ValueError(

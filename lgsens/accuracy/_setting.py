@@ -75,7 +75,7 @@ class Setting(eqx.Module):
     @property
     def curve(self) -> str:
         """The family, or what the integrator and the options are without their numbers."""
-        return self.family or self._described(kind(self.integrator))
+        return self.family or self._described(described(self.integrator, numbers=False))
 
     def _described(self, integrator: str) -> str:
         options = [f"{name}={value!r}" for name, value in (*self.model, *self.options)]
@@ -84,19 +84,8 @@ class Setting(eqx.Module):
 
     def trajectory(self, build: Build, p: Any, *, t0=0.0, t1, throw: bool = True) -> Trajectory:
         """The motion of build(p), with `num_steps` steps; arguments as in `evaluate`."""
-        return self._run(build, p, self.num_steps, t0, t1, throw)
-
-    def _run(self, build: Build, p, num_steps: int, t0, t1, throw: bool) -> Trajectory:
-        model = build(p, **dict(self.model))
-        return simulate(
-            model,
-            t0=t0,
-            t1=t1,
-            num_steps=num_steps,
-            integrator=self.integrator,
-            throw=throw,
-            **dict(self.options),
-        )
+        options = dict(self.options) | {"integrator": self.integrator, "throw": throw}
+        return simulate(build(p, **dict(self.model)), t0=t0, t1=t1, num_steps=self.num_steps, **options)
 
     def evaluate(self, fn: Function, build: Build, p: Any, *, t0=0.0, t1, throw: bool = True) -> Any:
         """Ψ of the parameters p with this setting, to be differentiated as usual.
@@ -115,7 +104,8 @@ class Setting(eqx.Module):
         found = []
 
         def value(num_steps: int):
-            found.append(self._run(build, p, num_steps, t0, t1, throw))
+            setting = dataclasses.replace(self, num_steps=num_steps)
+            found.append(setting.trajectory(build, p, t0=t0, t1=t1, throw=throw))
             return fn(found[-1], p) if isinstance(fn, Criterion) else fn(found[-1])
 
         if self.runs == 1:
@@ -125,32 +115,17 @@ class Setting(eqx.Module):
         return extrapolated, eqx.tree_at(lambda run: run.result, found[-1], result)
 
 
-def _changes(value: Any) -> list[tuple[str, Any]]:
-    """The fields of a dataclass that are not the default."""
-    return [
-        (field.name, getattr(value, field.name))
-        for field in dataclasses.fields(value)
-        if getattr(value, field.name) != field.default
-    ]
-
-
-def _is_plain(value: Any) -> bool:
-    return not dataclasses.is_dataclass(value) or isinstance(value, type)
-
-
-def described(value: Any) -> str:
-    """A value as it is written in Python, defaults left out."""
-    if _is_plain(value):
+def described(value: Any, numbers: bool = True) -> str:
+    """A value as it is written in Python, defaults left out; without numbers: the types in it."""
+    if not dataclasses.is_dataclass(value) or isinstance(value, type):
         return repr(value)
-    return f"{type(value).__name__}({', '.join(f'{name}={described(given)}' for name, given in _changes(value))})"
-
-
-def kind(value: Any) -> str:
-    """`described` without numbers."""
-    if _is_plain(value):
-        return repr(value)
-    inside = [kind(given) for _, given in _changes(value) if not _is_plain(given)]
-    return type(value).__name__ + (f"({', '.join(inside)})" if inside else "")
+    fields = ((field, getattr(value, field.name)) for field in dataclasses.fields(value))
+    given = {field.name: own for field, own in fields if own != field.default}
+    name = type(value).__name__
+    if numbers:
+        return f"{name}({', '.join(f'{key}={described(own)}' for key, own in given.items())})"
+    inside = [described(own, False) for own in given.values() if dataclasses.is_dataclass(own)]
+    return f"{name}({', '.join(inside)})" if inside else name
 
 
 def grid(num_steps: Any, *integrators: Any, **options: Any) -> tuple[Setting, ...]:

@@ -98,18 +98,8 @@ class Table:
 
     def __str__(self) -> str:
         width = max([len(row.setting.label) for row in self.rows], default=0)
-        heads = (
-            "steps",
-            "time [ms]",
-            "CPU [ms]",
-            "error of Ψ",
-            "of dΨ/dp",
-            "|Φ|",
-            "energy",
-            "iter.",
-            "memory",
-            "compile",
-        )
+        quality = "error of Ψ", "of dΨ/dp", "|Φ|", "energy", "iter."
+        heads = "steps", "time [ms]", "CPU [ms]", *quality, "memory", "compile"
         lines = [f"{'':{width}}" + "".join(f"{head:>11}" for head in heads)]
         for row in self.rows:
             start = f"{row.setting.label:{width}}{row.setting.num_steps:>11}"
@@ -143,9 +133,7 @@ class Table:
 
     def document(self) -> dict[str, Any]:
         """Everything, as JSON takes it; numbers that are not finite are None."""
-        reference = {
-            field.name: _plain(getattr(self.reference, field.name)) for field in dataclasses.fields(self.reference)
-        }
+        reference = {name: _plain(value) for name, value in vars(self.reference).items()}
         return {
             "rounds": self.rounds,
             "norm": "errors of the gradient: max |Δ dΨ/dp_i s_i| over max |dΨ/dp_i s_i|, s the scale of p",
@@ -154,13 +142,9 @@ class Table:
         }
 
     def _entry(self, row: Row) -> dict[str, Any]:
-        fields = [field.name for field in dataclasses.fields(row) if field.name != "setting"]
         setting = {"setting": row.setting.label, "family": row.setting.curve, "num_steps": row.setting.num_steps}
-        return (
-            setting
-            | {name: _plain(getattr(row, name)) for name in fields}
-            | {"below_reference": self.is_below_reference(row)}
-        )
+        numbers = {name: _plain(value) for name, value in vars(row).items() if name != "setting"}
+        return setting | numbers | {"below_reference": self.is_below_reference(row)}
 
 
 def _short(text: str, length: int = 90) -> str:

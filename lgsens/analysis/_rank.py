@@ -3,7 +3,6 @@
 import dataclasses
 
 import equinox as eqx
-import jax
 import numpy as np
 
 from lgsens._validate import as_float
@@ -86,13 +85,12 @@ def constraint_rank(model: Model | AbstractSystem, *, t0=0.0) -> ConstraintRank:
     t = as_float(t0, (), "`t0`")
     q, _ = _assembled(system, t)
     _, jacobian = _evaluated(system, q, t)
-    first = jacobian
     reference_rank = rank = left_null_space(jacobian)[1]
     for direction in np.random.default_rng(0).normal(size=(_DIRECTIONS, jacobian.shape[1])):
         moved = _moved(system, q, t, direction)
         if moved is not None and left_null_space(moved)[1] > rank:
             jacobian, rank = moved, left_null_space(moved)[1]
-    m, k = first.shape
+    m, k = jacobian.shape
     names = tuple(redundant_names(jacobian, system.constraint_names))
     return ConstraintRank(k - system.num_states, m, rank, reference_rank, names)
 
@@ -100,7 +98,7 @@ def constraint_rank(model: Model | AbstractSystem, *, t0=0.0) -> ConstraintRank:
 def _moved(system: AbstractSystem, q, t, direction):
     """J in a configuration near q along a direction, if there is one."""
     scale = np.asarray(system.coordinate_scale())
-    violation, jacobian = _evaluated(system, q, t)
+    _, jacobian = _evaluated(system, q, t)
     # the part of the direction that the constraints allow, in comparable coordinates
     rows = jacobian * scale
     x = direction - np.linalg.lstsq(rows, rows @ direction, rcond=None)[0]
@@ -119,14 +117,7 @@ def _moved(system: AbstractSystem, q, t, direction):
     return None
 
 
-@eqx.filter_jit
-def _assembled(system, t):
-    return assemble(system, t)
-
-
-@eqx.filter_jit
-def _value_and_jacobian(system, q, t):
-    return system.constraint(q, t), full_jacobian(system, q, t)
+_assembled = eqx.filter_jit(assemble)
 
 
 def _evaluated(system, q, t) -> tuple[np.ndarray, np.ndarray]:
@@ -136,9 +127,10 @@ def _evaluated(system, q, t) -> tuple[np.ndarray, np.ndarray]:
 
 
 @eqx.filter_jit
-def _retract(system, q, x):
-    return system.group.retract(q, x)
+def _value_and_jacobian(system, q, t):
+    return system.constraint(q, t), full_jacobian(system, q, t)
 
 
+@eqx.filter_jit
 def _retracted(system, q, x):
-    return _retract(system, q, jax.numpy.asarray(x))
+    return system.group.retract(q, x)

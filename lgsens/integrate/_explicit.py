@@ -146,11 +146,19 @@ class IndexReducedODE(AbstractScheme):
             )
 
     @property
-    def coefficients(self) -> Coefficients:
-        """Those of the solver."""
+    def _solver(self) -> Any:
         import diffrax  # takes its time to import
 
-        tableau = _tableau(diffrax.Tsit5() if self.solver is None else self.solver)
+        return diffrax.Tsit5() if self.solver is None else self.solver
+
+    @property
+    def convergence_order(self):
+        return self._solver.order(None)
+
+    @property
+    def coefficients(self) -> Coefficients:
+        """Those of the solver."""
+        tableau = _tableau(self._solver)
         used = max(np.flatnonzero(tableau.b_sol)) + 1
         a = np.zeros((used, used))
         for i, row in enumerate(tableau.a_lower[: used - 1]):

@@ -157,6 +157,11 @@ class AbstractScheme(AbstractIntegrator):
         """Raise `ValueError` where the steps are not those of a grid."""
         return
 
+    @property
+    def convergence_order(self) -> int:
+        """p: errors of states are of the order of h^p."""
+        return 2
+
     @abc.abstractmethod
     def equations(self, system: AbstractSystem, node: Node, previous: State, state: State) -> State:
         """E: the configuration that the step predicts as `q`, what is left of all other equations elsewhere.

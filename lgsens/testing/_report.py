@@ -95,6 +95,6 @@ def worst(checks: Iterable[Check]) -> tuple[Check, ...]:
 
 
 def _excess(check: Check) -> float:
-    if not check.passed:
-        return float("inf") if check.tolerance <= 0 or check.error != check.error else check.error / check.tolerance
-    return check.error / check.tolerance if check.tolerance > 0 else 0.0
+    if check.tolerance > 0 and check.error == check.error:
+        return check.error / check.tolerance
+    return 0.0 if check.passed else float("inf")

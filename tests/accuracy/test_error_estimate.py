@@ -13,7 +13,7 @@ from oscillator import T1, P, V, build
 
 import lgsens as lg
 from lgsens.accuracy import corrected, error_estimate
-from lgsens.examples import PROBLEMS
+from lgsens.examples import PROBLEMS, spinning_top
 
 DATA = Path(__file__).parents[1] / "data"
 
@@ -96,6 +96,41 @@ def test_the_four_bar():
     check("four_bar_spring", 0.5, 200, 0.3)
 
 
+NUM_STEPS = 24
+FRACTIONS = 1.0 + 0.3 * np.sin(np.arange(NUM_STEPS) / 4.0)
+DAMPED = lg.GeneralizedAlpha(0.5, tolerance=1e-12)
+STABILIZED = lg.GeneralizedAlpha(0.5, stabilized=True, tolerance=1e-12)
+OTHERS = {
+    "given": lg.GivenSteps(FRACTIONS, DAMPED),
+    "stabilized": STABILIZED,
+    "given, stabilized": lg.GivenSteps(FRACTIONS, STABILIZED),
+    "adaptive": lg.AdaptiveSteps(DAMPED, tolerance=1e-5, longest=0.1),
+    "order 3": lg.IndexReducedODE(diffrax.Bosh3()),
+    "given, order 5": lg.GivenSteps(FRACTIONS, lg.IndexReducedODE()),
+}
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n == "given" else pytest.mark.slow) for n in OTHERS])
+def test_other_steps_and_schemes(name):
+    """By a second run that divides each step: what is left is O(h) of the error, from explicit steps of order 8.
+
+    v̇ and λ of the second half: transients of ρ∞ = 0.5 last some steps more.
+    """
+    integrator = OTHERS[name]
+    run = lg.simulate(spinning_top(0.7, length=1.0), t1=0.12, num_steps=NUM_STEPS, integrator=integrator)
+    taken = np.concatenate([[True], np.diff(run.t) > 0.0])
+    order_8 = lg.GivenSteps.of(run, lg.IndexReducedODE(diffrax.Dopri8()))
+    exact = lg.simulate(run.system, t1=0.12, num_steps=order_8.num_steps, integrator=order_8).states
+    estimate, group = error_estimate(run, integrator), run.system.group
+    q = jax.tree.map(lambda leaf: leaf[taken], run.states.q)
+    true = {"w": jax.vmap(lambda q, other: group.log(group.compose(group.inverse(q), other)))(q, exact.q)}
+    true |= {key: getattr(exact, key) - getattr(run.states, key)[taken] for key in ("v", "vdot", "lam")}
+    for key, error in true.items():
+        left = np.abs(getattr(estimate, key)[taken] - error)
+        start, part = (len(error) // 2, 0.2) if key in ("vdot", "lam") else (0, 0.1)
+        assert left[start:].max() < part * np.abs(error[start:]).max(), key
+
+
 def test_an_estimate_that_is_there_is_kept():
     trajectory = lg.simulate(build(P), t1=T1, num_steps=5, integrator=lg.Richardson())
     assert error_estimate(trajectory) is trajectory.error
@@ -107,10 +142,13 @@ def test_bad_input():
         ValueError, match=r"not one of GeneralizedAlpha\(\) in equal steps; give the one that it is from"
     ):
         error_estimate(trajectory)
-    with pytest.raises(ValueError, match="`integrator` must be a GeneralizedAlpha"):
-        error_estimate(trajectory, lg.IndexReducedODE())
-    with pytest.raises(ValueError, match="for index 3; leave `stabilized` out"):
-        error_estimate(trajectory, lg.GeneralizedAlpha(stabilized=True))
+    for other in (lg.IndexReducedODE(), lg.GeneralizedAlpha(stabilized=True), lg.GivenSteps(jnp.ones(5))):
+        with pytest.raises(ValueError, match="`integrator`: the trajectory is not one of"):
+            error_estimate(trajectory, other)
+    with pytest.raises(ValueError, match="`integrator` must be a GeneralizedAlpha or another"):
+        error_estimate(trajectory, "alpha")
+    with pytest.raises(ValueError, match="with `rtol` = 1e-06 diffrax chooses the steps"):
+        error_estimate(trajectory, lg.IndexReducedODE(rtol=1e-6))
     with pytest.raises(ValueError, match="at least 3 steps, got 2"):
         error_estimate(lg.simulate(build(P), t1=T1, num_steps=2))
 
@@ -126,6 +164,10 @@ def test_what_is_not_by_the_scheme_is_nan_under_jit():
     assert all(jnp.isnan(leaf).all() for leaf in jax.tree.leaves(traced(uneven)))
     with pytest.raises(ValueError, match="in equal steps"):
         error_estimate(uneven)
+    grid = lg.GivenSteps.of(uneven)
+    found = jax.jit(lambda run: error_estimate(run, grid))(uneven)
+    for traced, expected in zip(jax.tree.leaves(found), jax.tree.leaves(error_estimate(uneven, grid))):
+        np.testing.assert_allclose(traced, expected, rtol=1e-9)  # differences of values 1e3 times as large
 
 
 @pytest.mark.slow  # derivatives of a linearization, in both modes
