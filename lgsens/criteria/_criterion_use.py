@@ -33,18 +33,6 @@ class Use(NamedTuple):
 
         return cls(dependence(criterion.rate), dependence(criterion.final))
 
-    @property
-    def in_integrand(self) -> bool:
-        return any(self.integrand)
-
-    @property
-    def in_terminal(self) -> bool:
-        return any(self.terminal)
-
-    @property
-    def multipliers(self) -> bool:
-        return self.integrand.multipliers or self.terminal.multipliers
-
 
 def _used_inputs(function, *arguments) -> list[bool]:
     """Which arguments the result of a function depends on, by the operations that lead to it."""
@@ -71,7 +59,7 @@ def checked_for(method: Any, uses: dict[str, Use]) -> None:
                 f"{name}: its integrand uses accelerations, which eqs. (39)–(43) cannot treat as they are: "
                 f"{_ALTERNATIVES}, 'derivatives' and 'first_order' too."
             )
-        if method.accelerations != "state" and use.in_terminal:
+        if method.accelerations != "state" and any(use.terminal):
             what = "accelerations" if use.terminal.accelerations else "multipliers"
             raise ValueError(
                 f"{name}: its terminal term uses {what}, which ContinuousAdjoint({method.accelerations!r}) cannot "

@@ -219,7 +219,7 @@ def _differentiate_jit(criteria, names, build, start, p, t0, t1, num_steps, inte
     else:
         found = _through_the_trajectory(task, flat, method)
     result, note = found.result, ""
-    of_multipliers = [name for name, use in zip(names, uses) if use.multipliers]
+    of_multipliers = [name for name, use in zip(names, uses) if use.integrand.multipliers or use.terminal.multipliers]
     if of_multipliers and found.details is not None:
         note = f"{' and '.join(of_multipliers)}: multipliers are used."
         # a given state0 has not been asked
@@ -281,7 +281,7 @@ def _continuous_adjoint(task: _Task, p, method: ContinuousAdjoint, uses: list[Us
         Parameters(system, grid),
         _stacked(task.criteria, task.unravel),
         p,
-        uses=(any(use.in_integrand for use in uses), any(use.in_terminal for use in uses)),
+        uses=tuple(any(map(any, each)) for each in zip(*uses)),
     )
     of_q = jax.vmap(lambda w: configuration_cotangent(system.group, q0, w))(cotangents.w0)
     (of_initial,) = jax.vmap(pull_back)((cotangents.system, of_q, cotangents.v0))
