@@ -36,6 +36,17 @@ LONGEST = 240.0  # s of one search
 DATA_SETS = 5
 
 
+class LineSearchGaussNewton(optimistix.AbstractGaussNewton):
+    """Gauss–Newton with backtracking, of optimistix's parts: what `least_squares` had before `optimistix.Dogleg`."""
+
+    rtol: float = 1e-5
+    atol: float = 1e-5
+    norm: Callable = optimistix.max_norm
+    descent: optimistix.NewtonDescent = optimistix.NewtonDescent()
+    search: optimistix.BacktrackingArmijo = optimistix.BacktrackingArmijo()
+    verbose: Callable = lambda **_: None
+
+
 class TimeIsUp(Exception):
     """`LONGEST` has passed."""
 
@@ -95,6 +106,7 @@ def by_scipy(counted: Counted, method: str, chosen: np.ndarray, kind: str) -> tu
         options |= {"gtol": 1e-5, "xtol": 1e-8, "barrier_tol": 1e-6}
     extra = {"hess": scipy.optimize.BFGS()} if method == "trust-constr" else {}
     seconds: list[float] = []
+    evaluating: list[float] = []
     while not seconds or (len(seconds) < 5 and sum(seconds) < 10.0):
         counted.restart()
         try:
@@ -106,10 +118,11 @@ def by_scipy(counted: Counted, method: str, chosen: np.ndarray, kind: str) -> tu
         except TimeIsUp:
             z, message = None, f"ended after {LONGEST:.0f} s"
         seconds.append(time.perf_counter() - counted.begun)
+        evaluating.append(counted.evaluating)
     row = dict(counted.asked) if kind == "jacobians" else {"simulations": counted.asked["simulations"]}
     if kind == "gradients":
         row["gradients"] = counted.asked["jacobians"]
-    row |= {"seconds": float(np.median(seconds)), "evaluating": counted.evaluating, "message": message}
+    row |= {"seconds": float(np.median(seconds)), "evaluating": float(np.median(evaluating)), "message": message}
     trace = [(f, g, {"simulations": s, kind: j}) for f, g, s, j in counted.trace]
     return row, z, trace
 
@@ -170,7 +183,7 @@ def identification() -> dict:
     data = [test.measure(jax.random.key(seed), test.truth) for seed in range(DATA_SETS)]
     logs = {name: Log() if name in ("m3", "m4", "k", "cd") else None for name in test.guess}
     solvers = {
-        "LineSearchGaussNewton": None,
+        "LineSearchGaussNewton": LineSearchGaussNewton(),
         "GaussNewton": optimistix.GaussNewton(1e-5, 1e-5),
         "LevenbergMarquardt": optimistix.LevenbergMarquardt(1e-5, 1e-5),
         "Dogleg": optimistix.Dogleg(1e-5, 1e-5),
@@ -193,7 +206,7 @@ def identification() -> dict:
         rows[name] = {
             "steps": sum(int(each.steps) for each in found),
             "seconds": float(np.median(seconds)),
-            "objective": sum(float(np.sum(each.residual**2)) for each in found) / 2,
+            "objective": sum(float(np.sum(each.residual**2)) for each in found if each.converged) / 2,
             "message": f"{sum(bool(each.converged) for each in found)} of {DATA_SETS} converged",
         }
         print(name, rows[name], flush=True)
@@ -262,12 +275,12 @@ def main() -> None:
     chosen = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     path = chosen.out / "optimizers.json"
-    kept = json.loads(path.read_text(encoding="utf-8"))["problems"] if path.exists() else {}
+    kept = lambda: json.loads(path.read_text(encoding="utf-8"))["problems"] if path.exists() else {}
     for name in chosen.problems:
-        kept[name] = PROBLEMS[name]() | {"steps": STEPS} | benchmark.environment()
-        ordered = {name: kept[name] for name in PROBLEMS if name in kept}
-        benchmark.write(path, {"problems": ordered})
-    print(table(ordered))
+        record = {name: PROBLEMS[name]() | benchmark.environment()}
+        benchmark.write(path, {"steps": STEPS, "problems": kept() | record})
+    found = kept()
+    print(table({name: found[name] for name in PROBLEMS if name in found}))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """A problem as `scipy.optimize` wants it: functions of a flat vector of 64-bit floats."""
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -116,14 +117,9 @@ def scipy_least_squares(
 def _remembered(function: Callable) -> Callable[[np.ndarray], PyTree]:
     """`function`, compiled, of NumPy arrays; what it was for the last argument is not computed again."""
     compiled = jax.jit(function)
-    last: dict[bytes, PyTree] = {}
 
-    def call(z):
-        key = np.ascontiguousarray(z, np.float64).tobytes()
-        if key not in last:
-            found = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), compiled(np.asarray(z)))
-            last.clear()
-            last[key] = found
-        return last[key]
+    @functools.lru_cache(maxsize=1)
+    def of_bytes(z: bytes):
+        return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), compiled(np.frombuffer(z)))
 
-    return call
+    return lambda z: of_bytes(np.asarray(z, np.float64).tobytes())

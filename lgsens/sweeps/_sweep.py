@@ -181,10 +181,8 @@ def _as_array(path, leaf) -> np.ndarray:
 
 def _agreed(store: Store) -> Store:
     """The store of the first process, in all of them; only the first one's may be a folder."""
-    everywhere = Store(*multihost_utils.broadcast_one_to_all(tuple(store)))
-    if jax.process_index() == 0:
-        return store
-    return Store(*jax.tree.map(np.array, tuple(everywhere)))
+    everywhere = multihost_utils.broadcast_one_to_all(tuple(store))
+    return store if jax.process_index() == 0 else Store(*jax.tree.map(np.array, everywhere))
 
 
 def _check_again(folder, row: int, store: Store, values: list[np.ndarray], ok: bool) -> None:
