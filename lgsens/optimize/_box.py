@@ -19,17 +19,15 @@ class Box(NamedTuple):
     upper: Float[Array, " n"]
     log: Bool[Array, " n"]
 
-    def _ends(self):
-        safe = lambda bound: jnp.log(jnp.where(self.log, bound, 1.0))
-        return jnp.where(self.log, safe(self.lower), self.lower), jnp.where(self.log, safe(self.upper), self.upper)
+    def _on_scale(self, x):
+        return jnp.where(self.log, jnp.log(jnp.where(self.log, x, 1.0)), x)
 
     def scaled(self, x):
-        lower, upper = self._ends()
-        return (jnp.where(self.log, jnp.log(jnp.where(self.log, x, 1.0)), x) - lower) / (upper - lower)
+        lower, upper = self._on_scale(self.lower), self._on_scale(self.upper)
+        return (self._on_scale(x) - lower) / (upper - lower)
 
     def value(self, z):
-        lower, upper = self._ends()
-        y = (1.0 - z) * lower + z * upper  # exact at both ends
+        y = (1.0 - z) * self._on_scale(self.lower) + z * self._on_scale(self.upper)  # exact at both ends
         # The clip keeps round-off of the logarithm from leaving the bounds.
         return jnp.clip(jnp.where(self.log, jnp.exp(jnp.where(self.log, y, 0.0)), y), self.lower, self.upper)
 
