@@ -70,7 +70,7 @@ def in_folder(folder: Path, designs: PyTree, shapes: PyTree, count: int) -> Stor
             )
     files = [entry["file"] for entry in wanted["values"]] + ["ok.npy", "done.npy"]
     *values, ok, done = (open_memmap(folder / name, mode="r+") for name in files)
-    return Store(values, ok, done)
+    return Store([*values], ok, done)
 
 
 def _description(designs: PyTree, shapes: PyTree, count: int) -> dict[str, Any]:
