@@ -195,9 +195,10 @@ def identification() -> dict:
         rows[name] = {
             "steps": sum(int(each.steps) for each in found),
             "seconds": float(np.median(seconds)),
-            "objective": sum(float(np.sum(each.residual**2)) for each in found if each.converged) / 2,
             "message": f"{sum(bool(each.converged) for each in found)} of {DATA_SETS} converged",
         }
+        if all(each.converged for each in found):
+            rows[name]["objective"] = sum(float(np.sum(each.residual**2)) for each in found) / 2
         print(name, rows[name], flush=True)
         jax.clear_caches()
     compiled = jax.jit(lambda p, readings: test.residual(p, readings))  # each problem compiles its own
