@@ -227,8 +227,8 @@ def test_batches_fit_into_caches():
         turn = lambda carry, add: (carry + inner(add), None)
         return jnp.sum(jax.lax.scan(turn, x * jnp.ones(12_500), jnp.ones(1000))[0])
 
-    carried = _batches.trace(fn, np.ones(1)).carried
-    assert 100_000 < carried < 100_100
+    bytes_per_turn = _batches.trace(fn, np.ones(1)).bytes_per_turn
+    assert 100_000 < bytes_per_turn < 100_100
     found = lg.sweep(fn, np.ones(30), progress=False)
     assert found.batch_size == 15  # two batches of at most 2 MiB/100 kB = 20
 

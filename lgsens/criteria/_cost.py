@@ -48,38 +48,30 @@ def measure_costs(
     leaves = jax.tree.leaves(criteria, is_leaf=lambda leaf: isinstance(leaf, Criterion))
     flat, unravel = ravel_pytree(p)
 
-    def gradient(method, criteria, build, p):
-        return lambda: differentiate(criteria, build, p, method=method, **settings).gradient
-
-    def with_first(first):
-        return unravel(flat.at[0].set(first))
-
-    def of_first(function):
-        return None if function is None else lambda s, first: function(s, with_first(first))
-
+    gradient = lambda method, *of: lambda: differentiate(*of, method=method, **settings).gradient
+    with_first = lambda first: unravel(flat.at[0].set(first))
+    of_first = lambda function: function and (lambda s, first: function(s, with_first(first)))
     one = tuple(Criterion(of_first(c.integrand), of_first(c.terminal)) for c in leaves)
-    build_one = lambda first: build(with_first(first))
-
     forward = jax.jit(lambda p: simulate(build(p), throw=False, **settings).states)
     direct, adjoint = DirectDifferentiation(), AdjointVariable()
     unit, *times = median_seconds(
         lambda: forward(p),
         gradient(direct, criteria, build, p),
-        gradient(direct, one, build_one, flat[0]),
+        gradient(direct, one, lambda first: build(with_first(first)), flat[0]),
         gradient(adjoint, criteria, build, p),
         gradient(adjoint, leaves[0], build, p),
         repeats=repeats,
     )
     direct_all, direct_one, adjoint_all, adjoint_one = (seconds / unit for seconds in times)
-    per_parameter = _share(direct_all - direct_one, flat.size - 1, TYPICAL.direct_per_parameter)
-    per_criterion = _share(adjoint_all - adjoint_one, len(leaves) - 1, TYPICAL.adjoint_per_criterion)
+
+    def share(difference: float, others: int, typical: float) -> float:
+        return difference / others if others > 0 and difference > 0.0 else typical
+
+    per_parameter = share(direct_all - direct_one, flat.size - 1, TYPICAL.direct_per_parameter)
+    per_criterion = share(adjoint_all - adjoint_one, len(leaves) - 1, TYPICAL.adjoint_per_criterion)
     return Costs(
         direct_fixed=direct_all - per_parameter * flat.size,
         direct_per_parameter=per_parameter,
         adjoint_fixed=adjoint_all - per_criterion * len(leaves),
         adjoint_per_criterion=per_criterion,
     )
-
-
-def _share(difference: float, others: int, typical: float) -> float:
-    return difference / others if others > 0 and difference > 0.0 else typical

@@ -111,37 +111,29 @@ def differentiate(
             "start needs four points. AdjointVariable() has no such limit."
         )
     names = tuple(f"Criterion {jax.tree_util.keystr(path)}".strip() for path, _ in paths)
+    task = _Task(leaves, build, state0, None, integrator, num_steps, t0, t1)
+    details, labels, note = None, (), ""
     if isinstance(method, IndexReduced):
-        value, gradient = _index_reduced(leaves, build, state0, p, t0, t1, method)
-        result, details, labels, note = jnp.zeros((), jnp.int32), None, (), ""
+        value, gradient = _index_reduced(task, p, method)
+        result = jnp.zeros((), jnp.int32)
     else:
-        value, gradient, result, details, labels, note = _differentiate_jit(
-            leaves, names, build, state0, p, t0, t1, num_steps, integrator, method
-        )
-    found = Sensitivities(
-        value=jax.tree.unflatten(structure, value),
-        gradient=jax.tree.unflatten(structure, gradient),
-        method=method,
-        result=result,
-    )
-    if not throw or details is None:
-        return found
-    value, gradient = throw_if_failed(found[:2], result, details, labels, note)
-    return found._replace(value=value, gradient=gradient)
+        value, gradient, result, details, labels, note = _differentiate_jit(task, p, names, method)
+    values, gradients = (jax.tree.unflatten(structure, leaves) for leaves in (value, gradient))
+    if throw and details is not None:
+        values, gradients = throw_if_failed((values, gradients), result, details, labels, note)
+    return Sensitivities(values, gradients, method, result)
 
 
-def _index_reduced(criteria, build, start, p, t0, t1, method: IndexReduced):
+def _index_reduced(task: "_Task", p, method: IndexReduced):
     from lgsens.criteria._index_reduced import integrate_index_reduced  # diffrax takes its time to import
 
-    if start is not None:
+    if task.start is not None:
         raise ValueError("IndexReduced starts from the consistent initial state of the model; leave `state0` out.")
     flat, unravel = ravel_pytree(p)
-    rate, final, system = _functions(
-        criteria, build, jax.tree.structure(p), tuple(leaf.shape for leaf in jax.tree.leaves(p))
-    )
-    found = integrate_index_reduced(
-        rate, final, system, flat, t0, t1, rtol=method.rtol, atol=method.atol, breaks=method.breaks
-    )
+    shapes = tuple(leaf.shape for leaf in jax.tree.leaves(p))
+    rate, final, system = _functions(task.criteria, task.build, jax.tree.structure(p), shapes)
+    settings = {"rtol": method.rtol, "atol": method.atol, "breaks": method.breaks}
+    found = integrate_index_reduced(rate, final, system, flat, task.t0, task.t1, **settings)
     return tuple(found.value), tuple(unravel(row) for row in found.gradient)
 
 
@@ -171,7 +163,7 @@ class _Task(NamedTuple):
     criteria: tuple[Criterion, ...]
     build: Callable[[Any], Any]
     start: Callable[[Any], State] | None
-    unravel: Callable[[Array], Any]
+    unravel: Any  # set inside of `jit`, where it is no key of the cache
     integrator: AbstractIntegrator
     num_steps: int
     t0: Float[Array, ""]
@@ -204,11 +196,11 @@ class _Found(NamedTuple):
 
 
 @eqx.filter_jit
-def _differentiate_jit(criteria, names, build, start, p, t0, t1, num_steps, integrator, method):
+def _differentiate_jit(task: _Task, p, names: tuple[str, ...], method):
     flat, unravel = ravel_pytree(p)
-    task = _Task(criteria, build, start, unravel, integrator, num_steps, t0, t1)
-    system = task.system(flat)
-    uses = [Use.of(criterion, system, t0, p) for criterion in criteria]
+    task = task._replace(unravel=unravel)
+    system, integrator = task.system(flat), task.integrator
+    uses = [Use.of(criterion, system, task.t0, p) for criterion in task.criteria]
     checked_for(method, dict(zip(names, uses)))
     if isinstance(method, FiniteDifferences):
         found = _differences(task, flat, method)
@@ -219,7 +211,7 @@ def _differentiate_jit(criteria, names, build, start, p, t0, t1, num_steps, inte
     else:
         found = _through_the_trajectory(task, flat, method)
     result, note = found.result, ""
-    of_multipliers = [name for name, use in zip(names, uses) if use.multipliers]
+    of_multipliers = [name for name, use in zip(names, uses) if use.integrand.multipliers or use.terminal.multipliers]
     if of_multipliers and found.details is not None:
         note = f"{' and '.join(of_multipliers)}: multipliers are used."
         # a given state0 has not been asked
@@ -281,7 +273,7 @@ def _continuous_adjoint(task: _Task, p, method: ContinuousAdjoint, uses: list[Us
         Parameters(system, grid),
         _stacked(task.criteria, task.unravel),
         p,
-        uses=(any(use.in_integrand for use in uses), any(use.in_terminal for use in uses)),
+        uses=(any(any(use.integrand) for use in uses), any(any(use.terminal) for use in uses)),
     )
     of_q = jax.vmap(lambda w: configuration_cotangent(system.group, q0, w))(cotangents.w0)
     (of_initial,) = jax.vmap(pull_back)((cotangents.system, of_q, cotangents.v0))

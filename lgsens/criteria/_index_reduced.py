@@ -110,11 +110,9 @@ def integrate_index_reduced(
         f"The integration with error control did not reach `t1` in {max_steps} steps. Give the times at which forces "
         "are not smooth as `breaks`, loosen `rtol` and `atol`, or raise `max_steps`."
     )
-    if not is_concrete(finished):
-        return eqx.error_if(run, ~finished, message)
-    if not bool(finished):
+    if is_concrete(finished) and not bool(finished):
         raise SimulationError(message)
-    return run
+    return run if is_concrete(finished) else eqx.error_if(run, ~finished, message)
 
 
 @eqx.filter_jit

@@ -18,11 +18,12 @@ Inside, L is minimized to a stationarity of min(ω, θ ρ σ), the latter a frac
 ∇L; then μ ← μ⁺, ω falls, and ρ grows unless σ fell. μ converges linearly, the faster the larger ρ (Nocedal & Wright
 2006, §17.4; Birgin & Martínez 2014, Practical Augmented Lagrangian Methods, §4).
 
-Inside there are two methods, each a step that evaluates f, g and derivatives once, accepted or not, traced so that
-a whole search compiles once: `_reverse_steps` with one gradient in reverse mode, whatever the number of constraints;
-and for few variables `_forward_steps` with the Jacobian of all constraints.
+Inside there are two methods, each a step that evaluates f, g and derivatives once, accepted or not: `_reverse_steps`
+with one gradient in reverse mode, whatever the number of constraints; and for few variables `_forward_steps` with the
+Jacobian of all constraints.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -64,6 +65,18 @@ class Row(NamedTuple):
     complementarity: Float[Array, ""]
 
 
+class Trial(NamedTuple):
+    """An evaluation at z."""
+
+    z: Float[Array, " n"]
+    x: Float[Array, " n"]
+    objective: Float[Array, ""]  # f, not scaled
+    constraints: Float[Array, " m"]
+    gradient: Float[Array, " n"]  # ∇L
+    estimate: Float[Array, " m"]  # μ⁺
+    finite: Bool[Array, ""]
+
+
 class Search(NamedTuple):
     """What both methods hand from one evaluation to the next."""
 
@@ -77,54 +90,30 @@ class Search(NamedTuple):
     ended: Int[Array, ""]
     best: Best
 
+    @classmethod
+    def start(cls, z: Float[Array, " n"], num_constraints: int) -> "Search":
+        """The state before the first evaluation, which is at z."""
+        none, count = jnp.zeros(num_constraints, z.dtype), jnp.zeros((), jnp.int32)
+        penalty, accuracy, infinite = (jnp.asarray(number, z.dtype) for number in (PENALTY, INNER_ACCURACY, jnp.inf))
+        best = Best(z, infinite, none, infinite, count)
+        return cls(none, penalty, accuracy, infinite, count, jnp.zeros((), z.dtype), count, count, best)
 
-class Trial(NamedTuple):
-    """An evaluation at z."""
+    def scale_of(self, objective: Float[Array, ""]) -> Float[Array, ""]:
+        """What f is divided by: |f(x₀)|, which the first evaluation finds, or 1 where that is 0."""
+        magnitude = jnp.abs(jax.lax.stop_gradient(objective))
+        return jnp.where(self.scale > 0, self.scale, jnp.where(magnitude > 0, magnitude, 1.0))
 
-    z: Float[Array, " n"]
-    x: Float[Array, " n"]
-    objective: Float[Array, ""]  # f, not scaled
-    constraints: Float[Array, " m"]
-    gradient: Float[Array, " n"]  # ∇L
-    pushed: Float[Array, " m"]  # μ⁺
-    finite: Bool[Array, ""]
+    def estimate(self, constraints: Float[Array, " m"]) -> Float[Array, " m"]:
+        """μ⁺."""
+        return jnp.maximum(0.0, self.multipliers + self.penalty * constraints)
 
-
-def start(z: Float[Array, " n"], num_constraints: int) -> Search:
-    """The state before the first evaluation, which is at z."""
-    count, infinite = jnp.zeros((), jnp.int32), jnp.full((), jnp.inf, z.dtype)
-    none = jnp.zeros(num_constraints, z.dtype)
-    return Search(
-        multipliers=none,
-        penalty=jnp.full((), PENALTY, z.dtype),
-        accuracy=jnp.full((), INNER_ACCURACY, z.dtype),
-        violation=infinite,
-        inner=count,
-        scale=jnp.zeros((), z.dtype),
-        step=count,
-        ended=count,
-        best=Best(z, infinite, none, infinite, count),
-    )
+    def lagrangian(self, scaled: Float[Array, ""], estimate: Float[Array, " m"]) -> Float[Array, ""]:
+        """L, of f/|f(x₀)| and μ⁺."""
+        return scaled + jnp.sum(estimate**2 - self.multipliers**2) / (2 * self.penalty)
 
 
-def scale(search: Search, objective: Float[Array, ""]) -> Float[Array, ""]:
-    """What f is divided by: |f(x₀)|, which the first evaluation finds, or 1 where that is 0."""
-    magnitude = jnp.abs(jax.lax.stop_gradient(objective))
-    return jnp.where(search.scale > 0, search.scale, jnp.where(magnitude > 0, magnitude, 1.0))
-
-
-def pushed(search: Search, constraints: Float[Array, " m"]) -> Float[Array, " m"]:
-    """μ⁺."""
-    return jnp.maximum(0.0, search.multipliers + search.penalty * constraints)
-
-
-def value(search: Search, scaled: Float[Array, ""], pushed: Float[Array, " m"]) -> Float[Array, ""]:
-    """L, of f/|f(x₀)| and μ⁺."""
-    return scaled + jnp.sum(pushed**2 - search.multipliers**2) / (2 * search.penalty)
-
-
-def noise(value: Float[Array, ""]) -> Float[Array, ""]:
-    """A simulation's round-off of L, 1e-12 in 64 bits."""
+def round_off(value: Float[Array, ""]) -> Float[Array, ""]:
+    """A simulation's of L, 1e-12 in 64 bits."""
     return jnp.finfo(value.dtype).eps ** 0.75 * jnp.abs(value)
 
 
@@ -141,7 +130,7 @@ def advance(
     penalty, count = search.penalty, jnp.ones_like(search.inner)
     worst = jnp.max(trial.constraints, initial=-jnp.inf)
     norm = jnp.linalg.norm(jnp.clip(trial.z - trial.gradient, 0.0, 1.0) - trial.z)
-    sigma = jnp.max(jnp.abs(trial.pushed - search.multipliers), initial=0.0) / penalty
+    sigma = jnp.max(jnp.abs(trial.estimate - search.multipliers), initial=0.0) / penalty
 
     converged = accepted & (worst <= constraint_tolerance) & (sigma <= tolerance) & (norm <= tolerance)
     accuracy = jnp.maximum(tolerance, jnp.minimum(search.accuracy, INNER_ACCURACY * penalty * sigma))
@@ -156,12 +145,12 @@ def advance(
     lower = jnp.where(feasible, f < best.objective, worst < best.worst)
     better = converged | trial.finite & ((feasible & ~before) | ((feasible == before) & lower))
     after = Search(
-        multipliers=jnp.where(follow, trial.pushed, search.multipliers),
+        multipliers=jnp.where(follow, trial.estimate, search.multipliers),
         penalty=jnp.where(stiffer, jnp.minimum(PENALTY_GROWTH * penalty, LARGEST_PENALTY), penalty),
         accuracy=jnp.where(follow, INNER_FALL * search.accuracy, search.accuracy),
         violation=jnp.where(follow, sigma, search.violation),
         inner=jnp.where(follow, 0 * count, search.inner + accepted.astype(count.dtype)),
-        scale=scale(search, f),
+        scale=search.scale_of(f),
         step=search.step + count,
         ended=jnp.where(converged, CONVERGED, jnp.where(contradiction, INFEASIBLE, search.ended)),
         best=select(better, Best(trial.z, f, trial.constraints, worst, search.step), best),
@@ -171,4 +160,4 @@ def advance(
 
 def select(condition, yes, no):
     """One of two pytrees."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+    return jax.tree.map(partial(jnp.where, condition), yes, no)

@@ -19,17 +19,15 @@ class Box(NamedTuple):
     upper: Float[Array, " n"]
     log: Bool[Array, " n"]
 
-    def _ends(self):
-        safe = lambda bound: jnp.log(jnp.where(self.log, bound, 1.0))
-        return jnp.where(self.log, safe(self.lower), self.lower), jnp.where(self.log, safe(self.upper), self.upper)
+    def _on_scale(self, x):
+        return jnp.where(self.log, jnp.log(jnp.where(self.log, x, 1.0)), x)
 
     def scaled(self, x):
-        lower, upper = self._ends()
-        return (jnp.where(self.log, jnp.log(jnp.where(self.log, x, 1.0)), x) - lower) / (upper - lower)
+        lower, upper = self._on_scale(self.lower), self._on_scale(self.upper)
+        return (self._on_scale(x) - lower) / (upper - lower)
 
     def value(self, z):
-        lower, upper = self._ends()
-        y = (1.0 - z) * lower + z * upper  # exact at both ends
+        y = (1.0 - z) * self._on_scale(self.lower) + z * self._on_scale(self.upper)  # exact at both ends
         # The clip keeps round-off of the logarithm from leaving the bounds.
         return jnp.clip(jnp.where(self.log, jnp.exp(jnp.where(self.log, y, 0.0)), y), self.lower, self.upper)
 
@@ -42,14 +40,14 @@ def checked_box(x0, lower, upper, log_scale) -> tuple[Array, Callable[[Array], P
     if isinstance(log_scale, bool):
         log_scale = jax.tree.map(lambda _: log_scale, x0)
 
-    def vector(tree, what: str, convert) -> Array:
+    def vector(tree, what: str) -> Array:
         if jax.tree.structure(tree) != jax.tree.structure(x0):
             raise ValueError(
                 f"`{what}` must be a pytree like `x0`, {jax.tree.structure(x0)}, got {jax.tree.structure(tree)}."
             )
 
         def leaf(path, x, value):
-            value = convert(value)
+            value = jnp.asarray(value, bool) if what == "log_scale" else as_float(value, None, f"`{what}`")
             if value.shape not in ((), x.shape):
                 name = jax.tree_util.keystr(path)
                 raise ValueError(f"`{what}{name}` must have shape {x.shape} or (), got shape {value.shape}.")
@@ -58,14 +56,8 @@ def checked_box(x0, lower, upper, log_scale) -> tuple[Array, Callable[[Array], P
         return ravel_pytree(jax.tree_util.tree_map_with_path(leaf, x0, tree))[0]
 
     x, unravel = ravel_pytree(x0)
-    box = Box(
-        vector(lower, "lower", lambda value: as_float(value, None, "`lower`")),
-        vector(upper, "upper", lambda value: as_float(value, None, "`upper`")),
-        vector(log_scale, "log_scale", lambda value: jnp.asarray(value, bool)),
-    )
-    names = entry_names(x0)
-    values = (np.asarray(box.lower), np.asarray(box.upper), np.asarray(x), np.asarray(box.log))
-    for name, low, high, value, log in zip(names, *values):
+    box = Box(vector(lower, "lower"), vector(upper, "upper"), vector(log_scale, "log_scale"))
+    for name, low, high, log, value in zip(entry_names(x0), *map(np.asarray, (*box, x))):
         if not low < high:
             raise ValueError(f"`lower` must be below `upper`, got {low} and {high} for {name}.")
         if not low <= value <= high:

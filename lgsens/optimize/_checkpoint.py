@@ -41,13 +41,9 @@ class Checkpoint:
         os.replace(draft, self.path)
 
     def load(self, carry: PyTree, first: Row) -> tuple[PyTree, list[Row]]:
-        """What the file holds; `carry` and no rows where there is none.
+        """What the file holds; `carry`, the one at x₀, and no rows where there is none.
 
-        Arguments:
-            carry: the one at x₀, for its structure.
-            first: what `fun` gives at x₀.
-
-        Raises `ValueError` for a file of another problem.
+        Raises `ValueError` for a file of another problem, or where `fun` does not give `first` at x₀.
         """
         if not self.path.exists():
             return carry, []

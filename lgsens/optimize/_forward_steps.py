@@ -67,7 +67,7 @@ def start(z: Float[Array, " n"], num_constraints: int) -> Carry:
     g = jnp.zeros(num_constraints, z.dtype)
     jacobian = jnp.zeros((g.size, z.size), z.dtype)
     return Carry(
-        search=outer.start(z, num_constraints),
+        search=outer.Search.start(z, num_constraints),
         point=Point(z, jnp.full((), jnp.inf, z.dtype), jnp.zeros_like(z), g, jacobian),
         curvature=jnp.eye(z.size, dtype=z.dtype),
         learned=jnp.asarray(False),
@@ -87,11 +87,11 @@ def make_step(fun: Callable, box: Box, tolerances: tuple[float, float]) -> Calla
 
     def step(carry: Carry) -> tuple[Carry, outer.Row]:
         search, here = carry.search, carry.point
-        pushed = outer.pushed(search, here.constraints)
+        estimate = search.estimate(here.constraints)
         model = PenaltyModel(
-            slope=here.slope + pushed @ here.jacobian,
+            slope=here.slope + estimate @ here.jacobian,
             curvature=carry.curvature,
-            pushed=search.multipliers + search.penalty * here.constraints,
+            shifted=search.multipliers + search.penalty * here.constraints,
             jacobian=here.jacobian,
             penalty=search.penalty,
             lower=jnp.maximum(-carry.reach, -here.z),
@@ -101,19 +101,19 @@ def make_step(fun: Callable, box: Box, tolerances: tuple[float, float]) -> Calla
         promised = -change
         z = jnp.clip(here.z + move, 0.0, 1.0)
         (slope, jacobian), (x, f, g) = jax.jacfwd(evaluate, has_aux=True)(z)
-        scale = outer.scale(search, f)
+        scale = search.scale_of(f)
         there = Point(z, f / scale, slope / scale, g, jacobian)
         finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in there]))
 
-        before = outer.value(search, here.objective, pushed)
-        pushed_there = outer.pushed(search, g)
-        gain = before - outer.value(search, there.objective, pushed_there)
-        accepted = finite & (gain >= outer.DECREASE * promised - outer.noise(before))
-        trial = outer.Trial(z, x, f, g, there.slope + pushed_there @ jacobian, pushed_there, finite)
+        before = search.lagrangian(here.objective, estimate)
+        estimate_there = search.estimate(g)
+        gain = before - search.lagrangian(there.objective, estimate_there)
+        accepted = finite & (gain >= outer.DECREASE * promised - outer.round_off(before))
+        trial = outer.Trial(z, x, f, g, there.slope + estimate_there @ jacobian, estimate_there, finite)
         search, follow, row = outer.advance(search, trial, accepted, tolerances, least=0)
         first = carry.search.step == 0
         eager = accepted & ~follow & ~first & (carry.search.step < EAGER)
-        multipliers = jnp.maximum(0.0, model.pushed + model.penalty * (here.jacobian @ move))
+        multipliers = jnp.maximum(0.0, model.shifted + model.penalty * (here.jacobian @ move))
         search = search._replace(multipliers=jnp.where(eager, multipliers, search.multipliers))
 
         # Of L, its slope and L at the trial the parabola; half where the trial is not finite.
@@ -125,7 +125,7 @@ def make_step(fun: Callable, box: Box, tolerances: tuple[float, float]) -> Calla
 
         given_up = ~accepted & (carry.rejected >= outer.REJECTIONS)
         after = outer.select(accepted, there, here)
-        gradients = jnp.where(accepted, pushed_there, pushed) @ jnp.stack([here.jacobian, jacobian])
+        gradients = jnp.where(accepted, estimate_there, estimate) @ jnp.stack([here.jacobian, jacobian])
         change = there.slope + gradients[1] - here.slope - gradients[0]
         curvature, learned = _learned(carry, move, change, finite & ~first)
         again = first | given_up

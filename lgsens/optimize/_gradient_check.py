@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PyTree
 
 from lgsens._validate import as_float
 from lgsens.optimize._box import entry_names
+from lgsens.optimize._parametrization import magnitude
 
 
 class GradientCheck(NamedTuple):
@@ -64,13 +65,10 @@ def check_gradient(
     h: float = np.cbrt(float(np.finfo(flat.dtype).eps)) if step is None else step
     if not h > 0:
         raise ValueError(f"`step` must be positive, got {h}.")
-    if scale is None:
-        scale = jax.tree.map(lambda leaf: jnp.max(jnp.abs(leaf)), x)
-        scale = jax.tree.map(lambda size: jnp.where(size > 0, size, 1.0), scale)
+    scale = jax.tree.map(magnitude, x) if scale is None else scale
     spread = lambda leaf, size: jnp.broadcast_to(as_float(size, None, "`scale`"), leaf.shape)
     size = np.asarray(ravel_pytree(jax.tree.map(spread, x, scale))[0])
-    if value_and_grad is None:
-        value_and_grad = jax.jit(jax.value_and_grad(fun))
+    value_and_grad = jax.jit(jax.value_and_grad(fun)) if value_and_grad is None else value_and_grad
 
     if flat.size <= max_directions:
         names, directions = tuple(entry_names(x)), np.eye(flat.size)

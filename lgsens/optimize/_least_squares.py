@@ -45,9 +45,11 @@ class LeastSquaresResult(NamedTuple):
 class LineSearchGaussNewton(optimistix.AbstractGaussNewton):
     """Gauss–Newton with backtracking, of optimistix's parts: like the parameters themselves it has no scale.
 
-    The damping of Levenberg–Marquardt has one: a multiple of the identity, which slows it down where the data determine
-    some combinations of parameters a hundred times better than others. Ends where a step is below `rtol` of the
-    parameters and lowers |r|² by less than that; much smaller steps drown in the round-off of |r|².
+    The damping of Levenberg–Marquardt has one, which slows it down where the data determine some combinations of
+    parameters a hundred times better than others: 234 steps beside 161 for five data sets of `AccelerationTest`, on
+    which Gauss–Newton alone diverges (`benchmarks/results/optimizers.json`). `optimistix.Dogleg`, with 135, did not
+    converge on all of the hundred oscillators of `tests/optimize/test_least_squares.py`. Ends where a step is below
+    `rtol` of the parameters and lowers |r|² by less.
     """
 
     rtol: float = 1e-5

@@ -34,13 +34,12 @@ def load_cases(
     shape, and a sharpness that is not positive.
     """
     listed = isinstance(cases, Sequence)
-    lengths = {len(cases)} if listed else {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(cases)}
-    if len(lengths) != 1 or lengths & {0, (), (0,)}:
+    shapes = {(len(cases),)} if listed else {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(cases)}
+    if len(shapes) != 1 or shapes & {(), (0,)}:
         raise ValueError(
-            f"`cases` must be a list, or arrays of one leading axis over the cases, got {lengths or 'none'}."
+            f"`cases` must be a list, or arrays of one leading axis over the cases, got {shapes or 'none'}."
         )
-    (length,) = lengths
-    count = length if isinstance(length, int) else length[0]
+    ((count,),) = shapes
     if sharpness is not None and not sharpness > 0:
         raise ValueError(f"`sharpness` must be positive, got {sharpness}.")
     if weights is None:
@@ -50,12 +49,10 @@ def load_cases(
     def combined(x):
         if listed:
             found = [fun(x, case) for case in cases]
-            f = jnp.stack([f for f, _ in found])
-            g = jnp.concatenate([g.ravel() for _, g in found])
+            f, g = jnp.stack([f for f, _ in found]), jnp.concatenate([g.ravel() for _, g in found])
         else:
             f, g = jax.vmap(fun, in_axes=(None, 0))(x, cases)
-            g = g.ravel()
         weighted = weights * f
-        return (jnp.sum(weighted) if sharpness is None else soft_maximum(weighted, sharpness)), g
+        return (jnp.sum(weighted) if sharpness is None else soft_maximum(weighted, sharpness)), g.ravel()
 
     return combined

@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 from lgsens._validate import as_count
 from lgsens.optimize._augmented_lagrangian import NOT_YET
 from lgsens.optimize._box import checked_box
-from lgsens.optimize._minimize import REASONS, Problem, check_tolerances, prepared
+from lgsens.optimize._minimize import REASONS, Problem, prepared
 from lgsens.sweeps import as_designs, sweep
 
 
@@ -71,7 +71,6 @@ def multi_start(
     alone. Raises `ValueError` as `minimize` and `sweep`.
     """
     num_steps = as_count(num_steps, "num_steps")
-    check_tolerances(tolerance, constraint_tolerance)
     if isinstance(starts, int):
         count = as_count(starts, "starts")
         # Any point will do to learn shapes and bounds.

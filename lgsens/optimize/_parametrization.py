@@ -26,17 +26,14 @@ class AbstractParametrization(eqx.Module):
         """z of x, entry by entry."""
 
 
-def _positive(name: str) -> Any:
+def _number(name: str, *, positive: bool = False, **default: Any) -> Any:
     def convert(value):
         array = as_float(value, None, f"`{name}`")
-        require(lambda a: np.all(a > 0), f"`{name}` must be positive, got {value}.", array)
+        if positive:
+            require(lambda a: np.all(a > 0), f"`{name}` must be positive, got {value}.", array)
         return array
 
-    return eqx.field(converter=convert, default=1.0)
-
-
-def _number(name: str, **default: Any) -> Any:
-    return eqx.field(converter=lambda value: as_float(value, None, f"`{name}`"), **default)
+    return eqx.field(converter=convert, **default)
 
 
 class Affine(AbstractParametrization):
@@ -47,7 +44,7 @@ class Affine(AbstractParametrization):
         offset: x at z = 0 [unit of x], shape () or that of x.
     """
 
-    scale: Float[Array, "..."] = _positive("scale")
+    scale: Float[Array, "..."] = _number("scale", positive=True, default=1.0)
     offset: Float[Array, "..."] = _number("offset", default=0.0)
 
     def value(self, z):
@@ -64,7 +61,7 @@ class Log(AbstractParametrization):
         scale: x at z = 0 [unit of x], positive, shape () or that of x.
     """
 
-    scale: Float[Array, "..."] = _positive("scale")
+    scale: Float[Array, "..."] = _number("scale", positive=True, default=1.0)
 
     def value(self, z):
         return self.scale * jnp.exp(z)
@@ -97,6 +94,12 @@ class Interval(AbstractParametrization):
         return jnp.log(share) - jnp.log1p(-share)
 
 
+def magnitude(leaf: Float[Array, "..."]) -> Float[Array, ""]:
+    """The largest absolute entry; 1 where that is 0."""
+    size = jnp.max(jnp.abs(leaf), initial=0.0)
+    return jnp.where(size > 0, size, 1.0)
+
+
 def variables(parametrization: PyTree, x0: PyTree) -> tuple[Float[Array, " n"], Callable[[Array], PyTree]]:
     """The variables of a design as one vector, and the way back.
 
@@ -113,14 +116,10 @@ def variables(parametrization: PyTree, x0: PyTree) -> tuple[Float[Array, " n"], 
         raise ValueError("`x0` has no arrays; there is nothing to search.")
     single = lambda node: node is None or isinstance(node, AbstractParametrization)
 
-    def own(leaf):
-        size = jnp.max(jnp.abs(leaf), initial=0.0)
-        return Affine(jnp.where(size > 0, size, 1.0))
-
     def spread(node, part):
         if not single(node):
             raise ValueError(f"`parametrization` must consist of Affine, Log, Interval or None, got {node!r}.")
-        return jax.tree.map(lambda leaf: own(leaf) if node is None else node, part)
+        return jax.tree.map(lambda leaf: Affine(magnitude(leaf)) if node is None else node, part)
 
     try:
         maps = jax.tree.map(spread, parametrization, x0, is_leaf=single)

@@ -28,7 +28,7 @@ class PenaltyModel(NamedTuple):
 
     slope: Float[Array, " n"]  # s
     curvature: Float[Array, "n n"]  # B
-    pushed: Float[Array, " m"]  # c
+    shifted: Float[Array, " m"]  # c
     jacobian: Float[Array, "m n"]  # J
     penalty: Float[Array, ""]  # ρ
     lower: Float[Array, " n"]
@@ -37,37 +37,37 @@ class PenaltyModel(NamedTuple):
     def value(self, d: Float[Array, " n"]) -> Float[Array, ""]:
         """q(d)."""
         change = self.penalty * (self.jacobian @ d)
-        rise = _rise(self.pushed, change)
-        over = rise**2 + 2 * jnp.maximum(0.0, self.pushed) * (rise - change)
+        rise = _rise(self.shifted, change)
+        over = rise**2 + 2 * jnp.maximum(0.0, self.shifted) * (rise - change)
         return jnp.vdot(self.slope, d) + jnp.vdot(d, self.curvature @ d) / 2 + jnp.sum(over) / (2 * self.penalty)
 
     def gradient(self, d: Float[Array, " n"]) -> Float[Array, " n"]:
         """∇q(d)."""
-        rise = _rise(self.pushed, self.penalty * (self.jacobian @ d))
+        rise = _rise(self.shifted, self.penalty * (self.jacobian @ d))
         return self.slope + self.curvature @ d + rise @ self.jacobian
 
     def hessian(self, d: Float[Array, " n"]) -> Float[Array, "n n"]:
         """∇²q(d)."""
-        active = jnp.where((self.pushed + self.penalty * (self.jacobian @ d) > 0)[:, None], self.jacobian, 0.0)
+        active = jnp.where((self.shifted + self.penalty * (self.jacobian @ d) > 0)[:, None], self.jacobian, 0.0)
         return self.curvature + self.penalty * active.T @ active
 
     def lowest(self, d, direction, gradient, longest) -> Float[Array, ""]:
         """The α up to `longest` of the least q(d + α direction), by bisection of its slope, which rises with α."""
-        pushed, more = (self.penalty * (self.jacobian @ v) for v in (d, direction))
-        pushed += self.pushed
+        shifted, more = (self.penalty * (self.jacobian @ v) for v in (d, direction))
+        shifted += self.shifted
         first, second = jnp.vdot(gradient, direction), jnp.vdot(direction, self.curvature @ direction)
 
         def halve(_, ends):
             middle = (ends[0] + ends[1]) / 2
-            rising = first + middle * second + jnp.vdot(_rise(pushed, middle * more), more) / self.penalty > 0
+            rising = first + middle * second + jnp.vdot(_rise(shifted, middle * more), more) / self.penalty > 0
             return jnp.where(rising, ends[0], middle), jnp.where(rising, middle, ends[1])
 
         return jnp.minimum(longest, jax.lax.fori_loop(0, BISECTIONS, halve, (jnp.zeros_like(longest), 2 * longest))[0])
 
 
-def _rise(pushed, change):
-    """max(0, pushed + change) − max(0, pushed)."""
-    return jnp.where(pushed > 0, jnp.maximum(change, -pushed), jnp.maximum(0.0, pushed + change))
+def _rise(shifted, change):
+    """max(0, shifted + change) − max(0, shifted)."""
+    return jnp.where(shifted > 0, jnp.maximum(change, -shifted), jnp.maximum(0.0, shifted + change))
 
 
 class _State(NamedTuple):

@@ -38,7 +38,7 @@ class Carry(NamedTuple):
 def start(z: Float[Array, " n"], num_constraints: int) -> Carry:
     """The carry before the first evaluation, which is at z."""
     return Carry(
-        search=outer.start(z, num_constraints),
+        search=outer.Search.start(z, num_constraints),
         z=z,
         value=jnp.full((), jnp.inf, z.dtype),
         gradient=jnp.zeros_like(z),
@@ -60,18 +60,18 @@ def make_step(fun: Callable, box: Box, tolerances: tuple[float, float]) -> Calla
         def lagrangian(z):
             x = box.value(z)
             f, g = fun(x)
-            pushed = outer.pushed(search, g)
-            return outer.value(search, f / outer.scale(search, f), pushed), (x, f, g, pushed)
+            estimate = search.estimate(g)
+            return search.lagrangian(f / search.scale_of(f), estimate), (x, f, g, estimate)
 
-        (value, (x, f, g, pushed)), gradient = jax.value_and_grad(lagrangian, has_aux=True)(z)
+        (value, (x, f, g, estimate)), gradient = jax.value_and_grad(lagrangian, has_aux=True)(z)
         finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(g)) & jnp.all(jnp.isfinite(gradient))
 
         move = z - carry.z
         promised = jnp.vdot(carry.gradient, move)
-        enough = value <= carry.value + outer.DECREASE * promised + outer.noise(carry.value)
+        enough = value <= carry.value + outer.DECREASE * promised + outer.round_off(carry.value)
         accepted = finite & (carry.fresh | enough)
         # Since a change of μ its first point is z itself, another one has to follow.
-        trial = outer.Trial(z, x, f, g, gradient, pushed, finite)
+        trial = outer.Trial(z, x, f, g, gradient, estimate, finite)
         search, follow, row = outer.advance(search, trial, accepted, tolerances, least=1)
 
         zero, one = jnp.zeros_like(carry.rejected), jnp.ones_like(carry.rejected)

@@ -1,5 +1,6 @@
 """A problem as `scipy.optimize` wants it: functions of a flat vector of 64-bit floats."""
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -9,11 +10,11 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
 from lgsens.optimize._box import checked_box
-from lgsens.optimize._minimize import Problem
+from lgsens.optimize._minimize import Problem, flattened
 
 
 class ScipyProblem(NamedTuple):
-    """A problem in variables z scaled to [0, 1] between the bounds; NumPy arrays.
+    """A problem in variables z scaled to [0, 1] between the bounds; NumPy arrays of 64-bit floats.
 
     Attributes:
         z0: the start, shape (n,).
@@ -56,21 +57,13 @@ def scipy_problem(
     Hessian-vector product a tangent of a gradient. Raises `ValueError` as `minimize` for bounds and shapes.
     """
     x, unravel, box = checked_box(x0, lower, upper, log_scale)
-    scaled = jax.jit(lambda z: fun(unravel(box.value(z))))  # jit keeps its trace for all that follows
     z0 = box.scaled(x)
-    shape = jax.eval_shape(scaled, z0)
-    if not (isinstance(shape, tuple) and len(shape) == 2 and shape[0].shape == ()):
-        raise ValueError(f"`fun` must return (objective of shape (), array of constraints), got {shape}.")
-    forward = shape[1].size > 0 if forward is None else forward
-
-    def both(z):
-        f, g = scaled(z)
-        return f, g.ravel()
-
-    values = _remembered(both)
-    jacobians = _remembered(jax.jacfwd(both))
-    gradient = _remembered(jax.grad(lambda z: both(z)[0]))
-    product = jax.jit(lambda z, p: jax.jvp(jax.grad(lambda z: both(z)[0]), (z,), (p,))[1])
+    flat_fun, constraints = flattened(fun, unravel, x)
+    forward = constraints.size > 0 if forward is None else forward
+    both = lambda z: flat_fun(box.value(z))
+    slope = jax.grad(lambda z: both(z)[0])
+    values, jacobians, gradient = map(_remembered, (both, jax.jacfwd(both), slope))
+    product = jax.jit(lambda z, p: jax.jvp(slope, (z,), (p,))[1])
     as_array = lambda z: np.asarray(z, z0.dtype)
     return ScipyProblem(
         z0=np.asarray(z0, np.float64),
@@ -124,14 +117,9 @@ def scipy_least_squares(
 def _remembered(function: Callable) -> Callable[[np.ndarray], PyTree]:
     """`function`, compiled, of NumPy arrays; what it was for the last argument is not computed again."""
     compiled = jax.jit(function)
-    last: dict[bytes, PyTree] = {}
 
-    def call(z):
-        key = np.ascontiguousarray(z, np.float64).tobytes()
-        if key not in last:
-            found = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), compiled(np.asarray(z)))
-            last.clear()
-            last[key] = found
-        return last[key]
+    @functools.lru_cache(maxsize=1)
+    def of_bytes(z: bytes):
+        return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), compiled(np.frombuffer(z)))
 
-    return call
+    return lambda z: of_bytes(np.asarray(z, np.float64).tobytes())

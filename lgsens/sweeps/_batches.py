@@ -44,11 +44,9 @@ class Program(NamedTuple):
 def succeeded(values: PyTree) -> jax.Array:
     """Whether the values of one design are finite, and every `Trajectory` or `Saved` among them successful."""
     is_run = lambda node: isinstance(node, Trajectory | Saved)
-    checks = [
-        jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(values) if jnp.issubdtype(leaf.dtype, jnp.inexact)
-    ]
-    runs = [node for node in jax.tree.leaves(values, is_leaf=is_run) if is_run(node)]
-    checks += [run.result == RESULTS.successful for run in runs]
+    floats = [leaf for leaf in jax.tree.leaves(values) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
+    runs = filter(is_run, jax.tree.leaves(values, is_leaf=is_run))
+    checks = [jnp.all(jnp.isfinite(leaf)) for leaf in floats] + [run.result == RESULTS.successful for run in runs]
     return jnp.all(jnp.stack(checks)) if checks else jnp.ones((), bool)
 
 
@@ -58,24 +56,24 @@ class Traced(NamedTuple):
     Attributes:
         run: the leaves of a design ↦ the leaves of its values, and whether it succeeded as the last.
         shapes: the values of one design, a pytree of shapes and dtypes.
-        carried: what a turn of its largest loop reads [bytes].
+        bytes_per_turn: what a turn of its largest loop reads [bytes].
         seconds: wall time [s].
     """
 
     run: Callable[..., list[jax.Array]]
     shapes: PyTree
-    carried: int
+    bytes_per_turn: int
     seconds: float
 
 
-def _carried(jaxpr: Any) -> int:
+def _bytes_per_turn(jaxpr: Any) -> int:
     """The bytes that a turn of the largest loop in a program reads: what it carries, and its share of what it scans."""
     largest = 0
     for equation in jaxpr.eqns:
         inner = list(jaxprs_in_params(equation.params))
         if equation.primitive.name in ("scan", "while"):
             largest = max(largest, *(sum(v.aval.size * v.aval.dtype.itemsize for v in body.invars) for body in inner))
-        largest = max([largest, *map(_carried, inner)])
+        largest = max([largest, *map(_bytes_per_turn, inner)])
     return largest
 
 
@@ -94,7 +92,7 @@ def trace(fn: Callable[[PyTree], PyTree], designs: PyTree) -> Traced:
     with failures_as_nan(), many_runs():
         jaxpr, (shapes, _) = jax.make_jaxpr(single, return_shape=True)(*one)
     run = jaxpr_as_fun(jaxpr)
-    return Traced(run, shapes, _carried(jaxpr.jaxpr), time.perf_counter() - started)
+    return Traced(run, shapes, _bytes_per_turn(jaxpr.jaxpr), time.perf_counter() - started)
 
 
 def compile_batch(
@@ -111,20 +109,18 @@ def compile_batch(
     spread = jax.jit(jax.shard_map(jax.vmap(traced.run), mesh=mesh, in_specs=rows, out_specs=rows, check_vma=False))
 
     def compiled(size):
-        shapes = [
-            jax.ShapeDtypeStruct((size, *leaf.shape[1:]), leaf.dtype, sharding=sharding)
-            for leaf in jax.tree.leaves(designs)
-        ]
-        return spread.lower(*shapes).compile()
+        shape = lambda leaf: jax.ShapeDtypeStruct((size, *leaf.shape[1:]), leaf.dtype, sharding=sharding)
+        return spread.lower(*map(shape, jax.tree.leaves(designs))).compile()
 
     started = time.perf_counter()
-    lanes = tuned.LANES_ELSEWHERE
-    if devices[0].platform == "cpu":
-        lanes = min(tuned.LANES, max(1, tuned.LANE_CACHE // max(traced.carried, 1)))
+    in_cache = min(tuned.LANES, max(1, tuned.LANE_CACHE // max(traced.bytes_per_turn, 1)))
+    lanes = in_cache if devices[0].platform == "cpu" else tuned.LANES_ELSEWHERE
     size = even(count, batch_size or lanes * len(devices), len(devices))
     program = compiled(size)
     if batch_size is None:
-        fits = _smallest(free_memory(devices) * tuned.FREE_SHARE / max(memory(program), 1.0))
+        fits = free_memory(devices) * tuned.FREE_SHARE / max(memory(program), 1.0)
+        if jax.process_count() > 1:  # all must agree on the size of a batch
+            fits = float(np.min(multihost_utils.process_allgather(np.asarray(fits, np.float32))))
         if fits < 1.0 and size > len(devices):
             size = even(count, int(size * fits), len(devices))
             program = compiled(size)
@@ -132,7 +128,9 @@ def compile_batch(
 
     def run(batch):
         place = lambda leaf: jax.make_array_from_callback(leaf.shape, sharding, lambda index: leaf[index])
-        *values, ok = on_host(program(*map(place, batch)))
+        found = program(*map(place, batch))  # on all processes' devices; all of it is wanted in each process
+        alone = jax.process_count() == 1
+        *values, ok = jax.device_get(found) if alone else multihost_utils.process_allgather(found, tiled=True)
         return [np.asarray(leaf) for leaf in values], np.asarray(ok)
 
     return Program(run, size, memory(program), seconds)
@@ -165,28 +163,13 @@ def free_memory(devices: Sequence[Any]) -> float:
     return _host_memory() / len(local)
 
 
-def _smallest(value: float) -> float:
-    """The least of all processes: they must agree on the size of a batch."""
-    if jax.process_count() == 1:
-        return value
-    return float(np.min(multihost_utils.process_allgather(np.asarray(value, np.float32))))
-
-
 def _host_memory() -> float:
     """Free memory of the machine [bytes]; all of it where the system does not tell what is free."""
     info = Path("/proc/meminfo")
-    if info.exists():
-        for line in info.read_text(encoding="ascii").splitlines():
-            if line.startswith("MemAvailable:"):
-                return 1024.0 * int(line.split()[1])
+    for line in info.read_text(encoding="ascii").splitlines() if info.exists() else ():
+        if line.startswith("MemAvailable:"):
+            return 1024.0 * int(line.split()[1])
     try:
         return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     except (AttributeError, ValueError, OSError):
         return np.inf
-
-
-def on_host(tree: PyTree) -> PyTree:
-    """NumPy arrays of the whole of a distributed pytree, in every process."""
-    if jax.process_count() > 1:
-        return multihost_utils.process_allgather(tree, tiled=True)
-    return jax.device_get(tree)

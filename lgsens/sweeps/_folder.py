@@ -36,16 +36,10 @@ class Store(NamedTuple):
 
     def write(self, rows: np.ndarray, values: list[np.ndarray], ok: np.ndarray) -> None:
         """Results of the designs `rows`; they count as done once everything else is on disk."""
-        for array, new in zip((*self.values, self.ok), (*values, ok)):
+        for array, new in zip((*self.values, self.ok, self.done), (*values, ok, True)):
             array[rows] = new
-            _flush(array)
-        self.done[rows] = True
-        _flush(self.done)
-
-
-def _flush(array: np.ndarray) -> None:
-    if isinstance(array, np.memmap):
-        array.flush()
+            if isinstance(array, np.memmap):
+                array.flush()
 
 
 def in_memory(shapes: PyTree, count: int) -> Store:
@@ -69,18 +63,14 @@ def in_folder(folder: Path, designs: PyTree, shapes: PyTree, count: int) -> Stor
         ("values", "holds the results of another `fn`"),
     ):
         if found.get(key) != wanted[key]:
+            has, own = (json.dumps(each.get(key)) for each in (found, wanted))
             raise ValueError(
-                f"`folder` {str(folder)!r} {what}: it has {_short(found.get(key))}, this sweep {_short(wanted[key])}. "
-                "Name another folder, or delete this one."
+                f"`folder` {str(folder)!r} {what}: it has {has[:200]}, this sweep {own[:200]}. Name another folder, or "
+                "delete this one."
             )
     files = [entry["file"] for entry in wanted["values"]] + ["ok.npy", "done.npy"]
     *values, ok, done = (open_memmap(folder / name, mode="r+") for name in files)
     return Store([*values], ok, done)
-
-
-def _short(entry: Any) -> str:
-    text = json.dumps(entry)
-    return text if len(text) <= 200 else text[:200] + "…"
 
 
 def _description(designs: PyTree, shapes: PyTree, count: int) -> dict[str, Any]:

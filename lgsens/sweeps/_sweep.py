@@ -113,12 +113,13 @@ def sweep(
     batch_size = None if batch_size is None else as_count(batch_size, "batch_size")
     devices = jax.devices() if devices is None else list(devices)
     traced = trace(fn, designs)
-    first, alone = jax.process_index() == 0, jax.process_count() == 1
+    first = jax.process_index() == 0
     store = in_memory(traced.shapes, count)
     if folder is not None and first:
         store = in_folder(Path(folder), designs, traced.shapes, count)
-    if not alone:
-        store = _agreed(store)
+    if jax.process_count() > 1:  # all go on from the store of the first, whose alone may be a folder
+        agreed = multihost_utils.broadcast_one_to_all(tuple(store))
+        store = store if first else Store(*jax.tree.map(np.array, agreed))
 
     done = np.flatnonzero(store.done)
     again = done[np.argsort(~store.ok[done], kind="stable")][:1]  # a design that succeeded, if one did
@@ -177,14 +178,6 @@ def _as_array(path, leaf) -> np.ndarray:
     if array.ndim == 0:
         raise ValueError(f"`designs`: {name} must have a leading axis over the designs, got the number {leaf}.")
     return array.astype(jax.dtypes.canonicalize_dtype(array.dtype))
-
-
-def _agreed(store: Store) -> Store:
-    """The store of the first process, in all of them; only the first one's may be a folder."""
-    everywhere = Store(*multihost_utils.broadcast_one_to_all(tuple(store)))
-    if jax.process_index() == 0:
-        return store
-    return Store(*jax.tree.map(np.array, tuple(everywhere)))
 
 
 def _check_again(folder, row: int, store: Store, values: list[np.ndarray], ok: bool) -> None:
