@@ -2,10 +2,12 @@
 
 Nearly all their time is compilation, so XLA's costly optimizations are off, as in JAX's own tests: a third less. So are
 its fusion emitters where they can be (jaxlib 0.10, the last one for Python 3.11; later ones do not know the flag and
-end at it): what is left takes half as long. `pytest --optimized` compiles as users do.
+end at it): what is left takes half as long. `pytest --optimized` compiles as users do. Programs that two tests have in
+common, mostly single operations, are compiled once in a run: JAX keeps them in a folder that ends with it.
 """
 
 import os
+import tempfile
 
 import jax
 import jaxlib
@@ -21,6 +23,13 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
+    if not hasattr(config, "workerinput"):  # the first process of a run; the others have its environment
+        folder = tempfile.TemporaryDirectory(prefix="programs-", ignore_cleanup_errors=True)
+        config.add_cleanup(folder.cleanup)
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder.name
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if config.getoption("--optimized"):
         return
     jax.config.update("jax_disable_most_optimizations", True)

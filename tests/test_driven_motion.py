@@ -35,7 +35,9 @@ def quantities(motion):
     return jnp.concatenate([*parts, motion.multiplier("motor")[-1]])
 
 
-@pytest.mark.parametrize("name", INTEGRATORS)
+@pytest.mark.parametrize(
+    "name", ["index 3", *(pytest.param(name, marks=pytest.mark.slow) for name in list(INTEGRATORS)[1:])]
+)
 def test_driven_slider_crank_is_that_of_kinematics(name):
     model, integrator = crank(lg.Polynomial((0.2, 3.0, 2.0))), INTEGRATORS[name]
     exact = quantities(lg.kinematics(model, t=np.linspace(0.0, END, 5)))
@@ -134,7 +136,7 @@ def check_gradients(end, x):
     np.testing.assert_allclose(forward, np.stack(difference, axis=1), rtol=0, atol=3e-7 * size)
 
 
-@pytest.mark.parametrize("name", ["index 3", "stabilized"])
+@pytest.mark.parametrize("name", ["index 3", pytest.param("stabilized", marks=pytest.mark.slow)])
 def test_gradients_by_the_signal_in_both_modes(name):
     """By amplitude, frequency, length and the initial time, at which the signal has a rate."""
     end = lambda x: shaken(x[:3], num_steps=8, t0=x[3], integrator=INTEGRATORS[name])

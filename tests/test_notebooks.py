@@ -6,6 +6,9 @@ a kernel: `jupyter execute --inplace notebooks/*.ipynb`, with the extra `noteboo
 """
 
 import ast
+import functools
+import importlib
+import inspect
 import json
 import re
 from pathlib import Path
@@ -15,6 +18,7 @@ import pytest
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 NAMES = sorted(path.stem for path in NOTEBOOKS.glob("*.ipynb"))
+LONG = ["03_quarter_car_design", "04_direct_or_adjoint", "05_speed_or_accuracy", "06_sweeps"]  # a minute or more each
 
 
 def read(name):
@@ -34,7 +38,7 @@ def run(source, filename, names):
     return None if last is None else eval(compile(ast.Expression(last.value), filename, "eval"), names)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in NAMES])
 def test_a_notebook_runs(name, tmp_path, monkeypatch):
     """And shows figures where they are committed."""
     monkeypatch.chdir(tmp_path)  # where a notebook writes
@@ -47,6 +51,35 @@ def test_a_notebook_runs(name, tmp_path, monkeypatch):
         if is_figure:
             assert shown._repr_png_().startswith(b"\x89PNG")
     jax.clear_caches()
+
+
+def imported(tree):
+    """What the modules are called that a cell imports as `import a.b as c` or `from a import b`."""
+    names = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {of.asname: importlib.import_module(of.name) for of in node.names if of.asname}
+        if isinstance(node, ast.ImportFrom):
+            names |= {of.asname or of.name: getattr(importlib.import_module(node.module), of.name) for of in node.names}
+    return names
+
+
+@pytest.mark.parametrize("name", LONG)
+def test_what_a_long_notebook_asks_for_is_there(name):
+    """Every name of a module that its cells use, and every keyword that they give to a function of lgsens."""
+    tree = ast.parse("\n".join("".join(cell["source"]) for cell in cells(name, "code")))
+    names, asked = imported(tree), 0
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute | ast.Call):
+            of = node.func if isinstance(node, ast.Call) else node
+            parts = ast.unparse(of).split(".")
+            if parts[0] not in names or not all(map(str.isidentifier, parts)):
+                continue
+            found = functools.reduce(getattr, parts[1:], names[parts[0]])
+            if isinstance(node, ast.Call) and str(getattr(found, "__module__", "")).startswith("lgsens"):
+                inspect.signature(found).bind_partial(**{word.arg: None for word in node.keywords if word.arg})
+                asked += 1
+    assert asked > 3
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -113,18 +113,21 @@ def _sides(p, integrator):
     return run.t, run.body("top").position[:, 0] ** 2 + 1e-5 * run.multiplier("pivot")[:, 2]
 
 
-def test_outputs_and_checkpoints():
-    plain = jax.jit(jax.value_and_grad(lambda p: psi(p, integrator=MIDPOINT)))(P)
-    for integrator in (MIDPOINT, GIVEN):
-        for method in (lg.DirectDifferentiation(), lg.AdjointVariable(checkpoints=2)):
-            f = lambda p, i=integrator, m=method: psi(p, integrator=i, save=side, sensitivity=m)
-            value, slope = jax.jit(jax.value_and_grad(f))(P)
-            if integrator is MIDPOINT:
-                np.testing.assert_allclose(value, plain[0], rtol=1e-10)
-                np.testing.assert_allclose(slope, plain[1], rtol=1e-8)
-            else:
-                forward = jax.jit(jax.jacfwd(lambda p, i=integrator: psi(p, integrator=i)))(P)
-                np.testing.assert_allclose(slope, forward, rtol=1e-8)
+@pytest.mark.parametrize(
+    ("integrator", "method"),
+    [
+        pytest.param(MIDPOINT, lg.DirectDifferentiation(), marks=pytest.mark.slow),
+        pytest.param(MIDPOINT, lg.AdjointVariable(checkpoints=2), marks=pytest.mark.slow),
+        pytest.param(GIVEN, lg.DirectDifferentiation(), marks=pytest.mark.slow),
+        (GIVEN, lg.AdjointVariable(checkpoints=2)),
+    ],
+)
+def test_outputs_and_checkpoints(integrator, method):
+    plain = lambda p: psi(p, integrator=integrator)
+    saved = lambda p: psi(p, integrator=integrator, save=side, sensitivity=method)
+    value, slope = jax.jit(jax.value_and_grad(saved))(P)
+    np.testing.assert_allclose(value, jax.jit(plain)(P), rtol=1e-10)
+    np.testing.assert_allclose(slope, jax.jit(jax.jacfwd(plain))(P), rtol=1e-8)
 
 
 def test_second_derivatives():

@@ -136,6 +136,7 @@ def test_hessian(scene):
     np.testing.assert_allclose(hessian, hessian.T, rtol=0, atol=1e-10 * scale)
 
 
+@pytest.mark.slow
 def test_all_orders_of_second_derivatives():
     """Forward and reverse nested in every order, on the top."""
     criterion = lambda a: top(jnp.stack([a, jnp.ones_like(a)]))[1]
