@@ -4,9 +4,9 @@ With the contact at r from the centre, ẋ = −ω × r, so ẍ = −ω̇ × r �
 contact is F = m (ẍ − g), and I ω̇ + ω × I ω = r × F determines ω̇: I ω̇ + m r × (ω̇ × r) = −ω × I ω − m r × (ω × ṙ + g).
 """
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
-from scipy.spatial.transform import Rotation
 
 import lgsens as lg
 
@@ -17,8 +17,10 @@ TILT, SPIN = 0.35, np.array([0.4, 6.0, 0.5])  # of the reference: about x; and �
 
 def scene(tilt=TILT, spin=SPIN, radius=RADIUS) -> lg.Model:
     """The disc at rest of centre, of which the joint makes a rolling one."""
-    turn = Rotation.from_rotvec([tilt, 0.0, 0.0]).as_matrix()
-    height = (0.0, 0.0, radius * np.cos(tilt))
+    c, s = jnp.cos(tilt), jnp.sin(tilt)
+    zero, one = jnp.zeros_like(c), jnp.ones_like(c)
+    turn = jnp.stack([jnp.stack([one, zero, zero]), jnp.stack([zero, c, -s]), jnp.stack([zero, s, c])])
+    height = jnp.stack([zero, zero, radius * c])
     disc = lg.RigidBody(MASS, MOMENTS, position=height, orientation=turn, angular_velocity=spin)
     rolling = lg.Rolling("disc", at=height, axis=turn[:, 1], radius=radius)
     return lg.Model({"disc": disc}, {"rolling": rolling}, {"weight": lg.Gravity(tuple(G))})

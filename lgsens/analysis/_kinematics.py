@@ -119,7 +119,7 @@ def kinematics(
         )
     if system.num_states:
         raise ValueError(
-            f"`model`: the force elements {sorted(system.owners_of_states)} have states, whose values depend on the "
+            f"`model`: the force elements {sorted(system.places_of_states())} have states, whose values depend on the "
             "motion before; use `simulate`, or leave them out."
         )
     unknowns, equations = system.group.dim, len(system.constraint_names)

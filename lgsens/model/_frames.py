@@ -55,6 +55,19 @@ class Frame(NamedTuple):
         return turn_back(self.orientation, axis)
 
 
+def motion_at(arm, position, orientation, twist, rate):
+    """x, ẋ and ẍ [m, s] of the point at X in body frames, from x, R, [ẋ, Ω] and [ẍ, Ω̇] of these; along leading axes.
+
+    x + R X,   ẋ + R (Ω × X),   ẍ + R (Ω̇ × X + Ω × (Ω × X))
+    """
+    to_inertial = lambda local: jnp.einsum("...ij,...j->...i", orientation, local)
+    (velocity, spin), (acceleration, change) = ((x[..., : ROTATION.start], x[..., ROTATION]) for x in (twist, rate))
+    arm = jnp.broadcast_to(arm, spin.shape)
+    swing = jnp.cross(spin, arm)
+    acceleration = acceleration + to_inertial(jnp.cross(change, arm) + jnp.cross(spin, swing))
+    return position + to_inertial(arm), velocity + to_inertial(swing), acceleration
+
+
 def ground_frame(dtype) -> Frame:
     """The inertial frame itself."""
     return Frame(jnp.zeros(3, dtype), jnp.eye(3, dtype=dtype))

@@ -1,14 +1,17 @@
 """The parts of merged bodies: their motion, and what their fixed joints carry."""
 
-from typing import Generic, TypeVar
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Generic, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from lgsens.dynamics import AbstractSystem, full_jacobian
 from lgsens.liegroups import Pose
-from lgsens.model._frames import BODY_DIM, ROTATION, Frame
+from lgsens.model._frames import BODY_DIM, ROTATION, Frame, motion_at
 
 System = TypeVar("System", bound=AbstractSystem)
 
@@ -47,15 +50,11 @@ class Parts(eqx.Module, Generic[System]):
         orientation = of_bodies(q.orientation, jnp.eye(3, dtype=c.dtype))
         twist, rate = of_bodies(twist, at_rest), of_bodies(rate, at_rest)
 
-        arm = jnp.broadcast_to(c, position.shape)
-        to_inertial = lambda local: jnp.einsum("...ij,...j->...i", orientation, local)
         to_part = lambda x: jnp.einsum("pji,...pj->...pi", turn, x)
         spin, change = twist[..., ROTATION], rate[..., ROTATION]
-        swing = jnp.cross(spin, arm)
-        velocity = twist[..., : ROTATION.start] + to_inertial(swing)
-        acceleration = rate[..., : ROTATION.start] + to_inertial(jnp.cross(change, arm) + jnp.cross(spin, swing))
+        position, velocity, acceleration = motion_at(c, position, orientation, twist, rate)
         return (
-            Pose(position + to_inertial(arm), orientation @ jnp.broadcast_to(turn, orientation.shape)),
+            Pose(position, orientation @ jnp.broadcast_to(turn, orientation.shape)),
             self._coordinates(velocity, to_part(spin)),
             self._coordinates(acceleration, to_part(change)),
         )
@@ -79,3 +78,25 @@ class Parts(eqx.Module, Generic[System]):
         jacobian = full_jacobian(self.system, q, t)[rows]
         found = jnp.linalg.solve(jacobian @ jacobian.T, -(jacobian @ residual))
         return jnp.zeros(len(names), lam.dtype).at[rows].set(found)
+
+    def multiplier(self, joint: str, rows_between: Callable[[str], np.ndarray], q, v, vdot, lam, t):
+        """The multipliers of a merged joint, along leading axes of q, v, v̇ of the parts and of λ between the merged
+        bodies, where those of each other joint are at `rows_between`."""
+        whole: Any = self.system
+        places, own_places = [np.zeros(0, int)], [np.zeros(0, int)]
+        for name in sorted(set(whole.constraint_names) - set(self.joints)):
+            rows, own = whole.multiplier_rows(name), rows_between(name)
+            if len(rows) != len(own):
+                raise ValueError(
+                    f"`multiplier`: what {joint!r} carries is not determined: joint {name!r} has {len(rows)} "
+                    f"equations between the bodies that it names, and {len(own)} between the merged ones. Leave "
+                    "`merge_fixed` out and remove the equations that are redundant then."
+                )
+            places.append(rows)
+            own_places.append(own)
+        others = jnp.zeros((*lam.shape[:-1], len(whole.constraint_names)), lam.dtype)
+        others = others.at[..., np.concatenate(places)].set(lam[..., np.concatenate(own_places)])
+        complete = partial(self.with_fixed, joint)
+        for _ in lam.shape[:-1]:
+            complete = jax.vmap(complete)
+        return complete(q, v, vdot, others, t)[..., whole.multiplier_rows(joint)]

@@ -96,6 +96,11 @@ class Model(eqx.Module):
             for name, member in members.items():
                 if not isinstance(member, kind):
                     raise ValueError(f"{what} {name!r} must be a {kind.__name__}, got {type(member).__name__}.")
+                if names := [leaf for leaf in jax.tree.leaves(member) if isinstance(leaf, str)]:
+                    raise ValueError(
+                        f"{what} {name!r}: {type(member).__name__} has names among its numbers, {names}; declare their "
+                        "fields with `eqx.field(static=True)`."
+                    )
         if not any(body.free for body in self.bodies.values()):
             raise ValueError("Model: no body has a degree of freedom; let at least one of them have a `free` one.")
         for name, joint in self.joints.items():

@@ -159,6 +159,12 @@ def at_ends(stacks: Sequence[Stack], q: Pose, *arrays) -> list[AtEnds]:
     return [AtEnds(a, b) for a, b in zip(at([stack.a for stack in stacks]), at([stack.b for stack in stacks]))]
 
 
+def state_coordinates(stack: Stack, index: np.ndarray) -> np.ndarray:
+    """Which coordinates have the states of each element as velocities, shape (elements, s), given those of bodies."""
+    every = [index[list(of), : ROTATION.start] for of in stack.carriers]
+    return np.concatenate(every, axis=1)[:, : num_states(stack.elements)]
+
+
 def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
     """Group elements by type and ground side, keeping their order within a group; rows of velocity level are last."""
     groups: dict[Any, list[Placed[Element]]] = {}

@@ -14,7 +14,7 @@ from lgsens.dynamics import AbstractRedundantSystem, AbstractSparseSystem, Tange
 from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew, turn
 from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, chosen
 from lgsens.model._constraints import AbstractRows
-from lgsens.model._frames import BODY_DIM, ROTATION
+from lgsens.model._frames import BODY_DIM, ROTATION, motion_at
 from lgsens.model._loads import AbstractDynamicLoad, AbstractLoad, generalized_force
 from lgsens.model._merged_parts import Parts
 from lgsens.model._stack import (
@@ -25,6 +25,7 @@ from lgsens.model._stack import (
     constraint_stiffness,
     load_tangents,
     square_blocks,
+    state_coordinates,
 )
 from lgsens.model._topology import Topology, topology
 
@@ -104,23 +105,15 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         return Pose(pick(moves, q.position, self.pose.position), pick(turns, q.orientation, self.pose.orientation))
 
     def motion(self, body: int, q, v, vdot):
-        """Position, orientation, velocity, Ω, acceleration, Ω̇ of a body's centre of mass, along leading axes.
-
-        With the origin of the body frame at rest and the centre of mass at c in it: x = x_o + R c, ẋ = R (Ω × c) and
-        ẍ = R (Ω̇ × c + Ω × (Ω × c)).
-        """
+        """Position, orientation, velocity, Ω, acceleration, Ω̇ of a body's centre of mass, along leading axes."""
         q = self._placed(q)
         position, orientation = q.position[..., body, :], q.orientation[..., body, :, :]
         twist, rate = (self.twists(x)[..., body, :] for x in (v, vdot))
-        velocity, spin = twist[..., : ROTATION.start], twist[..., ROTATION]
-        acceleration, change = rate[..., : ROTATION.start], rate[..., ROTATION]
-        if self.centre is not None:
-            to_inertial = lambda local: jnp.einsum("...ij,...j->...i", orientation, local)
-            arm = jnp.broadcast_to(self.centre[body], spin.shape)
-            swing = jnp.cross(spin, arm)
-            position, velocity = position + to_inertial(arm), velocity + to_inertial(swing)
-            acceleration = acceleration + to_inertial(jnp.cross(change, arm) + jnp.cross(spin, swing))
-        return position, orientation, velocity, spin, acceleration, change
+        if self.centre is None:
+            velocity, acceleration = twist[..., : ROTATION.start], rate[..., : ROTATION.start]
+        else:
+            position, velocity, acceleration = motion_at(self.centre[body], position, orientation, twist, rate)
+        return position, orientation, velocity, twist[..., ROTATION], acceleration, rate[..., ROTATION]
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
@@ -137,9 +130,8 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         the radius of gyration of all of them: a moment counts as a force at the arm l."""
         if not self.minimum_norm:
             return None
-        count = len(self.body_names)
-        mass = jnp.mean(self.mass[:count])
-        square = jnp.mean(jnp.trace(self.inertia[:count], axis1=1, axis2=2)) / (3.0 * mass)
+        mass = jnp.mean(self.mass[: len(self.body_names)])
+        square = jnp.mean(jnp.trace(self.inertia[: len(self.body_names)], axis1=1, axis2=2)) / (3.0 * mass)
         square = jnp.where(square > 0, square, 1.0)
         angular, t = [], jnp.zeros((), mass.dtype)
         for stack, ends, rows in zip(self.constraints, at_ends(self.constraints, self.pose), self.topology.rows):
@@ -179,23 +171,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             raise ValueError(f"`multiplier`: {suggestion(joint, set(whole.constraint_names))}.")
         if self.parts is None or joint not in self.parts.joints:
             return lam[..., self.multiplier_rows(joint)]
-        places, own_places = [np.zeros(0, int)], [np.zeros(0, int)]
-        for name in sorted(set(whole.constraint_names) - set(self.parts.joints)):
-            rows, own = whole.multiplier_rows(name), self.multiplier_rows(name)
-            if len(rows) != len(own):
-                raise ValueError(
-                    f"`multiplier`: what {joint!r} carries is not determined: joint {name!r} has {len(rows)} "
-                    f"equations between the bodies that it names, and {len(own)} between the merged ones. Leave "
-                    "`merge_fixed` out and remove the equations that are redundant then."
-                )
-            places.append(rows)
-            own_places.append(own)
-        others = jnp.zeros((*lam.shape[:-1], len(whole.constraint_names)), lam.dtype)
-        others = others.at[..., np.concatenate(places)].set(lam[..., np.concatenate(own_places)])
-        complete = partial(self.parts.with_fixed, joint)
-        for _ in lam.shape[:-1]:
-            complete = jax.vmap(complete)
-        return complete(q, v, vdot, others, t)[..., whole.multiplier_rows(joint)]
+        return self.parts.multiplier(joint, self.multiplier_rows, q, v, vdot, lam, t)
 
     def reference(self):
         return self.pose, self.velocity
@@ -213,7 +189,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         every = scale[np.concatenate([np.asarray(own, int) for own in self.free])]
         for stack in self._dynamic:
             sizes = jax.vmap(lambda load, length: load.size(length), in_axes=(0, None))(stack.elements, scale[0])
-            every = every.at[self._of_states(stack)].set(sizes)
+            every = every.at[state_coordinates(stack, self.index)].set(sizes)
         return every
 
     @property
@@ -225,30 +201,21 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         """The stacks of loads with states."""
         return [stack for stack in self.loads if stack.carriers]
 
-    def _of_states(self, stack: Stack[AbstractDynamicLoad]) -> np.ndarray:
-        """The coordinates of the states of each element of a stack, shape (elements, s)."""
-        return np.concatenate([self.index[list(of), : ROTATION.start] for of in stack.carriers], axis=1)[
-            :, : len(stack.elements.states)
-        ]
-
     def settled(self, q, v, t):
         stacks = self._dynamic
         for stack, ends in zip(stacks, at_ends(stacks, self._placed(q), self.twists(v))):
-            v = v.at[self._of_states(stack)].set(stack.map(lambda load, *args: load.initial(*args), ends, (t,)))
+            v = v.at[state_coordinates(stack, self.index)].set(
+                stack.map(lambda load, *args: load.initial(*args), ends, (t,))
+            )
         return v
 
-    @property
-    def owners_of_states(self) -> dict[str, tuple[Stack[AbstractDynamicLoad], int]]:
-        """The stack of each element with states and its place there, by its name."""
-        return {owner: (stack, i) for stack in self._dynamic for i, owner in enumerate(stack.owners)}
-
-    def states_of(self, force: str, v: Float[Array, "*batch k"]) -> dict[str, Float[Array, "*batch"]]:
-        """The states of the element `force` by their names, along leading axes."""
-        known = self.owners_of_states
-        if force not in known:
-            raise ValueError(f"`states_of`: {suggestion(force, known)}, the force elements with states.")
-        stack, i = known[force]
-        return {name: v[..., place] for name, place in zip(stack.elements.states, self._of_states(stack)[i])}
+    def places_of_states(self) -> dict[str, dict[str, int]]:
+        """By the name of each force element with states, and their names, where they are in v."""
+        return {
+            owner: dict(zip(stack.elements.states, map(int, places)))
+            for stack in self._dynamic
+            for owner, places in zip(stack.owners, state_coordinates(stack, self.index))
+        }
 
     def mass_matrix(self):
         return self.sparse_mass_matrix().dense()

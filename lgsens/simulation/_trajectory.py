@@ -98,7 +98,10 @@ class AbstractMotion(eqx.Module):
 
         Raises `ValueError` for an unknown name, or an element without states.
         """
-        return self._multibody().states_of(force, self._kinematics()[0].v)
+        places, v = self._multibody().places_of_states(), self._kinematics()[0].v
+        if force not in places:
+            raise ValueError(f"`states_of`: {suggestion(force, places)}, the force elements with states.")
+        return {name: v[..., place] for name, place in places[force].items()}
 
     def force(self, name: str) -> Any:
         """What a force element measures, every array with a leading axis n + 1 if this is a trajectory.
