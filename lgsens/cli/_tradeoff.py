@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -67,17 +66,10 @@ def quarter_car(bushings: Sequence[str] = ()) -> Scene:
     import diffrax  # takes its time to import
 
     car = QuarterCar.load()
-    names = sorted(car.links)
-    parameters = {
-        "stiffness": car.spring.rate,
-        "damping": car.damper.rate,
-        "hardpoints": jnp.stack([car.links[name].chassis for name in names]),
-    }
+    parameters = {"stiffness": car.spring.rate, "damping": car.damper.rate, "hardpoints": car.hardpoints}
 
     def build(p, **options):
-        members = lambda car: [car.spring.rate, car.damper.rate, *(car.links[name].chassis for name in names)]
-        moved = eqx.tree_at(members, car, [p["stiffness"], p["damping"], *p["hardpoints"]])
-        return moved.model(wheel="locked", bushings=bushings, **options)
+        return car.with_values(**p).model(wheel="locked", bushings=bushings, **options)
 
     comfort = Criterion(integrand=lambda s, p: s.body("chassis").acceleration[2] ** 2)
     # The bump ends at 0.25 s: a fourth of the steps, so that the kink is between two of them.
