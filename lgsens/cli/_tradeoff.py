@@ -1,9 +1,7 @@
 """`lgsens tradeoff`: what settings cost and lose on a scene, and which to take for how many digits."""
 
 import argparse
-import json
 import os
-import platform
 import runpy
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -14,7 +12,7 @@ import jax.numpy as jnp
 
 from lgsens import plotting
 from lgsens.accuracy import Recommendation, Setting, Table, grid, ladder, plot, recommend, work_precision
-from lgsens.cli._report import output_folder, version
+from lgsens.cli._report import output_folder, versions, write_json
 from lgsens.criteria import Criterion
 from lgsens.examples import PROBLEMS, QuarterCar
 from lgsens.integrate import GeneralizedAlpha, IndexReducedODE
@@ -130,22 +128,12 @@ def run(arguments: argparse.Namespace) -> int:
     plotting.figure()  # asks for matplotlib now, not after minutes
     scene = SCENES[arguments.scene]() if arguments.scene in SCENES else from_file(Path(arguments.scene))
     with output_folder(arguments.out, arguments.overwrite) as out:
-        table = work_precision(
-            scene.criterion,
-            scene.build,
-            scene.parameters,
-            scene.settings,
-            t0=scene.t0,
-            t1=scene.t1,
-            scale=scene.scale,
-            rounds=arguments.rounds,
-            progress=not arguments.quiet,
-        )
+        what = {"t0": scene.t0, "t1": scene.t1, "scale": scene.scale}
+        how = {"rounds": arguments.rounds, "progress": not arguments.quiet}
+        table = work_precision(scene.criterion, scene.build, scene.parameters, scene.settings, **what, **how)
         found = [recommend(table, target, by=arguments.by) for target in arguments.targets]
-        text = json.dumps(document(scene, table, found), indent=1, ensure_ascii=False, allow_nan=False)
-        (out / "tradeoff.json").write_text(text + "\n", encoding="utf-8")
-        figure = plot(table, arguments.targets, by=arguments.by, title=scene.title)
-        plotting.save(figure, out / "tradeoff.png")
+        write_json(document(scene, table, found), out / "tradeoff.json", indent=1, ensure_ascii=False)
+        plotting.save(plot(table, arguments.targets, by=arguments.by, title=scene.title), out / "tradeoff.png")
     if not arguments.quiet:
         print(table, *found, f"written to {out}: tradeoff.json, tradeoff.png", sep="\n\n")
     return 0 if all(found) else 1
@@ -176,6 +164,5 @@ def document(scene: Scene, table: Table, found: list[Recommendation]) -> dict[st
         "cores": os.cpu_count(),
         "load_average": round(os.getloadavg()[0], 1),
         "device": jax.devices()[0].platform,
-        "versions": {"python": platform.python_version()}
-        | {name: version(name) for name in ("lgsens", "jax", "jaxlib", "diffrax", "numpy")},
+        "versions": versions("diffrax"),
     }
