@@ -47,10 +47,11 @@ def run(arguments: argparse.Namespace) -> int:
             curves = {label: car.curves(travel) for label, car in outcome.cars.items()}
             outcome = outcome._replace(curves=curves)
         settings = {name: value for name, value in vars(arguments).items() if name not in ("run", "command")}
-        write_json(document(outcome, settings, TOLERANCE), out / "result.json", indent=2, default=str)
+        found = document(outcome, settings, TOLERANCE)
+        write_json(found, out / "result.json", indent=2, default=str)
         _figures(outcome, out)
         if not arguments.quiet:
-            print(table(outcome, TOLERANCE), written(out), sep="\n")
+            print(table(found), written(out), sep="\n")
     return 0 if outcome.result.feasible else 1
 
 

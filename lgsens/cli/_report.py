@@ -113,10 +113,11 @@ def constraints(outcome: Any, tolerance: float) -> list[dict[str, Any]]:
     """The worst moment of each path constraint before and after, and whether it is active at the end."""
     rows = []
     for i, (name, quantity, limit, unit) in enumerate(CONSTRAINTS):
-        row = {"name": name, "unit": unit, "limit": float(getattr(outcome.design.limits, limit))}
-        for label, response in (("before", outcome.before), ("after", outcome.after)):
-            row[label] = _worst(getattr(response, quantity), response.constraints[:, i], time=response.t)
-        rows.append(_with_state(row, tolerance))
+        stages = {
+            label: _worst(getattr(response, quantity), response.constraints[:, i], time=response.t)
+            for label, response in (("before", outcome.before), ("after", outcome.after))
+        }
+        rows.append(_row(name, unit, getattr(outcome.design.limits, limit), stages, tolerance))
     return rows
 
 
@@ -129,11 +130,9 @@ def kept_curves(outcome: Any, tolerance: float) -> list[dict[str, Any]]:
     curves = {label: keep.curves(car) for label, car in cars.items()}
     for name, band in keep.bands.items():
         middle, half = np.asarray(band.lower + band.upper) / 2, np.asarray(band.upper - band.lower) / 2
-        row = {"name": f"change of {name}", "unit": "rad", "limit": float(half[0])}
-        for label, found in curves.items():
-            change = np.asarray(getattr(found, name)) - middle
-            row[label] = _worst(change, np.abs(change) / half - 1, travel=keep.travel)
-        rows.append(_with_state(row, tolerance))
+        changes = {label: np.asarray(getattr(found, name)) - middle for label, found in curves.items()}
+        stages = {label: _worst(c, np.abs(c) / half - 1, travel=keep.travel) for label, c in changes.items()}
+        rows.append(_row(f"change of {name}", "rad", half[0], stages, tolerance))
     return rows
 
 
@@ -144,8 +143,9 @@ def _worst(values, violations, **places) -> dict[str, float]:
     return {"worst_value": float(values[worst]), **where, "violation_over_scale": float(violations[worst])}
 
 
-def _with_state(row: dict[str, Any], tolerance: float) -> dict[str, Any]:
-    return row | {"active": abs(row["after"]["violation_over_scale"]) <= tolerance}
+def _row(name: str, unit: str, limit, stages: dict[str, dict[str, float]], tolerance: float) -> dict[str, Any]:
+    active = abs(stages["after"]["violation_over_scale"]) <= tolerance
+    return {"name": name, "unit": unit, "limit": float(limit), **stages, "active": active}
 
 
 def _values(design: Any, name: str, value: Any) -> Any:
@@ -159,46 +159,43 @@ def _finite(values: np.ndarray) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]
 
 
-def table(outcome: Any, tolerance: float) -> str:
-    """The design, the objective, the constraints and the gradient check, before and after."""
-    design, result = outcome.design, outcome.result
-    lower, upper = design.bounds
+def table(found: dict[str, Any]) -> str:
+    """The design, the objective, the constraints and the gradient check of a `document`, before and after."""
     lines = [f"{'':<36}{'before':>13}{'after':>13}   limits", "-" * 92]
 
     def line(name, before, after, note, digits):
         lines.append(f"{name:<36}{before:>13.{digits}f}{after:>13.{digits}f}   {note}")
 
-    for name, value in design.start.items():
+    for name, row in found["design"].items():
         if name != "hardpoints":
-            bounds = f"{float(lower[name]):.0f} .. {float(upper[name]):.0f}"
-            line(f"{name} [{UNITS[name]}]", float(value), float(result.x[name]), bounds, 0)
+            line(f"{name} [{row['unit']}]", row["before"], row["after"], f"{row['lower']:.0f} .. {row['upper']:.0f}", 0)
             continue
-        box = 1e3 * float(design.limits.hardpoint_box)
-        for link, old, new in zip(sorted(design.car.links), value, result.x[name]):
-            for axis, a, b in zip("xyz", np.asarray(old), np.asarray(new)):
-                at_bound = ", at the bound" if box - abs(1e3 * (b - a)) < 1e-3 * box else ""
-                line(f"{link} {axis} [mm]", 1e3 * a, 1e3 * b, f"+-{box:.0f} mm{at_bound}", 1)
-    reduction = 100 * (1 - result.objective / float(outcome.before.objective))
-    line("Psi_0 [m^2/s^3]", float(outcome.before.objective), result.objective, f"{-reduction:+.1f} %", 4)
+        for link in row["before"]:
+            for i, axis in enumerate("xyz"):
+                before, after, highest = (1e3 * row[stage][link][i] for stage in ("before", "after", "upper"))
+                box = highest - before
+                at_bound = ", at the bound" if box - abs(after - before) < 1e-3 * box else ""
+                line(f"{link} {axis} [mm]", before, after, f"+-{box:.0f} mm{at_bound}", 1)
+    objective, tolerance = found["objective"], found["constraint_tolerance"]
+    line("Psi_0 [m^2/s^3]", objective["before"], objective["after"], f"{-100 * objective['reduction']:+.1f} %", 4)
     shown = {"m": (1e3, "mm"), "rad": (np.degrees(1.0), "deg")}
-    for row in constraints(outcome, tolerance) + kept_curves(outcome, tolerance):
+    for row in found["constraints"]:
         factor, unit = shown.get(row["unit"], (1.0, row["unit"]))
-        before, after = (factor * row[label]["worst_value"] for label in ("before", "after"))
+        before, after = (factor * row[stage]["worst_value"] for stage in ("before", "after"))
         violation = row["after"]["violation_over_scale"]
         state = "active" if row["active"] else "satisfied" if violation <= tolerance else "VIOLATED"
         note = f"{factor * row['limit']:g}, {state} ({violation:+.1e} of scale)"
         line(f"{row['name']} [{unit}]", before, after, note, 2)
-    kept = {} if design.keep is None else design.keep.bands
+    kept = [row["name"] for row in found["constraints"]]
     for name in ("camber", "toe"):
-        if outcome.curves and name not in kept:
-            before, after = (np.degrees(getattr(outcome.curves[label], name)) for label in ("before", "after"))
-            change, travel = after - before, 1e3 * float(outcome.curves["before"].travel[-1])
+        if found["curves"] and f"change of {name}" not in kept:
+            before, after = (np.degrees(found["curves"][stage][name]) for stage in ("before", "after"))
+            change, travel = after - before, 1e3 * found["curves"]["before"]["travel"][-1]
             note = f"free, at worst over +-{travel:.0f} mm of travel"
             line(f"change of {name} [deg]", 0.0, change[np.argmax(np.abs(change))], note, 2)
-    lines.append("-" * 92)
-    errors = (f"{float(np.max(check.error)):.1e} at the {where}" for where, check in outcome.checks.items())
-    lines.append(f"gradient against central differences: relative error {', '.join(errors)}")
-    lines.append(", ".join(f"{name} {value:.2f} s" for name, value in outcome.seconds.items()))
-    if not result.feasible:
+    errors = (f"{max(check['relative_error']):.1e} at the {where}" for where, check in found["gradient_check"].items())
+    seconds = (f"{name} {value:.2f} s" for name, value in found["seconds"].items())
+    lines += ["-" * 92, f"gradient against central differences: relative error {', '.join(errors)}", ", ".join(seconds)]
+    if not found["feasible"]:
         lines.append("No design satisfied the path constraints; this one violates them least. Try more --steps.")
     return "\n".join(lines)
