@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from lgsens.plotting._style import COLOURS, CURVES, LIMIT, figure, plain
+from lgsens.plotting._style import COLOURS, CURVES, LIMIT, LIMIT_LINE, figure, legend_below, plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -58,8 +58,7 @@ def errors(panels: Sequence[ErrorPanel], title: str = "") -> "Figure":
         axes.set(title=panel.title, xlabel=panel.horizontal, ylabel=panel.label)
         if panel.order is not None:
             _slope(axes, panel, panel.order)
-    style = {"ncols": -(-len(names) // 2) if len(names) > 3 else len(names), "frameon": False, "handlelength": 3.5}
-    fig.legend(handles=list(handles.values()), loc="outside lower center", **style)
+    legend_below(fig, handles, -(-len(names) // 2) if len(names) > 3 else len(names))
     return fig
 
 
@@ -87,14 +86,16 @@ class WorkPrecision(NamedTuple):
     cost: Any
     error: Any
 
+    def _by_cost(self) -> tuple[np.ndarray, np.ndarray]:
+        order = np.argsort(self.cost)
+        return np.asarray(self.cost, float)[order], np.asarray(self.error, float)[order]
+
     def cost_of(self, target: float) -> float | None:
         """What an error of `target` costs: between the two settings around it, along a line in the logarithms.
 
         The first setting may be better already; None where no setting is as good.
         """
-        cost, error = (np.asarray(array, float) for array in (self.cost, self.error))
-        order = np.argsort(cost)
-        cost, error = cost[order], error[order]
+        cost, error = self._by_cost()
         met = np.flatnonzero(error <= target)
         if not len(met):
             return None
@@ -131,13 +132,11 @@ def work_precision(
     axes = fig.add_subplot()
     unit = cost.partition("[")[2].partition("]")[0]
     for i, (name, method) in enumerate(methods.items()):
-        _check_costs(name, method)
+        x, y = _drawn(name, method)
         label = name
         if target is not None:
             price = method.cost_of(target)
             label += ": not reached" if price is None else f": {price:.3g} {unit}".rstrip()
-        order = np.argsort(method.cost)
-        x, y = (np.asarray(array, float)[order] for array in method)
         axes.loglog(x, y, label=label, **CURVES[i % len(CURVES)])
     if target is not None:
         _target_line(axes, target)
@@ -173,10 +172,8 @@ def work_precision_panels(
     for axes, (quantity, methods) in zip(all_axes, panels.items()):
         axes.set(xscale="log", yscale="log", xlabel=cost, ylabel=f"relative error of {quantity} [–]")
         for name, method in methods.items():
-            _check_costs(name, method)
+            x, y = _drawn(name, method)
             style = CURVES[names.index(name) % len(CURVES)]
-            order = np.argsort(method.cost)
-            x, y = (np.asarray(array, float)[order] for array in method)
             best = y < np.minimum.accumulate(np.concatenate([[np.inf], y[:-1]]))
             (handles[name],) = axes.plot(x[best], y[best], label=name, **style)
             axes.plot(x[~best], y[~best], **style | {"linestyle": "", "alpha": 0.3})
@@ -186,17 +183,18 @@ def work_precision_panels(
             axes.plot([price, price], [target, reached], color=LIMIT, linewidth=0.9, zorder=3)
             axes.plot(price, reached, marker="*", markersize=11, color=LIMIT, linestyle="", zorder=3)
         plain(axes)
-    style = {"ncols": 2 if len(names) > 3 else max(len(names), 1), "frameon": False, "handlelength": 3.5}
-    fig.legend(handles=list(handles.values()), loc="outside lower center", **style)
+    legend_below(fig, handles, 2 if len(names) > 3 else max(len(names), 1))
     return fig
 
 
-def _check_costs(name: str, method: WorkPrecision) -> None:
+def _drawn(name: str, method: WorkPrecision) -> tuple[np.ndarray, np.ndarray]:
+    """Costs, which a logarithmic axis can show, and errors, from the cheapest on."""
     if not np.all(np.asarray(method.cost) > 0):
         raise ValueError(f"`methods[{name!r}]`: costs must be positive, got {method.cost}.")
+    return method._by_cost()
 
 
 def _target_line(axes: "Axes", target: float, linewidth: float = 1.2, side: str = "left") -> None:
-    axes.axhline(target, color=LIMIT, linestyle=(0, (5, 3)), linewidth=linewidth)
+    axes.axhline(target, **LIMIT_LINE | {"linewidth": linewidth})
     style = {"color": LIMIT, "ha": side, "va": "bottom", "transform": axes.get_yaxis_transform()}
     axes.text({"left": 0.01, "right": 0.99}[side], target, f"target {target:g}", **style)

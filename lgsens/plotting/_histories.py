@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from lgsens.plotting._style import COLOURS, LIMIT, figure, plain
+from lgsens.plotting._style import COLOURS, LIMIT, LIMIT_LINE, figure, plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,25 +42,16 @@ def time_histories(t, panels: Sequence[Panel], title: str = "") -> "Figure":
         for i, (name, values) in enumerate(panel.series.items()):
             axes.plot(t, np.asarray(values), label=name, color=COLOURS[i % len(COLOURS)], linewidth=1.8)
         for name, value in panel.limits.items():
-            axes.axhline(value, color=LIMIT, linestyle=(0, (5, 3)), linewidth=1.2)
+            axes.axhline(value, **LIMIT_LINE)
             # The name stands at the right end of its line, where motions have died out.
-            axes.annotate(
-                name,
-                (1.0, value),
-                xycoords=("axes fraction", "data"),
-                xytext=(-4, 3),
-                textcoords="offset points",
-                ha="right",
-                color=LIMIT,
-                fontsize=9,
-            )
+            place = {"xycoords": ("axes fraction", "data"), "xytext": (-4, 3), "textcoords": "offset points"}
+            axes.annotate(name, (1.0, value), **place, ha="right", color=LIMIT, fontsize=9)
         plain(axes)
         axes.margins(x=0, y=0.12)
         axes.set_ylabel(panel.label)
     fig.align_ylabels()
     all_axes[-1].set_xlabel("time [s]")
-    handles, labels = all_axes[0].get_legend_handles_labels()
-    all_axes[0].legend(handles, labels, frameon=False, ncols=len(labels), loc="upper right")
+    all_axes[0].legend(frameon=False, ncols=len(panels[0].series), loc="upper right")
     return fig
 
 
@@ -76,12 +67,18 @@ def convergence(history: Any, *, tolerance: float, best: int | None = None, obje
     Raises `ImportError` without matplotlib.
     """
     fig = figure(8.0, 7.4)
-    top, middle, bottom = fig.subplots(3, 1, sharex=True)
-    steps = np.arange(len(history.objective))
-    style = {"color": COLOURS[1], "linewidth": 1.6, "marker": "o", "markersize": 3}
-    top.plot(steps, history.objective, **style)
-    middle.plot(steps, history.worst_constraint, **style)
-    bottom.semilogy(steps, history.gradient_norm, **style)
+    all_axes = fig.subplots(3, 1, sharex=True)
+    top, middle, bottom = all_axes
+    values = (history.objective, history.worst_constraint, history.gradient_norm)
+    labels = (objective, "worst constraint\nover its scale [–]", "projected gradient\nof the Lagrangian [–]")
+    for axes, value, label in zip(all_axes, values, labels):
+        axes.plot(value, color=COLOURS[1], linewidth=1.6, marker="o", markersize=3)
+        if best is not None:
+            axes.plot(best, value[best], "o", color=COLOURS[2], markersize=8, label="design kept", zorder=3)
+        plain(axes)
+        axes.set_ylabel(label)
+        axes.margins(x=0.02)
+    bottom.set_yscale("log")
     # Far from the limit a linear axis hides the end, where the constraint is met to 1e-3.
     if np.all(np.isfinite(history.worst_constraint)):
         middle.set_yscale("symlog", linthresh=tolerance)
@@ -91,15 +88,7 @@ def convergence(history: Any, *, tolerance: float, best: int | None = None, obje
         middle.set_ylim(low, high)
         middle.text(0.99, 0.97, "violated", transform=middle.transAxes, ha="right", va="top", color=LIMIT)
     if best is not None:
-        values = (history.objective, history.worst_constraint, history.gradient_norm)
-        for axes, value in zip((top, middle, bottom), values):
-            axes.plot(best, value[best], "o", color=COLOURS[2], markersize=8, label="design kept", zorder=3)
         top.legend(frameon=False, loc="upper right")
-    labels = (objective, "worst constraint\nover its scale [–]", "projected gradient\nof the Lagrangian [–]")
-    for axes, label in zip((top, middle, bottom), labels):
-        plain(axes)
-        axes.set_ylabel(label)
-        axes.margins(x=0.02)
     bottom.set_xlabel("step")
     fig.align_ylabels()
     return fig

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lgsens.examples import SuspensionCurves
-from lgsens.plotting._style import COLOURS, LIMIT, figure, plain
+from lgsens.plotting._style import COLOURS, LIMIT_LINE, figure, plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,14 +46,12 @@ def suspension_curves(
     colours = COLOURS if len(curves) > 1 else COLOURS[1:]
     for axes, (panel, factor, label, member) in zip(all_axes.ravel(), PANELS):
         for i, (name, curve) in enumerate(curves.items()):
-            values = factor * np.asarray(getattr(curve, member))
-            axes.plot(
-                1e3 * np.asarray(curve.travel), values, label=name, color=colours[i % len(colours)], linewidth=1.8
-            )
+            travel, values = 1e3 * np.asarray(curve.travel), factor * np.asarray(getattr(curve, member))
+            axes.plot(travel, values, label=name, color=colours[i % len(colours)], linewidth=1.8)
         if bounds and member in bounds:
             travel, *ends = (np.asarray(array) for array in bounds[member])
             for end in ends:
-                axes.plot(1e3 * travel, factor * end, color=LIMIT, linestyle=(0, (5, 3)), linewidth=1.2)
+                axes.plot(1e3 * travel, factor * end, **LIMIT_LINE)
         plain(axes)
         axes.axvline(0.0, color="#bcbcbc", linewidth=0.8)
         axes.set(title=panel, ylabel=label)
