@@ -73,29 +73,31 @@ def quarter_car(bushings: Sequence[str] = ()) -> Scene:
     # The bump ends at 0.25 s: a fourth of the steps, so that the kink is between two of them.
     loose, alpha, dopri8 = GeneralizedAlpha(tolerance=1e-5), GeneralizedAlpha(), IndexReducedODE(diffrax.Dopri8())
     heave, rods = {"chassis": "heave"}, {"chassis": "heave", "links": "rods"}
+    extrapolated = (
+        *grid((28, 52), GeneralizedAlpha(tolerance=1e-6), extrapolate=True, model=heave),
+        *grid((40,), GeneralizedAlpha(tolerance=1e-7), extrapolate=3, model=heave),
+    )
     if bushings:
         settings = (
             *grid((28, 76, 200), loose, model=heave),
             *grid((400, 1600, 6400), alpha, model=heave),
-            *grid((28, 52), GeneralizedAlpha(tolerance=1e-6), extrapolate=True, model=heave),
-            *grid((40,), GeneralizedAlpha(tolerance=1e-7), extrapolate=3, model=heave),
+            *extrapolated,
             *grid((200, 800), alpha, extrapolate=True, model=heave),
             *grid((8000,), IndexReducedODE(), model=heave),
             *grid((5000,), dopri8, model=heave),
         )
-        return Scene("stiff five-link quarter-car", build, comfort, parameters, 1.0, settings)
-    settings = (
-        *grid((28, 76), loose),
-        *grid((200,), alpha),
-        *grid((52,), loose, model=heave),
-        *grid((28, 76), loose, model=rods),
-        *grid((28, 52), GeneralizedAlpha(tolerance=1e-6), extrapolate=True, model=heave),
-        *grid((40,), GeneralizedAlpha(tolerance=1e-7), extrapolate=3, model=heave),
-        *grid((60,), IndexReducedODE()),
-        *grid((40,), dopri8),
-        *grid((20, 40, 80), dopri8, model=heave),
-    )
-    return Scene("five-link quarter-car", build, comfort, parameters, 1.0, settings)
+    else:
+        settings = (
+            *grid((28, 76), loose),
+            *grid((200,), alpha),
+            *grid((52,), loose, model=heave),
+            *grid((28, 76), loose, model=rods),
+            *extrapolated,
+            *grid((60,), IndexReducedODE()),
+            *grid((40,), dopri8),
+            *grid((20, 40, 80), dopri8, model=heave),
+        )
+    return Scene(f"{'stiff ' if bushings else ''}five-link quarter-car", build, comfort, parameters, 1.0, settings)
 
 
 # What the command knows by name.
@@ -145,11 +147,8 @@ def recommendations(table: Table, found: list[Recommendation]) -> list[dict[str,
     def place(row) -> int | None:
         return None if row is None else next(i for i, other in enumerate(table) if other is row)
 
-    return [
-        {"rtol": one.rtol, "row": place(one.row), "cheaper": place(one.cheaper)}
-        | {"margin": one.margin, "reason": one.reason}
-        for one in found
-    ]
+    places = lambda one: {"row": place(one.row), "cheaper": place(one.cheaper)}
+    return [{"rtol": one.rtol, **places(one), "margin": one.margin, "reason": one.reason} for one in found]
 
 
 def document(scene: Scene, table: Table, found: list[Recommendation]) -> dict[str, Any]:

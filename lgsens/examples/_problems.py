@@ -131,21 +131,9 @@ def _spinning_top(alpha0=0.7853981633974483, m=15.0, J11=0.2, J22=0.4, J33=0.2, 
 FREE = {"free_length": 0.3350681866287862, "free_radius": 0.336861050861}
 
 
-def _five_link(k=109000.0, c=4900.0, hb=0.05) -> Model:
+def _five_link(wheel: str, k=109000.0, c=4900.0, hb=0.05) -> Model:
     """The five-link quarter-car with given rates and bump; spring and tyre keep their free lengths."""
-    return QuarterCar.load().with_values(stiffness=k, damping=c, bump_height=hb).model(**FREE)
-
-
-def _locked_five_link(k=109000.0, c=4900.0, hb=0.05) -> Model:
-    return QuarterCar.load().with_values(stiffness=k, damping=c, bump_height=hb).model(wheel="locked", **FREE)
-
-
-def _integral(integrand: Callable[[Any, Any], Float[Array, ""]]) -> Criterion:
-    return Criterion(integrand=integrand)
-
-
-def _terminal(terminal: Callable[[Any, Any], Float[Array, ""]]) -> Criterion:
-    return Criterion(terminal=terminal)
+    return QuarterCar.load().with_values(stiffness=k, damping=c, bump_height=hb).model(wheel=wheel, **FREE)
 
 
 def _kinetic_energy_of_crank(s, p):
@@ -158,30 +146,30 @@ def _distance_of_coupler(s, p):
     return (x - 0.5) ** 2 + (y - 0.45) ** 2
 
 
-_X1_SQUARED = _integral(lambda s, p: s.body("top").position[0] ** 2)
-_HEIGHT = _integral(lambda s, p: s.body("top").position[2])
+_X1_SQUARED = Criterion(lambda s, p: s.body("top").position[0] ** 2)
+_HEIGHT = Criterion(lambda s, p: s.body("top").position[2])
 # x_cm = l R e₃; the scene's body has its centre of mass elsewhere
-_LAGRANGE = {"Psi": _integral(lambda s, p: (p["l"] * s.body("top").orientation[0, 2]) ** 2)}
-_TURNED = {"Psi": _integral(lambda s, p: s.body("body").orientation[1, 0] ** 2)}
-_PENDULUM = {"Psi": _integral(lambda s, p: s.body("mass").position[0] ** 2)}
+_LAGRANGE = {"Psi": Criterion(lambda s, p: (p["l"] * s.body("top").orientation[0, 2]) ** 2)}
+_TURNED = {"Psi": Criterion(lambda s, p: s.body("body").orientation[1, 0] ** 2)}
+_PENDULUM = {"Psi": Criterion(lambda s, p: s.body("mass").position[0] ** 2)}
 _SLIDER_CRANK = {
-    "G": _integral(_kinetic_energy_of_crank),
-    "Psi2": _integral(lambda s, p: s.body("slider").acceleration[0] ** 2),
+    "G": Criterion(_kinetic_energy_of_crank),
+    "Psi2": Criterion(lambda s, p: s.body("slider").acceleration[0] ** 2),
 }
 _FOUR_BAR = {
-    "Psi1": _integral(_distance_of_coupler),
-    "Psi2": _integral(lambda s, p: jnp.sum(s.body("coupler").acceleration ** 2)),
+    "Psi1": Criterion(_distance_of_coupler),
+    "Psi2": Criterion(lambda s, p: jnp.sum(s.body("coupler").acceleration ** 2)),
 }
-_SPRUNG = {"Psi0": _integral(lambda s, p: s.body("sprung").acceleration[2] ** 2)}
-_COMFORT = _integral(lambda s, p: s.body("chassis").acceleration[2] ** 2)
+_SPRUNG = {"Psi0": Criterion(lambda s, p: s.body("sprung").acceleration[2] ** 2)}
+_COMFORT = Criterion(lambda s, p: s.body("chassis").acceleration[2] ** 2)
 _LINEAR = {
-    "stroke": _terminal(lambda s, p: s.body("sprung").position[2] - s.body("unsprung").position[2]),
-    "tire_dyn_force": _terminal(lambda s, p: s.force("tyre")),
-    "zs_acc": _terminal(lambda s, p: s.body("sprung").acceleration[2]),
+    "stroke": Criterion(terminal=lambda s, p: s.body("sprung").position[2] - s.body("unsprung").position[2]),
+    "tire_dyn_force": Criterion(terminal=lambda s, p: s.force("tyre")),
+    "zs_acc": Criterion(terminal=lambda s, p: s.body("sprung").acceleration[2]),
 }
 _FIVE_LINK = {
-    "F_tire(0.3)": _terminal(lambda s, p: s.force("tyre")),
-    "spring_length(0.3)": _terminal(lambda s, p: s.force("spring").length),
+    "F_tire(0.3)": Criterion(terminal=lambda s, p: s.force("tyre")),
+    "spring_length(0.3)": Criterion(terminal=lambda s, p: s.force("spring").length),
 }
 
 
@@ -199,6 +187,7 @@ _DZHANIBEKOV = {"J1": 1.0, "J2": 2.0, "J3": 3.0, "w1": 0.001, "w2": 3.0, "w3": 0
 _SYMMETRIC = {"J1": 1.0, "J2": 1.0, "J3": 0.5, "w1": 0.5, "w2": 0.5, "w3": 1.0}
 _SIMO_WONG = {"m": 20.0, "l": 1.0, "J1": -15.0, "J3": 1.0, "w3": 50.0, "theta0": 0.05, "g": 1.0}
 _BRULS = "spinning_top_brulls"
+_HINGED, _LOCKED = (functools.partial(_five_link, wheel) for wheel in ("hinged", "locked"))
 _TOP = (_spinning_top, 1.0, 200, {"Psi": _X1_SQUARED})
 
 PROBLEMS: dict[str, Problem] = {
@@ -220,8 +209,8 @@ PROBLEMS: dict[str, Problem] = {
         _problem("quarter_car_linear", linear_quarter_car, 3.0, 750, _SPRUNG),
         _linear_at(0.1),
         _linear_at(0.3),
-        _problem("five_link_quarter_car", _five_link, 2.0, 480, {"Psi0": _COMFORT}),
-        _problem("five_link_quarter_car.at_0.3s", _five_link, 0.3, 300, _FIVE_LINK),
-        _problem("five_link_quarter_car.locked_wheel", _locked_five_link, 2.0, 480, {"Psi0_locked_wheel": _COMFORT}),
+        _problem("five_link_quarter_car", _HINGED, 2.0, 480, {"Psi0": _COMFORT}),
+        _problem("five_link_quarter_car.at_0.3s", _HINGED, 0.3, 300, _FIVE_LINK),
+        _problem("five_link_quarter_car.locked_wheel", _LOCKED, 2.0, 480, {"Psi0_locked_wheel": _COMFORT}),
     )
 }

@@ -69,11 +69,10 @@ class Part(eqx.Module):
 class QuarterCar(eqx.Module):
     """A quarter-car with a five-link suspension: its data, all numbers leaves. `QuarterCar.load()` reads them.
 
-    Five links, knuckle, wheel and chassis are eight rigid bodies. Each link has a universal joint at the
-    chassis and a spherical joint at the knuckle; the wheel turns on a hinge of the knuckle or is locked to
-    it; the chassis heaves only. With 48 coordinates and 45 (46) constraints the mechanism has 3 (2) degrees
-    of freedom; a reduced scene has the same with 19 and 16 (17), see `model`. Frame: x forward, y left, z up;
-    SI units.
+    Five links, knuckle, wheel and chassis are eight rigid bodies. Each link has a universal joint at the chassis and a
+    spherical joint at the knuckle; the wheel turns on a hinge of the knuckle or is locked to it; the chassis heaves
+    only. With 48 coordinates and 45 (46) constraints the mechanism has 3 (2) degrees of freedom; a reduced scene has
+    the same with 19 and 16 (17), see `model`. Frame: x forward, y left, z up; SI units.
 
     Source: Sonneville & Brüls (2014), §9; hardpoints, masses and rates from BPMinaker/eom_pkg,
     input_5link.m (R. Rieveley 2009).
@@ -96,9 +95,8 @@ class QuarterCar(eqx.Module):
     def load(path: str | Path | None = None) -> "QuarterCar":
         """Read a suspension from a TOML file; None: the one that ships with lgsens.
 
-        The shipped file, `lgsens/examples/data/five_link_suspension.toml`, shows the format. Raises
-        `ValueError` naming the file and the key (or the line) for a file that cannot be read or is
-        incomplete.
+        The shipped file, `lgsens/examples/data/five_link_suspension.toml`, shows the format. Raises `ValueError` naming
+        the file and the key (or the line) for a file that cannot be read or is incomplete.
         """
         with jax.ensure_compile_time_eval():  # the file's numbers are constants, inside `jit` too
             return _parse(*read(path))
@@ -300,11 +298,8 @@ def _parse(document: dict, path: str) -> QuarterCar:
 
     def strut(key: str, rate: str) -> Strut:
         element = root.table(key)
-        return Strut(
-            element.choice("link", links),
-            *element.segment("link_point", "chassis_point", metre),
-            element.number(rate),
-        )
+        points = element.segment("link_point", "chassis_point", metre)
+        return Strut(element.choice("link", links), *points, element.number(rate))
 
     bump = root.table("bump")
     return QuarterCar(

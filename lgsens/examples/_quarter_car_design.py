@@ -43,8 +43,7 @@ class DesignLimits(eqx.Module):
     def load(path: str | Path | None = None) -> "DesignLimits":
         """Read the limits from a TOML file; None: the one that ships with lgsens.
 
-        Raises `ValueError` naming the file and the key for a table that is missing, incomplete or
-        contradictory.
+        Raises `ValueError` naming the file and the key for a table that is missing, incomplete or contradictory.
         """
         document, name = read(path)
         table = Reader(document, name).table("design")
@@ -109,9 +108,8 @@ class SuspensionDesign(eqx.Module):
       - the start (k = 109 kN/m, c = 4.9 kN s/m, as in the source) is a firm production set-up: motion ratios
         0.60 and 0.89 give 40 N/mm at the wheel, the body at 1.4 Hz with 0.49 of critical damping;
       - F_min = 650 N is 15 % of the static 4,428 N: some grip is left on the far side of the bump;
-      - l_min = 254 mm is 35 mm of wheel travel over the design position (275 mm), where a jounce bumper
-        begins, which a bump as common as this one should not touch; l_max = 300 mm is 41 mm of travel down to
-        the rebound stop;
+      - l_min = 254 mm is 35 mm of wheel travel over the design position (275 mm), where a jounce bumper begins, which a
+        bump as common as this one should not touch; l_max = 300 mm is 41 mm of travel down to the rebound stop;
       - k from 50 to 200 kN/m is the body at 1.0 to 1.8 Hz: below, 100 kg over this corner sink it by more
         than 5 cm and need levelling; above lie sports cars;
       - c from 1.5 to 10 kN s/m is 0.15 to 1 of critical damping at the start's stiffness;

@@ -1,6 +1,6 @@
 """Errors against the step size or over time, and what a small error costs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -47,19 +47,24 @@ def errors(panels: Sequence[ErrorPanel], title: str = "") -> "Figure":
     all_axes = fig.subplots(rows, columns, squeeze=False).ravel()
     for axes in all_axes[len(panels) :]:
         axes.remove()
-    names = list(dict.fromkeys(name for panel in panels for name in panel.series))
+    styles = _styles(panel.series for panel in panels)
     handles: dict[str, Any] = {}
     for axes, panel in zip(all_axes, panels):
         for name, (x, error) in panel.series.items():
-            style = CURVES[names.index(name) % len(CURVES)]
-            (handles[name],) = axes.plot(np.asarray(x), np.asarray(error), label=name, **style)
+            (handles[name],) = axes.plot(np.asarray(x), np.asarray(error), label=name, **styles[name])
         axes.set_yscale("log")
         plain(axes)
         axes.set(title=panel.title, xlabel=panel.horizontal, ylabel=panel.label)
         if panel.order is not None:
             _slope(axes, panel, panel.order)
-    legend_below(fig, handles, -(-len(names) // 2) if len(names) > 3 else len(names))
+    legend_below(fig, handles, -(-len(styles) // 2) if len(styles) > 3 else len(styles))
     return fig
+
+
+def _styles(panels: Iterable[Iterable[str]]) -> dict[str, dict[str, Any]]:
+    """How the curves of all panels look, by their names."""
+    names = dict.fromkeys(name for panel in panels for name in panel)
+    return {name: CURVES[i % len(CURVES)] for i, name in enumerate(names)}
 
 
 def _slope(axes: "Axes", panel: ErrorPanel, order: int) -> None:
@@ -167,23 +172,22 @@ def work_precision_panels(
     """
     fig = figure(1.6 + 4.8 * len(panels), 5.6, title)
     all_axes = fig.subplots(1, len(panels), squeeze=False, sharey=True).ravel()
-    names = list(dict.fromkeys(name for methods in panels.values() for name in methods))
+    styles = _styles(panels.values())
     handles: dict[str, Any] = {}
     for axes, (quantity, methods) in zip(all_axes, panels.items()):
         axes.set(xscale="log", yscale="log", xlabel=cost, ylabel=f"relative error of {quantity} [–]")
         for name, method in methods.items():
             x, y = _drawn(name, method)
-            style = CURVES[names.index(name) % len(CURVES)]
             best = y < np.minimum.accumulate(np.concatenate([[np.inf], y[:-1]]))
-            (handles[name],) = axes.plot(x[best], y[best], label=name, **style)
-            axes.plot(x[~best], y[~best], **style | {"linestyle": "", "alpha": 0.3})
+            (handles[name],) = axes.plot(x[best], y[best], label=name, **styles[name])
+            axes.plot(x[~best], y[~best], **styles[name] | {"linestyle": "", "alpha": 0.3})
         for target, points in (chosen or {}).items():
             price, reached = points[quantity]
             _target_line(axes, target, linewidth=0.6, side="right")
             axes.plot([price, price], [target, reached], color=LIMIT, linewidth=0.9, zorder=3)
             axes.plot(price, reached, marker="*", markersize=11, color=LIMIT, linestyle="", zorder=3)
         plain(axes)
-    legend_below(fig, handles, 2 if len(names) > 3 else max(len(names), 1))
+    legend_below(fig, handles, 2 if len(styles) > 3 else max(len(styles), 1))
     return fig
 
 
