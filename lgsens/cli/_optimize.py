@@ -90,18 +90,18 @@ def _optimize(design: SuspensionDesign, steps: int, progress: bool) -> Outcome:
         (objective, _), gradient = evaluate(x)
         return objective, gradient
 
-    def look(x) -> tuple[Response, GradientCheck]:
+    def respond(x) -> tuple[Response, GradientCheck]:
         (_, (response, result)), _ = evaluate(x)
         if int(result) != RESULTS.successful:
             raise ValueError(f"the suspension cannot be simulated: {RESULTS(int(result)).message}")
         checked = {"step": CHECK_STEP, "max_directions": CHECKED_DIRECTIONS, "value_and_grad": objective_and_gradient}
         return jax.tree.map(np.asarray, response), check_gradient(lambda x: design(x)[0], x, scale=scale, **checked)
 
-    before, check_before = look(design.start)
+    before, check_before = respond(design.start)
     lower, upper = design.bounds
     bounds = {"lower": lower, "upper": upper, "log_scale": design.log_scale, "constraint_tolerance": TOLERANCE}
     result = minimize(design, design.start, **bounds, num_steps=steps, progress=progress)
-    after, check_after = look(result.x)
+    after, check_after = respond(result.x)
     seconds = {
         "compilation": compiled - started + result.compile_seconds,
         "optimization": result.run_seconds,

@@ -1,5 +1,7 @@
 """Mechanisms of a few parts: simple pendulum, slider-crank, four-bar linkage, chain of hinges, linear quarter-car."""
 
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -21,10 +23,13 @@ from lgsens.model import (
 
 _CRANK_MASS = 1.0  # kg, of the slider-crank, at rest on the pivot
 _AXIAL = 1e-2  # axial over transverse moment of inertia of a rod; planar motion does not excite it
-_ORIGIN, _E_X, _E_Y, _E_Z = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+_ORIGIN: Any = (0.0, 0.0, 0.0)  # tuples, which become arrays in the joints; an array made at import is float32
+_E_X: Any = (1.0, 0.0, 0.0)
+_E_Y: Any = (0.0, 1.0, 0.0)
+_E_Z: Any = (0.0, 0.0, 1.0)
 
 
-def _vector(x, y, z=0.0) -> Float[Array, "3"]:
+def _vector(x, y, z: Any = 0.0) -> Float[Array, "3"]:
     """An array of Python floats, arrays or traced numbers."""
     return as_float((x, y, z), (3,), "parameters")
 
@@ -38,7 +43,7 @@ def simple_pendulum(m=1.0, l=1.0, g=9.81) -> Model:
     Source: Library of Computational Benchmark Problems, IFToMM Technical Committee for Multibody Dynamics, A01;
     reference numbers from elliptic functions in `simple_pendulum_A01.json`.
     """
-    start = (-l, 0.0, 0.0)
+    start = _vector(-l, 0.0)
     return Model(
         bodies={"mass": RigidBody(mass=m, inertia=None, position=start)},
         joints={"rod": DistanceJoint(None, "mass", at_a=_ORIGIN, at_b=start)},
@@ -67,7 +72,7 @@ def slider_crank(a=0.5, J1=1.0, m2=1.0, J2=2.0, k=1.0, c=1.0, l0=1.0, F=1.0) -> 
     """
     reach = jnp.sqrt(1.0 - a**2)  # of the rod along x, when its other end is at (0, a)
     crank_pin, slider_pin = _vector(0.0, a), _vector(reach, 0.0)
-    spring = {"stiffness": k, "damping": c, "free_length": l0}
+    spring: Any = {"stiffness": k, "damping": c, "free_length": l0}
     return Model(
         bodies={
             "crank": RigidBody(mass=_CRANK_MASS, inertia=(J1, J1, J1)),
@@ -82,7 +87,7 @@ def slider_crank(a=0.5, J1=1.0, m2=1.0, J2=2.0, k=1.0, c=1.0, l0=1.0, F=1.0) -> 
         },
         forces={
             "spring": SpringDamper("crank", "conrod", at_a=crank_pin / 2, at_b=(crank_pin + slider_pin) / 2, **spring),
-            "push": AppliedForce("conrod", at=2 * slider_pin - crank_pin, force=(F, 0.0, 0.0)),
+            "push": AppliedForce("conrod", at=2 * slider_pin - crank_pin, force=_vector(F, 0.0)),
         },
     )
 
@@ -139,7 +144,7 @@ def four_bar(
         middle = velocity + rate * turned(end - start) / 2
         return RigidBody(mass, inertia, (start + end) / 2, velocity=middle, angular_velocity=(0.0, 0.0, rate))
 
-    spring = {"stiffness": k, "damping": cd, "free_length": l0}
+    spring: Any = {"stiffness": k, "damping": cd, "free_length": l0}
     return Model(
         bodies={
             "crank": rod(m2, _vector(0.0, 0.0), pin_b, 0.0, w0),
@@ -154,7 +159,7 @@ def four_bar(
         },
         forces={
             "gravity": Gravity((0.0, -g, 0.0)),
-            "spring": SpringDamper(None, "coupler", at_a=(px, py, 0.0), at_b=(pin_b + pin_c) / 2, **spring),
+            "spring": SpringDamper(None, "coupler", at_a=_vector(px, py), at_b=(pin_b + pin_c) / 2, **spring),
         },
     )
 
@@ -182,7 +187,7 @@ def spatial_chain(num_links: int = 3, length=0.3, mass=0.5, tilt=1.0, spin=3.0, 
         velocity = jnp.cross(rate, centre)
         bodies[f"link{i}"] = RigidBody(mass, inertia, centre, velocity=velocity, angular_velocity=rate)
         previous = f"link{i - 1}" if i else None
-        joints[f"hinge{i}"] = RevoluteJoint(previous, f"link{i}", at=(i * length, 0.0, 0.0), axis=axis(i))
+        joints[f"hinge{i}"] = RevoluteJoint(previous, f"link{i}", at=_vector(i * length, 0.0), axis=axis(i))
     return Model(bodies, joints, {"gravity": Gravity((0.0, 0.0, -g))})
 
 
@@ -199,8 +204,9 @@ def linear_quarter_car(ms=400.0, mu=40.0, ks=20000.0, cs=1500.0, kt=200000.0, hb
 
     Source: a standard model; reference numbers by the matrix exponential in `quarter_car_linear.json`.
     """
-    bump = BumpRoad(height=hb, duration=Tb)
-    rates = {"stiffness": ks, "damping": cs}
+    suspension: Any = {"stiffness": ks, "damping": cs}
+    bump: Any = {"height": hb, "duration": Tb}
+    tyre: Any = {"stiffness": kt, "road": BumpRoad(**bump)}
     return Model(
         bodies={"sprung": RigidBody(mass=ms, inertia=None), "unsprung": RigidBody(mass=mu, inertia=None)},
         joints={
@@ -208,7 +214,7 @@ def linear_quarter_car(ms=400.0, mu=40.0, ks=20000.0, cs=1500.0, kt=200000.0, hb
             "hop": PrismaticJoint(None, "unsprung", at=_ORIGIN, axis=_E_Z),
         },
         forces={
-            "suspension": SpringDamper("unsprung", "sprung", at_a=_ORIGIN, at_b=_E_Z, **rates),
-            "tyre": TyreSpring("unsprung", at=_ORIGIN, stiffness=kt, road=bump),
+            "suspension": SpringDamper("unsprung", "sprung", at_a=_ORIGIN, at_b=_E_Z, **suspension),
+            "tyre": TyreSpring("unsprung", at=_ORIGIN, **tyre),
         },
     )

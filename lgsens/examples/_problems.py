@@ -128,7 +128,7 @@ def _spinning_top(alpha0=0.7853981633974483, m=15.0, J11=0.2, J22=0.4, J33=0.2, 
 
 
 # Those at which the quarter-car's design position is in equilibrium for the k below, printed with the reference [m].
-FREE = {"free_length": 0.3350681866287862, "free_radius": 0.336861050861}
+FREE: dict[str, Any] = {"free_length": 0.3350681866287862, "free_radius": 0.336861050861}
 
 
 def _five_link(wheel: str, k=109000.0, c=4900.0, hb=0.05) -> Model:

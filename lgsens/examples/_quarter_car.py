@@ -34,7 +34,8 @@ from lgsens.model import (
 )
 
 GRAVITY = 9.81  # m/s²
-ALONG_Z = (0.0, 0.0, 1.0)
+ALONG_Y: Any = (0.0, 1.0, 0.0)
+ALONG_Z: Any = (0.0, 0.0, 1.0)
 
 
 class Link(eqx.Module):
@@ -166,7 +167,7 @@ class QuarterCar(eqx.Module):
             "wheel": _body(self.wheel),
         } | {name: _bar(link, self.link_radius) for name, link in self.links.items() if name not in rods}
         hub: Any = (
-            RevoluteJoint("knuckle", "wheel", at=self.bearing, axis=(0.0, 1.0, 0.0))
+            RevoluteJoint("knuckle", "wheel", at=self.bearing, axis=ALONG_Y)
             if wheel == "hinged"
             else FixedJoint("knuckle", "wheel", at=self.bearing)
         )

@@ -23,11 +23,8 @@ def free_rigid_body(J1=0.4, J2=0.7, J3=0.9, w1=1.2, w2=-0.5, w3=2.0) -> Model:
 
 def _on_a_point(body: RigidBody, gravity) -> Model:
     """A body on a ball joint at the origin, gravity along −z."""
-    return Model(
-        {"top": body},
-        {"pivot": SphericalJoint(None, "top", at=(0.0, 0.0, 0.0))},
-        {"gravity": Gravity((0.0, 0.0, -gravity))},
-    )
+    pivot = SphericalJoint(None, "top", at=jnp.zeros_like(body.position))
+    return Model({"top": body}, {"pivot": pivot}, {"gravity": Gravity((0.0, 0.0, -gravity))})
 
 
 def spinning_top(alpha0, mass=15.0, inertia=(0.2, 0.4, 0.2), length=1.0, spin=10.0, gravity=9.81) -> Model:
