@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from lgsens import plotting
-from lgsens.cli._report import output_folder
+from lgsens.cli._report import output_folder, written
 from lgsens.examples import QuarterCar, SuspensionCurves
 
 # Heading, member of SuspensionCurves, factor to the unit shown, decimals.
@@ -37,8 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
         plotting.save(plotting.suspension_curves({car.name: curves}, title=car.name), out / "curves.png")
         plotting.animate(car.travel(travel, links="bodies"), out / "travel.html", title=car.name)
         if not arguments.quiet:
-            print(table(curves))
-            print(f"\nwritten to {out}: {', '.join(sorted(path.name for path in out.iterdir()))}")
+            print(table(curves), written(out), sep="\n")
     return 0
 
 
@@ -53,9 +52,9 @@ def write_table(curves: SuspensionCurves, path: Path) -> None:
 def table(curves: SuspensionCurves) -> str:
     """A few rows of the curves, ISO 8855 signs."""
     n = len(curves.travel)
-    chosen = np.unique(np.linspace(0, n - 1, min(n, SHOWN)).round().astype(int))
+    rows = np.unique(np.linspace(0, n - 1, min(n, SHOWN)).round().astype(int))
     lines = ["".join(f"{heading:>17}" for heading, *_ in COLUMNS)]
-    for i in chosen:
+    for i in rows:
         cells = [f"{factor * float(getattr(curves, member)[i]):>17.{d}f}" for _, member, factor, d in COLUMNS]
         lines.append("".join(cells))
     return "\n".join(lines)

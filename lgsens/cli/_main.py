@@ -6,7 +6,7 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import jax
 
@@ -24,17 +24,23 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         self.exit(BAD_INPUT, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
+    def option(self, name: str, default: Any, meaning: str = "", **settings: Any) -> None:
+        """An option whose help ends with its default."""
+        self.add_argument(name, default=default, help=f"{meaning} (default: %(default)s)".lstrip(), **settings)
 
-def _add_out(parser: argparse.ArgumentParser, default: str, what: str) -> None:
-    """`--out` and `--overwrite`."""
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path(default),
-        metavar="DIR",
-        help=f"new folder for {what} (default: %(default)s)",
-    )
-    parser.add_argument("--overwrite", action="store_true", help="write into --out even if it exists")
+    def out(self, default: str, written: str) -> None:
+        """`--out` and `--overwrite`."""
+        self.option("--out", Path(default), f"new folder for {written}", type=Path, metavar="DIR")
+        self.add_argument("--overwrite", action="store_true", help="write into --out even if it exists")
+
+    def hardpoints(self) -> None:
+        """`--hardpoints`."""
+        meaning = "a suspension of your own (default: the one that ships with lgsens)"
+        self.add_argument("--hardpoints", type=Path, metavar="FILE.toml", help=meaning)
+
+    def quiet(self, nothing: str) -> None:
+        """`--quiet`."""
+        self.add_argument("--quiet", action="store_true", help=nothing)
 
 
 def _positive(text: str) -> float:
@@ -62,47 +68,26 @@ def _parser() -> argparse.ArgumentParser:
         description="Find the suspension whose chassis accelerates least over a bump, its tyre on the "
         "road and its spring within its travel (Sonneville & Brüls 2014, §9).",
     )
-    optimize.add_argument("problem", choices=["quarter-car"], help="what to optimize")
-    _add_out(optimize, "out/quarter-car", "result.json and the figures")
-    optimize.add_argument(
-        "--hardpoints",
-        type=Path,
-        metavar="FILE.toml",
-        help="a suspension of your own (default: the one that ships with lgsens)",
-    )
-    optimize.add_argument(
-        "--parameters",
-        choices=list(PARAMETERS),
-        default="k,c",
-        help="what to change: stiffness k and damping c, chassis hardpoints, or all (default: %(default)s)",
-    )
-    optimize.add_argument("--t1", type=_positive, default=2.0, help="duration [s] (default: %(default)s)")
-    optimize.add_argument("--dt", type=_positive, default=2e-3, help="step size [s] (default: %(default)s)")
-    optimize.add_argument(
-        "--steps", type=_count, default=300, help="most gradients that the optimizer takes (default: %(default)s)"
-    )
-    optimize.add_argument(
-        "--wheel",
-        choices=["hinged", "locked"],
-        default="hinged",
-        help="whether the wheel turns on its hinge (default: %(default)s)",
-    )
-    for angle in ("camber", "toe"):
-        optimize.add_argument(
-            f"--keep-{angle}",
-            type=_positive,
-            metavar="DEG",
-            help=f"keep the {angle} curve within this of the one at the start [degree] (default: it may change)",
-        )
-    optimize.add_argument(
-        "--travel",
-        type=_positive,
-        default=0.05,
-        metavar="M",
-        help="wheel travel up and down over which curves are kept and drawn [m] (default: %(default)s)",
-    )
-    optimize.add_argument("--quiet", action="store_true", help="no progress bar and no table")
     optimize.set_defaults(run=_optimize.run)
+    optimize.add_argument("problem", choices=["quarter-car"], help="what to optimize")
+    optimize.out("out/quarter-car", "result.json and the figures")
+    optimize.hardpoints()
+    optimize.option(
+        "--parameters",
+        "k,c",
+        "what to change: stiffness k and damping c, chassis hardpoints, or all",
+        choices=list(PARAMETERS),
+    )
+    optimize.option("--t1", 2.0, "duration [s]", type=_positive)
+    optimize.option("--dt", 2e-3, "step size [s]", type=_positive)
+    optimize.option("--steps", 300, "most gradients that the optimizer takes", type=_count)
+    optimize.option("--wheel", "hinged", "whether the wheel turns on its hinge", choices=["hinged", "locked"])
+    for angle in ("camber", "toe"):
+        meaning = f"keep the {angle} curve within this of the one at the start [degree] (default: it may change)"
+        optimize.add_argument(f"--keep-{angle}", type=_positive, metavar="DEG", help=meaning)
+    kept = "wheel travel up and down over which curves are kept and drawn [m]"
+    optimize.option("--travel", 0.05, kept, type=_positive, metavar="M")
+    optimize.quiet("no progress bar and no table")
 
     curves = commands.add_parser(
         "curves",
@@ -110,29 +95,22 @@ def _parser() -> argparse.ArgumentParser:
         description="Camber, toe, track, wheelbase, motion ratio and roll centre of a suspension over wheel travel: a "
         "figure, a table, and a page on which it moves.",
     )
-    curves.add_argument("suspension", choices=["quarter-car"], help="which suspension")
-    _add_out(curves, "out/curves", "curves.png, curves.csv and travel.html")
-    curves.add_argument(
-        "--hardpoints",
-        type=Path,
-        metavar="FILE.toml",
-        help="a suspension of your own (default: the one that ships with lgsens)",
-    )
-    curves.add_argument("--axle", choices=["rear", "front"], default="rear", help="(default: %(default)s)")
-    curves.add_argument(
-        "--travel", type=_positive, default=0.08, metavar="M", help="up and down [m] (default: %(default)s)"
-    )
-    curves.add_argument("--points", type=_count, default=41, help="positions (default: %(default)s)")
-    curves.add_argument("--quiet", action="store_true", help="no table")
     curves.set_defaults(run=_curves.run)
+    curves.add_argument("suspension", choices=["quarter-car"], help="which suspension")
+    curves.out("out/curves", "curves.png, curves.csv and travel.html")
+    curves.hardpoints()
+    curves.option("--axle", "rear", choices=["rear", "front"])
+    curves.option("--travel", 0.08, "up and down [m]", type=_positive, metavar="M")
+    curves.option("--points", 41, "positions", type=_count)
+    curves.quiet("no table")
 
     top = commands.add_parser(
         "top",
         help="differentiate the spinning top",
         description="The sensitivity of the paper's spinning top (§8) by every method, beside its reference.",
     )
-    top.add_argument("--h", type=_positive, default=1e-3, help="step size [s] (default: %(default)s)")
     top.set_defaults(run=_top.run)
+    top.option("--h", 1e-3, "step size [s]", type=_positive)
 
     paper = commands.add_parser(
         "paper",
@@ -141,11 +119,11 @@ def _parser() -> argparse.ArgumentParser:
         "independent integrator: the spinning top (Sonneville & Brüls 2014, Fig. 2) and the quarter-car (Fig. 4). "
         "Most of the ten minutes is compilation.",
     )
-    _add_out(paper, "out/paper", "paper.json and the figures")
+    paper.set_defaults(run=_paper.run)
+    paper.out("out/paper", "paper.json and the figures")
     paper.add_argument("--only", choices=list(_paper.STUDIES), help="one of the figures (default: all)")
     paper.add_argument("--coarse", action="store_true", help="two large steps instead of four or five: a quick look")
-    paper.add_argument("--quiet", action="store_true", help="no progress bar and no tables")
-    paper.set_defaults(run=_paper.run)
+    paper.quiet("no progress bar and no tables")
 
     tradeoff = commands.add_parser(
         "tradeoff",
@@ -153,29 +131,20 @@ def _parser() -> argparse.ArgumentParser:
         description="What settings of the simulation cost on a scene, what they lose of a criterion and of its "
         "gradient, and the cheapest for each target. A program is compiled for every setting: minutes.",
     )
+    tradeoff.set_defaults(run=_tradeoff.run)
     tradeoff.add_argument(
         "scene",
         metavar="SCENE",
         help=f"{', '.join(_tradeoff.SCENES)}, or FILE.py that defines `build(p)`, `criterion(trajectory)`, "
         "`parameters` and `t1`, and if it likes `settings`, `scale` and `t0`, as in lgsens.accuracy.work_precision",
     )
-    _add_out(tradeoff, "out/tradeoff", "tradeoff.json and tradeoff.png")
-    tradeoff.add_argument(
-        "--targets",
-        type=_positive,
-        nargs="+",
-        default=list(_tradeoff.TARGETS),
-        help="relative errors for which to recommend a setting (default: 1e-2 1e-4 1e-6 1e-8)",
-    )
-    tradeoff.add_argument("--rounds", type=_count, default=5, help="timed calls, at least 5 (default: %(default)s)")
-    tradeoff.add_argument(
-        "--by",
-        choices=["seconds", "cpu_seconds"],
-        default="seconds",
-        help="the cost: time of the clock or of the processor (default: %(default)s)",
-    )
-    tradeoff.add_argument("--quiet", action="store_true", help="no progress bar and no table")
-    tradeoff.set_defaults(run=_tradeoff.run)
+    tradeoff.out("out/tradeoff", "tradeoff.json and tradeoff.png")
+    targets = "relative errors for which to recommend a setting (default: 1e-2 1e-4 1e-6 1e-8)"
+    tradeoff.add_argument("--targets", type=_positive, nargs="+", default=list(_tradeoff.TARGETS), help=targets)
+    tradeoff.option("--rounds", 5, "timed calls, at least 5", type=_count)
+    costs = ["seconds", "cpu_seconds"]
+    tradeoff.option("--by", "seconds", "the cost: time of the clock or of the processor", choices=costs)
+    tradeoff.quiet("no progress bar and no table")
     return parser
 
 

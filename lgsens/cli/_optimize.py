@@ -1,7 +1,6 @@
 """`lgsens optimize quarter-car`: the suspension of the paper's §9, optimized, checked and drawn."""
 
 import argparse
-import json
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -10,7 +9,7 @@ import jax
 import numpy as np
 
 from lgsens import plotting
-from lgsens.cli._report import document, output_folder, table
+from lgsens.cli._report import document, output_folder, table, write_json, written
 from lgsens.dynamics import RESULTS
 from lgsens.examples import CurveBounds, QuarterCar, Response, SuspensionCurves, SuspensionDesign
 from lgsens.optimize import GradientCheck, OptimizationResult, check_gradient, minimize
@@ -32,46 +31,43 @@ class Outcome(NamedTuple):
     seconds: dict[str, float]
     curves: dict[str, SuspensionCurves] | None = None  # before and after, where hardpoints were free
 
+    @property
+    def cars(self) -> dict[str, QuarterCar]:
+        """The suspension before and after."""
+        return {"before": self.design.car, "after": self.design.with_design(self.result.x)}
+
 
 def run(arguments: argparse.Namespace) -> int:
     """Optimize, write `result.json` and the figures, print a table; 1 if no design met the constraints."""
     with output_folder(arguments.out, arguments.overwrite) as out:
-        return _run(arguments, out)
+        plotting.figure()  # asks for matplotlib now, not after minutes
+        outcome = _optimize(_design(arguments), arguments.steps, progress=not arguments.quiet)
+        if "hardpoints" in outcome.design.start:
+            travel = np.linspace(-arguments.travel, arguments.travel, CURVE_POINTS)
+            curves = {label: car.curves(travel) for label, car in outcome.cars.items()}
+            outcome = outcome._replace(curves=curves)
+        settings = {name: value for name, value in vars(arguments).items() if name not in ("run", "command")}
+        found = document(outcome, settings, TOLERANCE)
+        write_json(found, out / "result.json", indent=2, default=str)
+        _figures(outcome, out)
+        if not arguments.quiet:
+            print(table(found), written(out), sep="\n")
+    return 0 if outcome.result.feasible else 1
 
 
-def _run(arguments: argparse.Namespace, out: Path) -> int:
-    num_steps = round(arguments.t1 / arguments.dt)
-    if num_steps < 1 or abs(num_steps * arguments.dt / arguments.t1 - 1) > 1e-6:
-        raise ValueError(
-            f"--t1 must be a whole number of steps --dt, got t1 = {arguments.t1} s and dt = {arguments.dt} s"
-        )
-    plotting.figure()  # asks for matplotlib now, not after minutes
+def _design(arguments: argparse.Namespace) -> SuspensionDesign:
+    """The problem that the arguments ask for."""
+    t1, dt, path = arguments.t1, arguments.dt, arguments.hardpoints
+    num_steps = round(t1 / dt)
+    if num_steps < 1 or abs(num_steps * dt / t1 - 1) > 1e-6:
+        raise ValueError(f"--t1 must be a whole number of steps --dt, got t1 = {t1} s and dt = {dt} s")
     kept = {name: np.radians(width) for name in ("camber", "toe") if (width := getattr(arguments, f"keep_{name}"))}
     if kept and "hardpoints" not in arguments.parameters:
         names = " and ".join(f"--keep-{name}" for name in kept)
         raise ValueError(f"{names} is about hardpoints, which --parameters {arguments.parameters} does not move")
-    keep = CurveBounds.around(QuarterCar.load(arguments.hardpoints), travel=arguments.travel, **kept) if kept else None
-    design = SuspensionDesign.load(
-        arguments.hardpoints,
-        keep=keep,
-        parameters=arguments.parameters,
-        wheel=arguments.wheel,
-        t1=arguments.t1,
-        num_steps=num_steps,
-    )
-    outcome = _optimize(design, arguments.steps, progress=not arguments.quiet)
-    if "hardpoints" in design.start:
-        travel = np.linspace(-arguments.travel, arguments.travel, CURVE_POINTS)
-        cars = {"before": design.car, "after": design.with_design(outcome.result.x)}
-        outcome = outcome._replace(curves={name: car.curves(travel) for name, car in cars.items()})
-    settings = {name: value for name, value in vars(arguments).items() if name not in ("run", "command")}
-    text = json.dumps(document(outcome, settings, TOLERANCE), indent=2, default=str, allow_nan=False)
-    (out / "result.json").write_text(text + "\n", encoding="utf-8")
-    _figures(outcome, out)
-    if not arguments.quiet:
-        print(table(outcome, TOLERANCE))
-        print(f"\nwritten to {out}: {', '.join(sorted(path.name for path in out.iterdir()))}")
-    return 0 if outcome.result.feasible else 1
+    keep = CurveBounds.around(QuarterCar.load(path), travel=arguments.travel, **kept) if kept else None
+    settings = {"parameters": arguments.parameters, "wheel": arguments.wheel, "t1": t1, "num_steps": num_steps}
+    return SuspensionDesign.load(path, keep=keep, **settings)
 
 
 def _optimize(design: SuspensionDesign, steps: int, progress: bool) -> Outcome:
@@ -94,33 +90,18 @@ def _optimize(design: SuspensionDesign, steps: int, progress: bool) -> Outcome:
         (objective, _), gradient = evaluate(x)
         return objective, gradient
 
-    def look(x) -> tuple[Response, GradientCheck]:
+    def respond(x) -> tuple[Response, GradientCheck]:
         (_, (response, result)), _ = evaluate(x)
         if int(result) != RESULTS.successful:
             raise ValueError(f"the suspension cannot be simulated: {RESULTS(int(result)).message}")
-        check = check_gradient(
-            lambda x: design(x)[0],
-            x,
-            scale=scale,
-            step=CHECK_STEP,
-            max_directions=CHECKED_DIRECTIONS,
-            value_and_grad=objective_and_gradient,
-        )
-        return jax.tree.map(np.asarray, response), check
+        checked = {"step": CHECK_STEP, "max_directions": CHECKED_DIRECTIONS, "value_and_grad": objective_and_gradient}
+        return jax.tree.map(np.asarray, response), check_gradient(lambda x: design(x)[0], x, scale=scale, **checked)
 
-    before, check_before = look(design.start)
+    before, check_before = respond(design.start)
     lower, upper = design.bounds
-    result = minimize(
-        design,
-        design.start,
-        lower=lower,
-        upper=upper,
-        num_steps=steps,
-        log_scale=design.log_scale,
-        constraint_tolerance=TOLERANCE,
-        progress=progress,
-    )
-    after, check_after = look(result.x)
+    bounds = {"lower": lower, "upper": upper, "log_scale": design.log_scale, "constraint_tolerance": TOLERANCE}
+    result = minimize(design, design.start, **bounds, num_steps=steps, progress=progress)
+    after, check_after = respond(result.x)
     seconds = {
         "compilation": compiled - started + result.compile_seconds,
         "optimization": result.run_seconds,
@@ -134,33 +115,27 @@ def _figures(outcome: Outcome, out: Path) -> None:
     """Responses, convergence and mechanism as PNG files in `out`."""
     design, before, after = outcome.design, outcome.before, outcome.after
     limits = design.limits
+
+    def panel(label: str, member: str, factor: float, **limit) -> plotting.Panel:
+        series = {"before": factor * getattr(before, member), "after": factor * getattr(after, member)}
+        lines = {f"${name}$": factor * float(value) for name, value in limit.items()}
+        return plotting.Panel(label, series, lines)
+
+    lengths = {"l_{min}": limits.minimum_spring_length, "l_{max}": limits.maximum_spring_length}
     panels = [
-        plotting.Panel("chassis acceleration\n[m/s²]", {"before": before.acceleration, "after": after.acceleration}),
-        plotting.Panel(
-            "suspension length\n[mm]",
-            {"before": 1e3 * before.spring_length, "after": 1e3 * after.spring_length},
-            {
-                "$l_{min}$": 1e3 * float(limits.minimum_spring_length),
-                "$l_{max}$": 1e3 * float(limits.maximum_spring_length),
-            },
-        ),
-        plotting.Panel(
-            "tyre force\n[kN]",
-            {"before": before.tyre_force / 1e3, "after": after.tyre_force / 1e3},
-            {"$F_{min}$": float(limits.minimum_tyre_force) / 1e3},
-        ),
+        panel("chassis acceleration\n[m/s²]", "acceleration", 1.0),
+        panel("suspension length\n[mm]", "spring_length", 1e3, **lengths),
+        panel("tyre force\n[kN]", "tyre_force", 1e-3, **{"F_{min}": limits.minimum_tyre_force}),
     ]
     reduction = 100 * (1 - outcome.result.objective / float(before.objective))
     change = f"{float(before.objective):.3f} to {outcome.result.objective:.3f} m²/s³ (−{reduction:.0f} %)"
     title = f"Quarter-car over a bump: $\\Psi_0$ from {change}"
     plotting.save(plotting.time_histories(before.t, panels, title), out / "response.png")
-    fig = plotting.convergence(
-        outcome.result.history, tolerance=TOLERANCE, best=outcome.result.step, objective="$\\Psi_0$ [m²/s³]"
-    )
-    plotting.save(fig, out / "convergence.png")
+    marked = {"tolerance": TOLERANCE, "best": outcome.result.step, "objective": "$\\Psi_0$ [m²/s³]"}
+    plotting.save(plotting.convergence(outcome.result.history, **marked), out / "convergence.png")
     cars = {"before": design.car}
     if outcome.curves is not None:  # k and c do not show
-        cars["after"] = design.with_design(outcome.result.x)
+        cars = outcome.cars
         keep = design.keep
         bounds = {} if keep is None else {name: (keep.travel, b.lower, b.upper) for name, b in keep.bands.items()}
         fig = plotting.suspension_curves(outcome.curves, bounds, title=design.car.name)

@@ -2,9 +2,7 @@
 
 import argparse
 import itertools
-import json
 import os
-import platform
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -15,10 +13,10 @@ import numpy as np
 
 from lgsens import plotting
 from lgsens._progress import progress_bar
-from lgsens.cli._report import output_folder, version
+from lgsens.cli._report import output_folder, versions, write_json
 from lgsens.cli._top import REFERENCE
 from lgsens.criteria import Criterion, IndexReduced, Method, differentiate
-from lgsens.examples import PROBLEMS
+from lgsens.examples import PROBLEMS, Problem
 from lgsens.integrate import GeneralizedAlpha
 from lgsens.model import Model
 from lgsens.sensitivity import AdjointVariable, ContinuousAdjoint, ContinuousDirect, DirectDifferentiation
@@ -38,7 +36,6 @@ RHO_INF = 0.9
 RTOL = 1e-12  # of the reference
 CALLS = 3  # of which the median time is taken, after the one that compiles
 SLOPE_STEPS = 3  # the finest ones, through which the slope is fitted
-COLUMNS = ("h", "gradient", "relative_error", "seconds", "seconds_of_first_call")
 
 
 class Curves(NamedTuple):
@@ -56,16 +53,28 @@ class Curves(NamedTuple):
 
 
 class Study(NamedTuple):
-    """One figure: panels whose numbers come from the same calls of `differentiate`."""
+    """One figure: panels whose numbers come from the same calls of `differentiate`.
+
+    `problem` is the scene, `free` names the parameters by which is differentiated; the others keep their values.
+    """
 
     scene: str
-    build: Callable[[Mapping[str, Any]], Model]
-    parameters: dict[str, float]
+    problem: Problem
+    free: tuple[str, ...]
     criteria: dict[str, Criterion]
     panels: dict[str, Curves]
     num_steps: tuple[int, ...]
     coarse: tuple[int, ...]
     breaks: tuple[float, ...] = ()
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The free ones."""
+        return {name: self.problem.parameters[name] for name in self.free}
+
+    def build(self, p: Mapping[str, Any]) -> Model:
+        """The scene for some values of the free ones."""
+        return self.problem.build({**self.problem.parameters, **p})
 
 
 def _top() -> Study:
@@ -80,15 +89,8 @@ def _top() -> Study:
         published=REFERENCE,
         source="lgsens.examples.spinning_top: Runge-Kutta and generalized-alpha, both converged",
     )
-    return Study(
-        scene="spinning top, l = 1 m, alpha_0 = pi/4",
-        build=lambda p: problem.build({**problem.parameters, **p}),
-        parameters={"alpha0": problem.parameters["alpha0"]},
-        criteria=problem.criteria,
-        panels={"fig2": panel},
-        num_steps=(100, 200, 500, 1000, 2000),
-        coarse=(100, 200),
-    )
+    scene, num_steps = "spinning top, l = 1 m, alpha_0 = pi/4", (100, 200, 500, 1000, 2000)
+    return Study(scene, problem, ("alpha0",), problem.criteria, {"fig2": panel}, num_steps, coarse=(100, 200))
 
 
 def _quarter_car() -> Study:
@@ -119,8 +121,8 @@ def _quarter_car() -> Study:
     )
     return Study(
         scene="five-link quarter-car",
-        build=lambda p: problem.build({**problem.parameters, **p}),
-        parameters={name: problem.parameters[name] for name in ("k", "c")},
+        problem=problem,
+        free=("k", "c"),
         criteria={"Psi_0": problem.criteria["Psi0"], "Psi_3": at_instant.criteria["spring_length(0.3)"]},
         panels={"fig4a": spring, "fig4b": comfort},
         # Multiples of 24: the end of the bump, 0.25 s, is a node of both horizons, and they share their programs.
@@ -144,12 +146,23 @@ def run(arguments: argparse.Namespace) -> int:
             found = measure(study, arguments.coarse, progress=not arguments.quiet)
             if not arguments.quiet:
                 print("\n\n".join(table(panel) for panel in found.values()), end="\n\n")
-            plotting.save(
-                plotting.errors([_drawn(study, key, panel) for key, panel in found.items()]), out / f"{name}.png"
-            )
+            drawn = []
+            for key, panel in found.items():
+                series = {method: (curve["h"], curve["relative_error"]) for method, curve in panel["methods"].items()}
+                drawn.append(plotting.ErrorPanel(study.panels[key].title, "relative error [–]", series))
+            plotting.save(plotting.errors(drawn), out / f"{name}.png")
             panels |= found
-        text = json.dumps(_document(panels, arguments), indent=2, allow_nan=False)
-        (out / "paper.json").write_text(text + "\n", encoding="utf-8")
+        document = {
+            "source": "Sonneville & Bruls (2014), Fig. 2 and Fig. 4",
+            "settings": {"only": arguments.only, "coarse": arguments.coarse},
+            "panels": panels,
+            "timing": f"median of {CALLS} calls after the first, which compiles; a program of fig4a serves fig4b, too",
+            "slope": f"least squares through the {SLOPE_STEPS} smallest steps",
+            "cores": os.cpu_count(),
+            "device": jax.devices()[0].platform,
+            "versions": versions("diffrax", "equinox"),
+        }
+        write_json(document, out / "paper.json", indent=2)
     if not arguments.quiet:
         print(f"written to {out}: paper.json, {', '.join(f'{name}.png' for name in names)}")
     return 0
@@ -175,7 +188,7 @@ def measure(study: Study, coarse: bool, progress: bool) -> dict[str, dict[str, A
                 "source": panel.source,
                 "relative_difference": abs(value / panel.published - 1),
             },
-            "methods": {name: {key: [] for key in COLUMNS} for name in panel.methods},
+            "methods": {name: {} for name in panel.methods},
         }
     methods = {name: method for panel in study.panels.values() for name, method in panel.methods.items()}
     num_steps = study.coarse if coarse else study.num_steps
@@ -185,8 +198,8 @@ def measure(study: Study, coarse: bool, progress: bool) -> dict[str, dict[str, A
             for key, panel in study.panels.items():
                 if name in panel.methods:
                     row = _timed(study, panel, methods[name], count, found[key]["reference"]["value"])
-                    for column, number in zip(COLUMNS, row):
-                        found[key]["methods"][name][column].append(number)
+                    for column, number in row.items():
+                        found[key]["methods"][name].setdefault(column, []).append(number)
             if count == num_steps[-1]:
                 jax.clear_caches()  # a program of the quarter-car takes 6,000 of the 65,530 memory maps of Linux
             bar.update()
@@ -198,27 +211,25 @@ def measure(study: Study, coarse: bool, progress: bool) -> dict[str, dict[str, A
 
 
 def _gradient(study: Study, panel: Curves, method: Method, num_steps: int) -> float:
-    found = differentiate(
-        study.criteria,
-        study.build,
-        study.parameters,
-        t1=panel.t1,
-        num_steps=num_steps,
-        integrator=GeneralizedAlpha(RHO_INF),
-        method=method,
-    )
+    settings = {"t1": panel.t1, "num_steps": num_steps, "integrator": GeneralizedAlpha(RHO_INF), "method": method}
+    found = differentiate(study.criteria, study.build, study.parameters, **settings)
     return float(found.gradient[panel.criterion][panel.parameter])
 
 
-def _timed(study: Study, panel: Curves, method: Method, num_steps: int, reference: float) -> tuple[float, ...]:
-    """One entry for each of `COLUMNS`."""
+def _timed(study: Study, panel: Curves, method: Method, num_steps: int, reference: float) -> dict[str, float]:
+    """The entries of a curve at one step size."""
     seconds, value = [], 0.0
     for _ in range(1 + CALLS):
         started = time.perf_counter()
         value = _gradient(study, panel, method, num_steps)
         seconds.append(time.perf_counter() - started)
-    error = abs(value / reference - 1)
-    return panel.t1 / num_steps, value, error, statistics.median(seconds[1:]), seconds[0]
+    return {
+        "h": panel.t1 / num_steps,
+        "gradient": value,
+        "relative_error": abs(value / reference - 1),
+        "seconds": statistics.median(seconds[1:]),
+        "seconds_of_first_call": seconds[0],
+    }
 
 
 def table(panel: Mapping[str, Any]) -> str:
@@ -234,38 +245,13 @@ def table(panel: Mapping[str, Any]) -> str:
     ]
 
     def block(head: str, columns: Sequence[str], row: Callable[[Any], Sequence[str]]):
-        lines.extend(["", f"{head:<34}" + "".join(f"{column:>11}" for column in columns)])
-        lines.extend(f"{name:<34}" + "".join(f"{cell:>11}" for cell in row(curve)) for name, curve in methods.items())
+        rows = [(head, columns), *((name, row(curve)) for name, curve in methods.items())]
+        lines.extend(["", *(f"{name:<34}" + "".join(f"{cell:>11}" for cell in cells) for name, cells in rows)])
 
     sizes = [f"{h:.4g}" for h in steps]
-    block(
-        "relative error, h [s] =",
-        [*sizes, "slope"],
-        lambda c: [*(f"{error:.3e}" for error in c["relative_error"]), f"{c['slope']:.3f}"],
-    )
-    block(
-        "slope between this h and the last",
-        ["", *sizes[1:]],
-        lambda c: ["", *(f"{s:.3f}" for s in c["slopes_between"])],
-    )
+    errors = lambda c: [*(f"{error:.3e}" for error in c["relative_error"]), f"{c['slope']:.3f}"]
+    block("relative error, h [s] =", [*sizes, "slope"], errors)
+    slopes = lambda c: ["", *(f"{slope:.3f}" for slope in c["slopes_between"])]
+    block("slope between this h and the last", ["", *sizes[1:]], slopes)
     block("time of one gradient [ms]", sizes, lambda c: [f"{1e3 * seconds:.1f}" for seconds in c["seconds"]])
     return "\n".join(lines)
-
-
-def _drawn(study: Study, key: str, panel: Mapping[str, Any]) -> plotting.ErrorPanel:
-    series = {name: (curve["h"], curve["relative_error"]) for name, curve in panel["methods"].items()}
-    return plotting.ErrorPanel(study.panels[key].title, "relative error [–]", series)
-
-
-def _document(panels: Mapping[str, Any], arguments: argparse.Namespace) -> dict[str, Any]:
-    return {
-        "source": "Sonneville & Bruls (2014), Fig. 2 and Fig. 4",
-        "settings": {"only": arguments.only, "coarse": arguments.coarse},
-        "panels": panels,
-        "timing": f"median of {CALLS} calls after the first, which compiles; a program of fig4a serves fig4b, too",
-        "slope": f"least squares through the {SLOPE_STEPS} smallest steps",
-        "cores": os.cpu_count(),
-        "device": jax.devices()[0].platform,
-        "versions": {"python": platform.python_version()}
-        | {name: version(name) for name in ("lgsens", "jax", "jaxlib", "diffrax", "equinox", "numpy")},
-    }

@@ -1,6 +1,7 @@
 """What commands share, and what `lgsens optimize` says: the document of `result.json` and the table."""
 
 import contextlib
+import json
 import platform
 from collections.abc import Iterator
 from importlib import metadata
@@ -15,6 +16,7 @@ CONSTRAINTS = (
     ("minimum spring length", "spring_length", "minimum_spring_length", "m"),
     ("maximum spring length", "spring_length", "maximum_spring_length", "m"),
 )
+HISTORY = ("objective", "worst_constraint", "gradient_norm")
 UNITS = {"stiffness": "N/m", "damping": "N s/m", "hardpoints": "m"}
 
 
@@ -43,22 +45,32 @@ def version(distribution: str = "lgsens") -> str:
         return "unknown"
 
 
+def versions(*names: str) -> dict[str, str]:
+    """The versions of Python, of the libraries that every command uses, and of those named."""
+    found = {name: version(name) for name in ("lgsens", "jax", "jaxlib", *names, "numpy")}
+    return {"python": platform.python_version()} | found
+
+
+def write_json(document: dict[str, Any], path: Path, **layout: Any) -> None:
+    """A document as a file of finite numbers; `layout`: settings of `json.dumps`."""
+    path.write_text(json.dumps(document, allow_nan=False, **layout) + "\n", encoding="utf-8")
+
+
+def written(out: Path) -> str:
+    """What the last line says."""
+    return f"\nwritten to {out}: {', '.join(sorted(path.name for path in out.iterdir()))}"
+
+
 def document(outcome: Any, settings: dict[str, Any], tolerance: float) -> dict[str, Any]:
     """Everything about an outcome, as JSON: SI units, finite numbers only."""
     design, result, before = outcome.design, outcome.result, outcome.before
-    lower, upper = design.bounds
+    stages = dict(zip(("before", "after", "lower", "upper"), (design.start, result.x, *design.bounds)))
     return {
         "problem": "quarter-car",
         "suspension": design.car.name,
         "design": {
-            name: {
-                "unit": UNITS[name],
-                "before": _values(design, name, value),
-                "after": _values(design, name, result.x[name]),
-                "lower": _values(design, name, lower[name]),
-                "upper": _values(design, name, upper[name]),
-            }
-            for name, value in design.start.items()
+            name: {"unit": UNITS[name]} | {stage: _values(design, name, x[name]) for stage, x in stages.items()}
+            for name in design.start
         },
         "objective": {
             "name": "Psi_0, integral of the squared vertical acceleration of the chassis",
@@ -89,14 +101,11 @@ def document(outcome: Any, settings: dict[str, Any], tolerance: float) -> dict[s
         "history": {
             "kept_step": result.step,
             "ended": result.reason,
-            "objective": _finite(result.history.objective),
-            "worst_constraint": _finite(result.history.worst_constraint),
-            "gradient_norm": _finite(result.history.gradient_norm),
+            **{name: _finite(getattr(result.history, name)) for name in HISTORY},
         },
         "settings": settings,
         "seconds": outcome.seconds,
-        "versions": {"python": platform.python_version()}
-        | {name: version(name) for name in ("lgsens", "jax", "jaxlib", "optax", "numpy")},
+        "versions": versions("optax"),
     }
 
 
@@ -104,16 +113,11 @@ def constraints(outcome: Any, tolerance: float) -> list[dict[str, Any]]:
     """The worst moment of each path constraint before and after, and whether it is active at the end."""
     rows = []
     for i, (name, quantity, limit, unit) in enumerate(CONSTRAINTS):
-        row = {"name": name, "unit": unit, "limit": float(getattr(outcome.design.limits, limit))}
-        for label, response in (("before", outcome.before), ("after", outcome.after)):
-            worst = int(np.argmax(response.constraints[:, i]))
-            row[label] = {
-                "worst_value": float(getattr(response, quantity)[worst]),
-                "time": float(response.t[worst]),
-                "violation_over_scale": float(response.constraints[worst, i]),
-            }
-        row["active"] = abs(row["after"]["violation_over_scale"]) <= tolerance
-        rows.append(row)
+        stages = {
+            label: _worst(getattr(response, quantity), response.constraints[:, i], time=response.t)
+            for label, response in (("before", outcome.before), ("after", outcome.after))
+        }
+        rows.append(_row(name, unit, getattr(outcome.design.limits, limit), stages, tolerance))
     return rows
 
 
@@ -126,18 +130,22 @@ def kept_curves(outcome: Any, tolerance: float) -> list[dict[str, Any]]:
     curves = {label: keep.curves(car) for label, car in cars.items()}
     for name, band in keep.bands.items():
         middle, half = np.asarray(band.lower + band.upper) / 2, np.asarray(band.upper - band.lower) / 2
-        row = {"name": f"change of {name}", "unit": "rad", "limit": float(half[0])}
-        for label, found in curves.items():
-            change = np.asarray(getattr(found, name)) - middle
-            worst = int(np.argmax(np.abs(change) / half))
-            row[label] = {
-                "worst_value": float(change[worst]),
-                "travel": float(keep.travel[worst]),
-                "violation_over_scale": float(np.abs(change[worst]) / half[worst] - 1),
-            }
-        row["active"] = abs(row["after"]["violation_over_scale"]) <= tolerance
-        rows.append(row)
+        changes = {label: np.asarray(getattr(found, name)) - middle for label, found in curves.items()}
+        stages = {label: _worst(c, np.abs(c) / half - 1, travel=keep.travel) for label, c in changes.items()}
+        rows.append(_row(f"change of {name}", "rad", half[0], stages, tolerance))
     return rows
+
+
+def _worst(values, violations, **places) -> dict[str, float]:
+    """The value where a constraint is violated most, and the place, by the name of what it is a place in."""
+    worst = int(np.argmax(violations))
+    where = {name: float(place[worst]) for name, place in places.items()}
+    return {"worst_value": float(values[worst]), **where, "violation_over_scale": float(violations[worst])}
+
+
+def _row(name: str, unit: str, limit, stages: dict[str, dict[str, float]], tolerance: float) -> dict[str, Any]:
+    active = abs(stages["after"]["violation_over_scale"]) <= tolerance
+    return {"name": name, "unit": unit, "limit": float(limit), **stages, "active": active}
 
 
 def _values(design: Any, name: str, value: Any) -> Any:
@@ -151,54 +159,43 @@ def _finite(values: np.ndarray) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]
 
 
-def table(outcome: Any, tolerance: float) -> str:
-    """The design, the objective, the constraints and the gradient check, before and after."""
-    design, result = outcome.design, outcome.result
-    lower, upper = design.bounds
+def table(found: dict[str, Any]) -> str:
+    """The design, the objective, the constraints and the gradient check of a `document`, before and after."""
     lines = [f"{'':<36}{'before':>13}{'after':>13}   limits", "-" * 92]
 
     def line(name, before, after, note, digits):
         lines.append(f"{name:<36}{before:>13.{digits}f}{after:>13.{digits}f}   {note}")
 
-    for name, value in design.start.items():
+    for name, row in found["design"].items():
         if name != "hardpoints":
-            bounds = f"{float(lower[name]):.0f} .. {float(upper[name]):.0f}"
-            line(f"{name} [{UNITS[name]}]", float(value), float(result.x[name]), bounds, 0)
+            line(f"{name} [{row['unit']}]", row["before"], row["after"], f"{row['lower']:.0f} .. {row['upper']:.0f}", 0)
             continue
-        box = 1e3 * float(design.limits.hardpoint_box)
-        for link, old, new in zip(sorted(design.car.links), value, result.x[name]):
-            for axis, a, b in zip("xyz", np.asarray(old), np.asarray(new)):
-                at_bound = ", at the bound" if box - abs(1e3 * (b - a)) < 1e-3 * box else ""
-                line(f"{link} {axis} [mm]", 1e3 * a, 1e3 * b, f"+-{box:.0f} mm{at_bound}", 1)
-    reduction = 100 * (1 - result.objective / float(outcome.before.objective))
-    line("Psi_0 [m^2/s^3]", float(outcome.before.objective), result.objective, f"{-reduction:+.1f} %", 4)
+        for link in row["before"]:
+            for i, axis in enumerate("xyz"):
+                before, after, highest = (1e3 * row[stage][link][i] for stage in ("before", "after", "upper"))
+                box = highest - before
+                at_bound = ", at the bound" if box - abs(after - before) < 1e-3 * box else ""
+                line(f"{link} {axis} [mm]", before, after, f"+-{box:.0f} mm{at_bound}", 1)
+    objective, tolerance = found["objective"], found["constraint_tolerance"]
+    line("Psi_0 [m^2/s^3]", objective["before"], objective["after"], f"{-100 * objective['reduction']:+.1f} %", 4)
     shown = {"m": (1e3, "mm"), "rad": (np.degrees(1.0), "deg")}
-    for row in constraints(outcome, tolerance) + kept_curves(outcome, tolerance):
+    for row in found["constraints"]:
         factor, unit = shown.get(row["unit"], (1.0, row["unit"]))
+        before, after = (factor * row[stage]["worst_value"] for stage in ("before", "after"))
         violation = row["after"]["violation_over_scale"]
         state = "active" if row["active"] else "satisfied" if violation <= tolerance else "VIOLATED"
-        line(
-            f"{row['name']} [{unit}]",
-            factor * row["before"]["worst_value"],
-            factor * row["after"]["worst_value"],
-            f"{factor * row['limit']:g}, {state} ({violation:+.1e} of scale)",
-            2,
-        )
-    curves = outcome.curves or {}
-    for name in ("camber", "toe") if curves else ():
-        if design.keep is None or name not in design.keep.bands:
-            before, after = (np.degrees(getattr(curves[label], name)) for label in ("before", "after"))
-            travel = 1e3 * float(curves["before"].travel[-1])
-            change = after - before
+        note = f"{factor * row['limit']:g}, {state} ({violation:+.1e} of scale)"
+        line(f"{row['name']} [{unit}]", before, after, note, 2)
+    kept = [row["name"] for row in found["constraints"]]
+    for name in ("camber", "toe"):
+        if found["curves"] and f"change of {name}" not in kept:
+            before, after = (np.degrees(found["curves"][stage][name]) for stage in ("before", "after"))
+            change, travel = after - before, 1e3 * found["curves"]["before"]["travel"][-1]
             note = f"free, at worst over +-{travel:.0f} mm of travel"
             line(f"change of {name} [deg]", 0.0, change[np.argmax(np.abs(change))], note, 2)
-    lines.append("-" * 92)
-    errors = {where: float(np.max(check.error)) for where, check in outcome.checks.items()}
-    lines.append(
-        "gradient against central differences: relative error "
-        + ", ".join(f"{error:.1e} at the {where}" for where, error in errors.items())
-    )
-    lines.append(", ".join(f"{name} {value:.2f} s" for name, value in outcome.seconds.items()))
-    if not result.feasible:
+    errors = (f"{max(check['relative_error']):.1e} at the {where}" for where, check in found["gradient_check"].items())
+    seconds = (f"{name} {value:.2f} s" for name, value in found["seconds"].items())
+    lines += ["-" * 92, f"gradient against central differences: relative error {', '.join(errors)}", ", ".join(seconds)]
+    if not found["feasible"]:
         lines.append("No design satisfied the path constraints; this one violates them least. Try more --steps.")
     return "\n".join(lines)

@@ -1,21 +1,18 @@
 """`lgsens tradeoff`: what settings cost and lose on a scene, and which to take for how many digits."""
 
 import argparse
-import json
 import os
-import platform
 import runpy
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from lgsens import plotting
 from lgsens.accuracy import Recommendation, Setting, Table, grid, ladder, plot, recommend, work_precision
-from lgsens.cli._report import output_folder, version
+from lgsens.cli._report import output_folder, versions, write_json
 from lgsens.criteria import Criterion
 from lgsens.examples import PROBLEMS, QuarterCar
 from lgsens.integrate import GeneralizedAlpha, IndexReducedODE
@@ -67,45 +64,40 @@ def quarter_car(bushings: Sequence[str] = ()) -> Scene:
     import diffrax  # takes its time to import
 
     car = QuarterCar.load()
-    names = sorted(car.links)
-    parameters = {
-        "stiffness": car.spring.rate,
-        "damping": car.damper.rate,
-        "hardpoints": jnp.stack([car.links[name].chassis for name in names]),
-    }
+    parameters = {"stiffness": car.spring.rate, "damping": car.damper.rate, "hardpoints": car.hardpoints}
 
     def build(p, **options):
-        members = lambda car: [car.spring.rate, car.damper.rate, *(car.links[name].chassis for name in names)]
-        moved = eqx.tree_at(members, car, [p["stiffness"], p["damping"], *p["hardpoints"]])
-        return moved.model(wheel="locked", bushings=bushings, **options)
+        return car.with_values(**p).model(wheel="locked", bushings=bushings, **options)
 
     comfort = Criterion(integrand=lambda s, p: s.body("chassis").acceleration[2] ** 2)
     # The bump ends at 0.25 s: a fourth of the steps, so that the kink is between two of them.
     loose, alpha, dopri8 = GeneralizedAlpha(tolerance=1e-5), GeneralizedAlpha(), IndexReducedODE(diffrax.Dopri8())
     heave, rods = {"chassis": "heave"}, {"chassis": "heave", "links": "rods"}
+    extrapolated = (
+        *grid((28, 52), GeneralizedAlpha(tolerance=1e-6), extrapolate=True, model=heave),
+        *grid((40,), GeneralizedAlpha(tolerance=1e-7), extrapolate=3, model=heave),
+    )
     if bushings:
         settings = (
             *grid((28, 76, 200), loose, model=heave),
             *grid((400, 1600, 6400), alpha, model=heave),
-            *grid((28, 52), GeneralizedAlpha(tolerance=1e-6), extrapolate=True, model=heave),
-            *grid((40,), GeneralizedAlpha(tolerance=1e-7), extrapolate=3, model=heave),
+            *extrapolated,
             *grid((200, 800), alpha, extrapolate=True, model=heave),
             *grid((8000,), IndexReducedODE(), model=heave),
             *grid((5000,), dopri8, model=heave),
         )
-        return Scene("stiff five-link quarter-car", build, comfort, parameters, 1.0, settings)
-    settings = (
-        *grid((28, 76), loose),
-        *grid((200,), alpha),
-        *grid((52,), loose, model=heave),
-        *grid((28, 76), loose, model=rods),
-        *grid((28, 52), GeneralizedAlpha(tolerance=1e-6), extrapolate=True, model=heave),
-        *grid((40,), GeneralizedAlpha(tolerance=1e-7), extrapolate=3, model=heave),
-        *grid((60,), IndexReducedODE()),
-        *grid((40,), dopri8),
-        *grid((20, 40, 80), dopri8, model=heave),
-    )
-    return Scene("five-link quarter-car", build, comfort, parameters, 1.0, settings)
+    else:
+        settings = (
+            *grid((28, 76), loose),
+            *grid((200,), alpha),
+            *grid((52,), loose, model=heave),
+            *grid((28, 76), loose, model=rods),
+            *extrapolated,
+            *grid((60,), IndexReducedODE()),
+            *grid((40,), dopri8),
+            *grid((20, 40, 80), dopri8, model=heave),
+        )
+    return Scene(f"{'stiff ' if bushings else ''}five-link quarter-car", build, comfort, parameters, 1.0, settings)
 
 
 # What the command knows by name.
@@ -138,22 +130,12 @@ def run(arguments: argparse.Namespace) -> int:
     plotting.figure()  # asks for matplotlib now, not after minutes
     scene = SCENES[arguments.scene]() if arguments.scene in SCENES else from_file(Path(arguments.scene))
     with output_folder(arguments.out, arguments.overwrite) as out:
-        table = work_precision(
-            scene.criterion,
-            scene.build,
-            scene.parameters,
-            scene.settings,
-            t0=scene.t0,
-            t1=scene.t1,
-            scale=scene.scale,
-            rounds=arguments.rounds,
-            progress=not arguments.quiet,
-        )
+        what = {"t0": scene.t0, "t1": scene.t1, "scale": scene.scale}
+        how = {"rounds": arguments.rounds, "progress": not arguments.quiet}
+        table = work_precision(scene.criterion, scene.build, scene.parameters, scene.settings, **what, **how)
         found = [recommend(table, target, by=arguments.by) for target in arguments.targets]
-        text = json.dumps(document(scene, table, found), indent=1, ensure_ascii=False, allow_nan=False)
-        (out / "tradeoff.json").write_text(text + "\n", encoding="utf-8")
-        figure = plot(table, arguments.targets, by=arguments.by, title=scene.title)
-        plotting.save(figure, out / "tradeoff.png")
+        write_json(document(scene, table, found), out / "tradeoff.json", indent=1, ensure_ascii=False)
+        plotting.save(plot(table, arguments.targets, by=arguments.by, title=scene.title), out / "tradeoff.png")
     if not arguments.quiet:
         print(table, *found, f"written to {out}: tradeoff.json, tradeoff.png", sep="\n\n")
     return 0 if all(found) else 1
@@ -165,11 +147,8 @@ def recommendations(table: Table, found: list[Recommendation]) -> list[dict[str,
     def place(row) -> int | None:
         return None if row is None else next(i for i, other in enumerate(table) if other is row)
 
-    return [
-        {"rtol": one.rtol, "row": place(one.row), "cheaper": place(one.cheaper)}
-        | {"margin": one.margin, "reason": one.reason}
-        for one in found
-    ]
+    places = lambda one: {"row": place(one.row), "cheaper": place(one.cheaper)}
+    return [{"rtol": one.rtol, **places(one), "margin": one.margin, "reason": one.reason} for one in found]
 
 
 def document(scene: Scene, table: Table, found: list[Recommendation]) -> dict[str, Any]:
@@ -184,6 +163,5 @@ def document(scene: Scene, table: Table, found: list[Recommendation]) -> dict[st
         "cores": os.cpu_count(),
         "load_average": round(os.getloadavg()[0], 1),
         "device": jax.devices()[0].platform,
-        "versions": {"python": platform.python_version()}
-        | {name: version(name) for name in ("lgsens", "jax", "jaxlib", "diffrax", "numpy")},
+        "versions": versions("diffrax"),
     }

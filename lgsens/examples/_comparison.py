@@ -1,26 +1,22 @@
 """The scenes on which all methods are compared: four scenes, five kinds of criteria on each."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from lgsens.criteria import Criterion
-from lgsens.examples._chain import spatial_chain
-from lgsens.examples._four_bar import four_bar
+from lgsens.examples._mechanisms import four_bar, spatial_chain
 from lgsens.examples._problems import FREE, Problem
 from lgsens.examples._quarter_car import QuarterCar
-from lgsens.examples._top import spinning_top
+from lgsens.examples._tops import spinning_top
 from lgsens.model import Model
 
 
 def _quarter_car(p) -> Model:
     """The five-link quarter-car; one chassis hardpoint is moved, spring and tyre keep their free lengths."""
-    with jax.ensure_compile_time_eval():  # the file is read and checked even where p is traced
-        car = QuarterCar.load()
-    members = lambda car: (car.spring.rate, car.damper.rate, car.links["trailing_arm"].chassis)
-    moved = car.links["trailing_arm"].chassis + p["trailing_arm_y"] * jnp.asarray([0.0, 1.0, 0.0], car.bearing.dtype)
-    car = eqx.tree_at(members, car, (*(jnp.asarray(p[n], car.bearing.dtype) for n in ("k", "c")), moved))
-    return car.model(**FREE)
+    car = QuarterCar.load().with_values(stiffness=p["k"], damping=p["c"])
+    member = lambda car: car.links["trailing_arm"].chassis
+    moved = member(car) + p["trailing_arm_y"] * jnp.asarray([0.0, 1.0, 0.0], car.bearing.dtype)
+    return eqx.tree_at(member, car, moved).model(**FREE)
 
 
 def _five(terminal, q, v, vdot, lam) -> dict[str, Criterion]:

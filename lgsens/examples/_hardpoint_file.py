@@ -2,6 +2,7 @@
 
 import math
 import tomllib
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,10 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
+def _are_numbers(value: Any, count: int) -> bool:
+    return isinstance(value, list) and len(value) == count and all(map(_is_number, value))
+
+
 class Reader:
     """Reads keys of a TOML document, and says which one is missing or wrong."""
 
@@ -25,32 +30,29 @@ class Reader:
     def _fail(self, key: str, why: str) -> ValueError:
         return ValueError(f"Hardpoint file {self._path!r}, key {'.'.join((*self._keys, key))!r}: {why}")
 
-    def _get(self, key: str) -> Any:
+    def _get(self, key: str, holds: Callable[[Any], bool], what: str) -> Any:
         if key not in self._table:
             raise self._fail(key, "is missing; see lgsens/examples/data/five_link_suspension.toml for the format.")
-        return self._table[key]
+        value = self._table[key]
+        if not holds(value):
+            raise self._fail(key, f"must be {what}, got {value!r}.")
+        return value
 
     def table(self, key: str) -> "Reader":
-        value = self._get(key)
-        if not isinstance(value, dict):
-            raise self._fail(key, f"must be a table, got {value!r}.")
+        value = self._get(key, lambda value: isinstance(value, dict), "a table")
         return Reader(value, self._path, (*self._keys, key))
 
     def names(self) -> list[str]:
         return list(self._table)
 
     def number(self, key: str, scale: float = 1.0, positive: bool = True) -> Array:
-        value = self._get(key)
-        if not _is_number(value):
-            raise self._fail(key, f"must be a finite number, got {value!r}.")
-        if positive and not value > 0:
-            raise self._fail(key, f"must be positive, got {value!r}.")
+        value = self._get(key, _is_number, "a finite number")
+        if positive:
+            self._get(key, lambda value: value > 0, "positive")
         return as_float(value * scale, (), key)
 
     def vector(self, key: str, scale: float = 1.0) -> Array:
-        value = self._get(key)
-        if not isinstance(value, list) or len(value) != 3 or not all(map(_is_number, value)):
-            raise self._fail(key, f"must be three numbers [x, y, z], got {value!r}.")
+        value = self._get(key, lambda value: _are_numbers(value, 3), "three numbers [x, y, z]")
         return as_float([x * scale for x in value], (3,), key)
 
     def segment(self, first: str, second: str, scale: float) -> tuple[Array, Array]:
@@ -69,17 +71,13 @@ class Reader:
         return value
 
     def interval(self, key: str) -> tuple[Array, Array]:
-        value = self._get(key)
-        is_pair = isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))
-        if not is_pair or not 0 < value[0] < value[1]:
-            raise self._fail(key, f"must be two numbers [lower, upper] with 0 < lower < upper, got {value!r}.")
-        return as_float(value[0], (), key), as_float(value[1], (), key)
+        holds = lambda value: _are_numbers(value, 2) and 0 < value[0] < value[1]
+        lower, upper = self._get(key, holds, "two numbers [lower, upper] with 0 < lower < upper")
+        return as_float(lower, (), key), as_float(upper, (), key)
 
     def choice(self, key: str, known) -> str:
-        value = self._get(key)
-        if value not in list(known):  # a list, for a value that has no hash
-            raise self._fail(key, f"must be one of {sorted(known)}, got {value!r}.")
-        return value
+        # a list, for a value that has no hash
+        return self._get(key, lambda value: value in list(known), f"one of {sorted(known)}")
 
 
 def read(path: str | Path | None) -> tuple[dict, str]:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_float
-from lgsens.examples._four_bar import four_bar
+from lgsens.examples._mechanisms import four_bar
 from lgsens.simulation import simulate
 
 

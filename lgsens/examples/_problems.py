@@ -5,21 +5,14 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens.criteria import Criterion
-from lgsens.examples._four_bar import four_bar
-from lgsens.examples._free_rigid_body import free_rigid_body
-from lgsens.examples._heavy_top import heavy_top
-from lgsens.examples._lagrange_top import lagrange_top
-from lgsens.examples._linear_quarter_car import linear_quarter_car
+from lgsens.examples._mechanisms import four_bar, linear_quarter_car, simple_pendulum, slider_crank
 from lgsens.examples._quarter_car import QuarterCar
-from lgsens.examples._simple_pendulum import simple_pendulum
-from lgsens.examples._slider_crank import slider_crank
-from lgsens.examples._top import spinning_top
+from lgsens.examples._tops import free_rigid_body, heavy_top, lagrange_top, spinning_top
 from lgsens.integrate import GeneralizedAlpha
 from lgsens.model import Model
 from lgsens.simulation import Trajectory, simulate
@@ -118,43 +111,29 @@ class Problem(NamedTuple):
 
 
 @functools.cache  # the cases of a problem have one `build`, and so one compiled program
-def _of_dict(builder: Callable[..., Model]) -> Callable[[Mapping[str, Any]], Model]:
-    return lambda p: builder(**p)
+def _of_dict(scene: Callable[..., Model]) -> Callable[[Mapping[str, Any]], Model]:
+    return lambda p: scene(**p)
 
 
-def _with_defaults(builder: Callable[..., Model], **changes: float) -> dict[str, Any]:
-    """`build` and `parameters` of a builder whose arguments are the parameters."""
-    defaults = {name: argument.default for name, argument in inspect.signature(builder).parameters.items()}
-    return {"build": _of_dict(builder), "parameters": defaults | changes}
+def _problem(
+    name: str, scene: Callable[..., Model], t1: float, num_steps: int, criteria: dict[str, Criterion], **changes: float
+) -> Problem:
+    """The problem of a scene whose arguments are its parameters; `changes`: those that differ from their defaults."""
+    defaults = {name: argument.default for name, argument in inspect.signature(scene).parameters.items()}
+    return Problem(name, _of_dict(scene), defaults | changes, t1, criteria, num_steps)
 
 
-def _spinning_top(p) -> Model:
-    return spinning_top(p["alpha0"], p["m"], (p["J11"], p["J22"], p["J33"]), p["l"], p["omega0"], p["g"])
+def _spinning_top(alpha0=0.7853981633974483, m=15.0, J11=0.2, J22=0.4, J33=0.2, l=1.0, omega0=10.0, g=9.81) -> Model:
+    return spinning_top(alpha0, m, (J11, J22, J33), l, omega0, g)
 
 
 # Those at which the quarter-car's design position is in equilibrium for the k below, printed with the reference [m].
-FREE = {"free_length": 0.3350681866287862, "free_radius": 0.336861050861}
+FREE: dict[str, Any] = {"free_length": 0.3350681866287862, "free_radius": 0.336861050861}
 
 
-def _five_link(wheel: str) -> Callable[[Mapping[str, Any]], Model]:
+def _five_link(wheel: str, k=109000.0, c=4900.0, hb=0.05) -> Model:
     """The five-link quarter-car with given rates and bump; spring and tyre keep their free lengths."""
-
-    def build(p):
-        with jax.ensure_compile_time_eval():  # the file is read and checked even where k, c, hb are traced
-            car = QuarterCar.load()
-        members = lambda car: (car.spring.rate, car.damper.rate, car.bump_height)
-        car = eqx.tree_at(members, car, tuple(jnp.asarray(p[name], car.bearing.dtype) for name in ("k", "c", "hb")))
-        return car.model(wheel=wheel, **FREE)
-
-    return build
-
-
-def _integral(integrand: Callable[[Any, Any], Float[Array, ""]]) -> Criterion:
-    return Criterion(integrand=integrand)
-
-
-def _terminal(terminal: Callable[[Any, Any], Float[Array, ""]]) -> Criterion:
-    return Criterion(terminal=terminal)
+    return QuarterCar.load().with_values(stiffness=k, damping=c, bump_height=hb).model(wheel=wheel, **FREE)
 
 
 def _kinetic_energy_of_crank(s, p):
@@ -167,142 +146,71 @@ def _distance_of_coupler(s, p):
     return (x - 0.5) ** 2 + (y - 0.45) ** 2
 
 
-_X1_SQUARED = _integral(lambda s, p: s.body("top").position[0] ** 2)
-_HEIGHT = _integral(lambda s, p: s.body("top").position[2])
-_COMFORT = _integral(lambda s, p: s.body("chassis").acceleration[2] ** 2)
+_X1_SQUARED = Criterion(lambda s, p: s.body("top").position[0] ** 2)
+_HEIGHT = Criterion(lambda s, p: s.body("top").position[2])
+# x_cm = l R e₃; the scene's body has its centre of mass elsewhere
+_LAGRANGE = {"Psi": Criterion(lambda s, p: (p["l"] * s.body("top").orientation[0, 2]) ** 2)}
+_TURNED = {"Psi": Criterion(lambda s, p: s.body("body").orientation[1, 0] ** 2)}
+_PENDULUM = {"Psi": Criterion(lambda s, p: s.body("mass").position[0] ** 2)}
+_SLIDER_CRANK = {
+    "G": Criterion(_kinetic_energy_of_crank),
+    "Psi2": Criterion(lambda s, p: s.body("slider").acceleration[0] ** 2),
+}
+_FOUR_BAR = {
+    "Psi1": Criterion(_distance_of_coupler),
+    "Psi2": Criterion(lambda s, p: jnp.sum(s.body("coupler").acceleration ** 2)),
+}
+_SPRUNG = {"Psi0": Criterion(lambda s, p: s.body("sprung").acceleration[2] ** 2)}
+_COMFORT = Criterion(lambda s, p: s.body("chassis").acceleration[2] ** 2)
 _LINEAR = {
-    "stroke": _terminal(lambda s, p: s.body("sprung").position[2] - s.body("unsprung").position[2]),
-    "tire_dyn_force": _terminal(lambda s, p: s.force("tyre")),
-    "zs_acc": _terminal(lambda s, p: s.body("sprung").acceleration[2]),
+    "stroke": Criterion(terminal=lambda s, p: s.body("sprung").position[2] - s.body("unsprung").position[2]),
+    "tire_dyn_force": Criterion(terminal=lambda s, p: s.force("tyre")),
+    "zs_acc": Criterion(terminal=lambda s, p: s.body("sprung").acceleration[2]),
+}
+_FIVE_LINK = {
+    "F_tire(0.3)": Criterion(terminal=lambda s, p: s.force("tyre")),
+    "spring_length(0.3)": Criterion(terminal=lambda s, p: s.force("spring").length),
 }
 
-_TOP = {
-    "alpha0": 0.7853981633974483,
-    "m": 15.0,
-    "J11": 0.2,
-    "J22": 0.4,
-    "J33": 0.2,
-    "l": 1.0,
-    "omega0": 10.0,
-    "g": 9.81,
+
+def _heavy_top(seconds: int, num_steps: int) -> Problem:
+    criteria = {f"int_x1^2_0_{seconds}": _X1_SQUARED, f"int_x3_0_{seconds}": _HEIGHT}
+    return _problem(f"heavy_top_bruls2012.to_{seconds}s", heavy_top, float(seconds), num_steps, criteria)
+
+
+def _linear_at(t: float) -> Problem:
+    criteria = {f"{name}({t})": criterion for name, criterion in _LINEAR.items()}
+    return _problem(f"quarter_car_linear.at_{t}s", linear_quarter_car, t, 150, criteria)
+
+
+_DZHANIBEKOV = {"J1": 1.0, "J2": 2.0, "J3": 3.0, "w1": 0.001, "w2": 3.0, "w3": 0.002}
+_SYMMETRIC = {"J1": 1.0, "J2": 1.0, "J3": 0.5, "w1": 0.5, "w2": 0.5, "w3": 1.0}
+_SIMO_WONG = {"m": 20.0, "l": 1.0, "J1": -15.0, "J3": 1.0, "w3": 50.0, "theta0": 0.05, "g": 1.0}
+_BRULS = "spinning_top_brulls"
+_HINGED, _LOCKED = (functools.partial(_five_link, wheel) for wheel in ("hinged", "locked"))
+_TOP = (_spinning_top, 1.0, 200, {"Psi": _X1_SQUARED})
+
+PROBLEMS: dict[str, Problem] = {
+    problem.name: problem
+    for problem in (
+        _problem(f"{_BRULS}.as_printed_l_0.5", *_TOP, l=0.5),
+        _problem(f"{_BRULS}.l_1.0_reproduces_published_number", *_TOP),
+        _problem(f"{_BRULS}.l_1.0_alpha0_0.785398", *_TOP, alpha0=0.785398),
+        _heavy_top(1, 1000),
+        _heavy_top(2, 4000),
+        _problem("lagrange_top_analytic.nutating", lagrange_top, 1.0, 4000, _LAGRANGE),
+        _problem("lagrange_top_analytic.simo_wong", lagrange_top, 1.0, 500, _LAGRANGE, **_SIMO_WONG),
+        _problem("free_rigid_body.asymmetric", free_rigid_body, 10.0, 500, _TURNED),
+        _problem("free_rigid_body.dzhanibekov", free_rigid_body, 20.0, 1000, _TURNED, **_DZHANIBEKOV),
+        _problem("free_rigid_body.symmetric_kynema", free_rigid_body, 5.0, 250, _TURNED, **_SYMMETRIC),
+        _problem("simple_pendulum_A01", simple_pendulum, 10.0, 1000, _PENDULUM),
+        _problem("slider_crank_sundials", slider_crank, 10.0, 500, _SLIDER_CRANK),
+        _problem("four_bar_spring", four_bar, 2.0, 500, _FOUR_BAR),
+        _problem("quarter_car_linear", linear_quarter_car, 3.0, 750, _SPRUNG),
+        _linear_at(0.1),
+        _linear_at(0.3),
+        _problem("five_link_quarter_car", _HINGED, 2.0, 480, {"Psi0": _COMFORT}),
+        _problem("five_link_quarter_car.at_0.3s", _HINGED, 0.3, 300, _FIVE_LINK),
+        _problem("five_link_quarter_car.locked_wheel", _LOCKED, 2.0, 480, {"Psi0_locked_wheel": _COMFORT}),
+    )
 }
-_CAR = {"k": 109000.0, "c": 4900.0, "hb": 0.05}
-
-
-def _tops() -> list[Problem]:
-    spinning = {"build": _spinning_top, "t1": 1.0, "criteria": {"Psi": _X1_SQUARED}, "num_steps": 200}
-    # x_cm = l R e₃; the scene's body has its centre of mass elsewhere
-    centre = _integral(lambda s, p: (p["l"] * s.body("top").orientation[0, 2]) ** 2)
-    lagrange = {"t1": 1.0, "criteria": {"Psi": centre}}
-    simo_wong = {"m": 20.0, "l": 1.0, "J1": -15.0, "J3": 1.0, "w3": 50.0, "theta0": 0.05, "g": 1.0}
-    return [
-        Problem("spinning_top_brulls.as_printed_l_0.5", parameters=_TOP | {"l": 0.5}, **spinning),
-        Problem("spinning_top_brulls.l_1.0_reproduces_published_number", parameters=_TOP, **spinning),
-        Problem("spinning_top_brulls.l_1.0_alpha0_0.785398", parameters=_TOP | {"alpha0": 0.785398}, **spinning),
-        *(
-            Problem(
-                f"heavy_top_bruls2012.to_{seconds}s",
-                **_with_defaults(heavy_top),
-                t1=float(seconds),
-                criteria={f"int_x1^2_0_{seconds}": _X1_SQUARED, f"int_x3_0_{seconds}": _HEIGHT},
-                num_steps=num_steps,
-            )
-            for seconds, num_steps in ((1, 1000), (2, 4000))
-        ),
-        Problem("lagrange_top_analytic.nutating", **_with_defaults(lagrange_top), **lagrange, num_steps=4000),
-        Problem(
-            "lagrange_top_analytic.simo_wong", **_with_defaults(lagrange_top, **simo_wong), **lagrange, num_steps=500
-        ),
-    ]
-
-
-def _free_bodies() -> list[Problem]:
-    criteria = {"Psi": _integral(lambda s, p: s.body("body").orientation[1, 0] ** 2)}
-    cases = {
-        "asymmetric": ({}, 10.0, 500),
-        "dzhanibekov": ({"J1": 1.0, "J2": 2.0, "J3": 3.0, "w1": 0.001, "w2": 3.0, "w3": 0.002}, 20.0, 1000),
-        "symmetric_kynema": ({"J1": 1.0, "J2": 1.0, "J3": 0.5, "w1": 0.5, "w2": 0.5, "w3": 1.0}, 5.0, 250),
-    }
-    return [
-        Problem(
-            f"free_rigid_body.{case}",
-            **_with_defaults(free_rigid_body, **changes),
-            t1=t1,
-            criteria=criteria,
-            num_steps=num_steps,
-        )
-        for case, (changes, t1, num_steps) in cases.items()
-    ]
-
-
-def _planar() -> list[Problem]:
-    return [
-        Problem(
-            "simple_pendulum_A01",
-            **_with_defaults(simple_pendulum),
-            t1=10.0,
-            criteria={"Psi": _integral(lambda s, p: s.body("mass").position[0] ** 2)},
-            num_steps=1000,
-        ),
-        Problem(
-            "slider_crank_sundials",
-            **_with_defaults(slider_crank),
-            t1=10.0,
-            criteria={
-                "G": _integral(_kinetic_energy_of_crank),
-                "Psi2": _integral(lambda s, p: s.body("slider").acceleration[0] ** 2),
-            },
-            num_steps=500,
-        ),
-        Problem(
-            "four_bar_spring",
-            **_with_defaults(four_bar),
-            t1=2.0,
-            criteria={
-                "Psi1": _integral(_distance_of_coupler),
-                "Psi2": _integral(lambda s, p: jnp.sum(s.body("coupler").acceleration ** 2)),
-            },
-            num_steps=500,
-        ),
-    ]
-
-
-def _cars() -> list[Problem]:
-    linear = _with_defaults(linear_quarter_car)
-    comfort = _integral(lambda s, p: s.body("sprung").acceleration[2] ** 2)
-    hinged = {"build": _five_link("hinged"), "parameters": _CAR}
-    return [
-        Problem("quarter_car_linear", **linear, t1=3.0, criteria={"Psi0": comfort}, num_steps=750),
-        *(
-            Problem(
-                f"quarter_car_linear.at_{t}s",
-                **linear,
-                t1=t,
-                criteria={f"{name}({t})": criterion for name, criterion in _LINEAR.items()},
-                num_steps=150,
-            )
-            for t in (0.1, 0.3)
-        ),
-        Problem("five_link_quarter_car", **hinged, t1=2.0, criteria={"Psi0": _COMFORT}, num_steps=480),
-        Problem(
-            "five_link_quarter_car.at_0.3s",
-            **hinged,
-            t1=0.3,
-            criteria={
-                "F_tire(0.3)": _terminal(lambda s, p: s.force("tyre")),
-                "spring_length(0.3)": _terminal(lambda s, p: s.force("spring").length),
-            },
-            num_steps=300,
-        ),
-        Problem(
-            "five_link_quarter_car.locked_wheel",
-            build=_five_link("locked"),
-            parameters=_CAR,
-            t1=2.0,
-            criteria={"Psi0_locked_wheel": _COMFORT},
-            num_steps=480,
-        ),
-    ]
-
-
-PROBLEMS: dict[str, Problem] = {problem.name: problem for problem in (*_tops(), *_free_bodies(), *_planar(), *_cars())}

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._validate import require, suggestion
+from lgsens._validate import as_float, require, suggestion
 from lgsens.analysis import Kinematics, kinematics
 from lgsens.examples._hardpoint_file import Reader, read
 from lgsens.examples._suspension_curves import SuspensionCurves, suspension_curves
@@ -34,6 +34,8 @@ from lgsens.model import (
 )
 
 GRAVITY = 9.81  # m/s²
+ALONG_Y: Any = (0.0, 1.0, 0.0)
+ALONG_Z: Any = (0.0, 0.0, 1.0)
 
 
 class Link(eqx.Module):
@@ -52,6 +54,10 @@ class Strut(eqx.Module):
     chassis_point: Float[Array, "3"]
     rate: Float[Array, ""]
 
+    def element(self, **rates: Any) -> SpringDamper:
+        """The force element with these numbers of `SpringDamper`."""
+        return SpringDamper(self.link, "chassis", at_a=self.link_point, at_b=self.chassis_point, **rates)
+
 
 class Part(eqx.Module):
     """A body: centre of mass [m], mass [kg], principal moments about the axes of the file [kg m²]."""
@@ -64,11 +70,10 @@ class Part(eqx.Module):
 class QuarterCar(eqx.Module):
     """A quarter-car with a five-link suspension: its data, all numbers leaves. `QuarterCar.load()` reads them.
 
-    Five links, knuckle, wheel and chassis are eight rigid bodies. Each link has a universal joint at the
-    chassis and a spherical joint at the knuckle; the wheel turns on a hinge of the knuckle or is locked to
-    it; the chassis heaves only. With 48 coordinates and 45 (46) constraints the mechanism has 3 (2) degrees
-    of freedom; a reduced scene has the same with 19 and 16 (17), see `model`. Frame: x forward, y left, z up;
-    SI units.
+    Five links, knuckle, wheel and chassis are eight rigid bodies. Each link has a universal joint at the chassis and a
+    spherical joint at the knuckle; the wheel turns on a hinge of the knuckle or is locked to it; the chassis heaves
+    only. With 48 coordinates and 45 (46) constraints the mechanism has 3 (2) degrees of freedom; a reduced scene has
+    the same with 19 and 16 (17), see `model`. Frame: x forward, y left, z up; SI units.
 
     Source: Sonneville & Brüls (2014), §9; hardpoints, masses and rates from BPMinaker/eom_pkg,
     input_5link.m (R. Rieveley 2009).
@@ -91,12 +96,27 @@ class QuarterCar(eqx.Module):
     def load(path: str | Path | None = None) -> "QuarterCar":
         """Read a suspension from a TOML file; None: the one that ships with lgsens.
 
-        The shipped file, `lgsens/examples/data/five_link_suspension.toml`, shows the format. Raises
-        `ValueError` naming the file and the key (or the line) for a file that cannot be read or is
-        incomplete.
+        The shipped file, `lgsens/examples/data/five_link_suspension.toml`, shows the format. Raises `ValueError` naming
+        the file and the key (or the line) for a file that cannot be read or is incomplete.
         """
         with jax.ensure_compile_time_eval():  # the file's numbers are constants, inside `jit` too
             return _parse(*read(path))
+
+    @property
+    def hardpoints(self) -> Float[Array, "n 3"]:
+        """The chassis ends of the links in sorted order of their names [m]."""
+        return jnp.stack([self.links[name].chassis for name in sorted(self.links)])
+
+    def with_values(self, *, stiffness=None, damping=None, bump_height=None, hardpoints=None) -> "QuarterCar":
+        """The car with another stiffness [N/m] or damping [N s/m], bump [m] or `hardpoints`; None: with its own."""
+        rates = lambda car: [car.spring.rate, car.damper.rate, car.bump_height]
+        members = lambda car: rates(car) + [car.links[name].chassis for name in sorted(self.links)]
+        points = [None] * len(self.links) if hardpoints is None else hardpoints
+        values = [
+            old if value is None else as_float(value, old.shape, "values of a car")
+            for old, value in zip(members(self), (stiffness, damping, bump_height, *points))
+        ]
+        return eqx.tree_at(members, self, values)
 
     def model(
         self,
@@ -140,73 +160,43 @@ class QuarterCar(eqx.Module):
                 raise ValueError(f"`bushings`: {suggestion(name, self.links)}.")
         kept = {self.spring.link, self.damper.link, *bushings}
         rods = {name: link for name, link in self.links.items() if links == "rods" and name not in kept}
-        frozen = free_length is not None
-        heaves = "z" if chassis == "heave" else ALL_FREE
+        chassis_free = "z" if chassis == "heave" else ALL_FREE
         bodies = {
-            "chassis": _body(self.chassis, [(rod.mass / 2, rod.chassis) for rod in rods.values()], heaves),
+            "chassis": _body(self.chassis, [(rod.mass / 2, rod.chassis) for rod in rods.values()], chassis_free),
             "knuckle": _body(self.knuckle, [(rod.mass / 2, rod.knuckle) for rod in rods.values()]),
             "wheel": _body(self.wheel),
         } | {name: _bar(link, self.link_radius) for name, link in self.links.items() if name not in rods}
-        along_x = jnp.asarray([1.0, 0.0, 0.0], self.bearing.dtype)
-        along_y = jnp.asarray([0.0, 1.0, 0.0], self.bearing.dtype)
-        along_z = jnp.asarray([0.0, 0.0, 1.0], self.bearing.dtype)
-        joints: dict[str, Any] = {
-            "hub": RevoluteJoint("knuckle", "wheel", at=self.bearing, axis=along_y)
+        hub: Any = (
+            RevoluteJoint("knuckle", "wheel", at=self.bearing, axis=ALONG_Y)
             if wheel == "hinged"
-            else FixedJoint("knuckle", "wheel", at=self.bearing),
-        }
+            else FixedJoint("knuckle", "wheel", at=self.bearing)
+        )
+        joints = {"hub": hub}
         if chassis == "guided":
-            joints["heave"] = PrismaticJoint(None, "chassis", at=self.chassis.centre, axis=along_z)
+            joints["heave"] = PrismaticJoint(None, "chassis", at=self.chassis.centre, axis=ALONG_Z)
+        along_x = jnp.asarray([1.0, 0.0, 0.0], self.bearing.dtype)
         for name, link in self.links.items():
             if name in rods:
                 joints[name] = DistanceJoint("chassis", "knuckle", at_a=link.chassis, at_b=link.knuckle)
                 continue
-            joints[f"{name}_chassis"] = UniversalJoint(
-                "chassis",
-                name,
-                at=link.chassis,
-                axis_a=along_x,
-                axis_b=jnp.cross(along_x, link.knuckle - link.chassis),
-            )
+            across = jnp.cross(along_x, link.knuckle - link.chassis)
+            joints[f"{name}_chassis"] = UniversalJoint("chassis", name, at=link.chassis, axis_a=along_x, axis_b=across)
             if name not in bushings:
                 joints[f"{name}_knuckle"] = SphericalJoint("knuckle", name, at=link.knuckle)
-        spring, damper = self.spring, self.damper
-        forces = {
-            "gravity": Gravity(-GRAVITY * along_z),
-            "spring": SpringDamper(
-                spring.link,
-                "chassis",
-                at_a=spring.link_point,
-                at_b=spring.chassis_point,
-                stiffness=spring.rate,
-                free_length=free_length,
-            ),
-            "damper": SpringDamper(
-                damper.link,
-                "chassis",
-                at_a=damper.link_point,
-                at_b=damper.chassis_point,
-                stiffness=jnp.zeros_like(damper.rate),
-                damping=damper.rate,
-            ),
-            "tyre": TyreSpring(
-                "wheel",
-                at=self.wheel.centre,
-                stiffness=self.tyre_stiffness,
-                free_radius=free_radius,
-                road=BumpRoad(height=self.bump_height, duration=self.bump_duration),
-            ),
+        road = BumpRoad(height=self.bump_height, duration=self.bump_duration)
+        tyre = {"stiffness": self.tyre_stiffness, "free_radius": free_radius, "road": road}
+        forces: dict[str, Any] = {
+            "gravity": Gravity((0.0, 0.0, -GRAVITY)),
+            "spring": self.spring.element(stiffness=self.spring.rate, free_length=free_length),
+            "damper": self.damper.element(stiffness=0.0, damping=self.damper.rate),
+            "tyre": TyreSpring("wheel", at=self.wheel.centre, **tyre),
         }
         for name in bushings:
-            forces[f"{name}_bushing"] = Bushing(
-                "knuckle",
-                name,
-                at=self.links[name].knuckle,
-                stiffness=jnp.full(3, bushing_stiffness, self.bearing.dtype),
-                damping=jnp.full(3, bushing_damping, self.bearing.dtype),
-            )
+            rates = {"stiffness": bushing_stiffness, "damping": bushing_damping}
+            rates = {rate: jnp.full(3, value, self.bearing.dtype) for rate, value in rates.items()}
+            forces[f"{name}_bushing"] = Bushing("knuckle", name, at=self.links[name].knuckle, **rates)
         model = Model(bodies, joints, forces)
-        if frozen:
+        if free_length is not None:
             return model
         model, unbalanced = static_preload(model, ("spring", "tyre", *(f"{name}_bushing" for name in bushings)))
         require(
@@ -232,12 +222,9 @@ class QuarterCar(eqx.Module):
         """
         # Lengths that are given need no preload to be found.
         scene = self.model(wheel="locked", chassis="heave", links=links, free_length=1.0, free_radius=1.0)
-        along_z = jnp.asarray([0.0, 0.0, 1.0], self.bearing.dtype)
-        rig = Model(
-            scene.bodies | {"chassis": _body(self.chassis, free=())},
-            scene.joints | {"travel": TranslationDriver(None, "wheel", at=self.wheel.centre, axis=along_z)},
-            scene.forces,
-        )
+        driver = TranslationDriver(None, "wheel", at=self.wheel.centre, axis=ALONG_Z)
+        held = {"chassis": _body(self.chassis, free=())}
+        rig = Model(scene.bodies | held, scene.joints | {"travel": driver}, scene.forces)
         return kinematics(rig, {"travel": travel}, throw=throw)
 
     def curves(self, travel, *, axle: str = "rear", throw: bool = True) -> SuspensionCurves:
@@ -312,11 +299,8 @@ def _parse(document: dict, path: str) -> QuarterCar:
 
     def strut(key: str, rate: str) -> Strut:
         element = root.table(key)
-        return Strut(
-            element.choice("link", links),
-            *element.segment("link_point", "chassis_point", metre),
-            element.number(rate),
-        )
+        points = element.segment("link_point", "chassis_point", metre)
+        return Strut(element.choice("link", links), *points, element.number(rate))
 
     bump = root.table("bump")
     return QuarterCar(

@@ -43,8 +43,7 @@ class DesignLimits(eqx.Module):
     def load(path: str | Path | None = None) -> "DesignLimits":
         """Read the limits from a TOML file; None: the one that ships with lgsens.
 
-        Raises `ValueError` naming the file and the key for a table that is missing, incomplete or
-        contradictory.
+        Raises `ValueError` naming the file and the key for a table that is missing, incomplete or contradictory.
         """
         document, name = read(path)
         table = Reader(document, name).table("design")
@@ -109,9 +108,8 @@ class SuspensionDesign(eqx.Module):
       - the start (k = 109 kN/m, c = 4.9 kN s/m, as in the source) is a firm production set-up: motion ratios
         0.60 and 0.89 give 40 N/mm at the wheel, the body at 1.4 Hz with 0.49 of critical damping;
       - F_min = 650 N is 15 % of the static 4,428 N: some grip is left on the far side of the bump;
-      - l_min = 254 mm is 35 mm of wheel travel over the design position (275 mm), where a jounce bumper
-        begins, which a bump as common as this one should not touch; l_max = 300 mm is 41 mm of travel down to
-        the rebound stop;
+      - l_min = 254 mm is 35 mm of wheel travel over the design position (275 mm), where a jounce bumper begins, which a
+        bump as common as this one should not touch; l_max = 300 mm is 41 mm of travel down to the rebound stop;
       - k from 50 to 200 kN/m is the body at 1.0 to 1.8 Hz: below, 100 kg over this corner sink it by more
         than 5 cm and need levelling; above lie sports cars;
       - c from 1.5 to 10 kN s/m is 0.15 to 1 of critical damping at the start's stiffness;
@@ -156,25 +154,19 @@ class SuspensionDesign(eqx.Module):
                 )
         return SuspensionDesign(car, limits, **settings)
 
-    def _members(self, stiffness, damping, hardpoints) -> dict[str, Array]:
-        members = {"stiffness": stiffness, "damping": damping, "hardpoints": hardpoints}
-        return {name: members[name] for name in PARAMETERS[self.parameters]}
-
     @property
     def start(self) -> dict[str, Array]:
         """The design of the hardpoint file."""
-        points = jnp.stack([self.car.links[name].chassis for name in sorted(self.car.links)])
-        return self._members(self.car.spring.rate, self.car.damper.rate, points)
+        car = self.car
+        every = {"stiffness": car.spring.rate, "damping": car.damper.rate, "hardpoints": car.hardpoints}
+        return {name: every[name] for name in PARAMETERS[self.parameters]}
 
     @property
     def bounds(self) -> tuple[dict[str, Array], dict[str, Array]]:
         """The lower and the upper bound of the design."""
-        limits = self.limits
-        points = jnp.stack([self.car.links[name].chassis for name in sorted(self.car.links)])
-        lower, upper = (
-            self._members(limits.stiffness[i], limits.damping[i], points + sign * limits.hardpoint_box)
-            for i, sign in ((0, -1.0), (1, 1.0))
-        )
+        limits, points, box = self.limits, self.car.hardpoints, self.limits.hardpoint_box
+        every = {"stiffness": limits.stiffness, "damping": limits.damping, "hardpoints": (points - box, points + box)}
+        lower, upper = ({name: every[name][i] for name in PARAMETERS[self.parameters]} for i in (0, 1))
         return lower, upper
 
     @property
@@ -184,15 +176,7 @@ class SuspensionDesign(eqx.Module):
 
     def with_design(self, design: dict[str, Array]) -> QuarterCar:
         """The car with the values of a design."""
-        car = self.car
-        if "stiffness" in design:
-            car = eqx.tree_at(lambda c: c.spring.rate, car, design["stiffness"])
-        if "damping" in design:
-            car = eqx.tree_at(lambda c: c.damper.rate, car, design["damping"])
-        if "hardpoints" in design:
-            names = sorted(car.links)
-            car = eqx.tree_at(lambda c: [c.links[name].chassis for name in names], car, list(design["hardpoints"]))
-        return car
+        return self.car.with_values(**design)
 
     def simulate(self, design: dict[str, Array], throw: bool = True) -> Trajectory:
         """The motion of a design over the bump; `throw` as in `lgsens.simulate`."""
@@ -205,27 +189,16 @@ class SuspensionDesign(eqx.Module):
         acceleration = trajectory.body("chassis").acceleration[:, 2]
         length, force = trajectory.force("spring").length, trajectory.force("tyre")
         car = self.car
-        masses = [
-            car.chassis.mass,
-            car.knuckle.mass,
-            car.wheel.mass,
-            *(link.mass for link in car.links.values()),
-        ]
-        static_force = GRAVITY * jnp.sum(jnp.stack(masses))
+        parts = (car.chassis, car.knuckle, car.wheel, *car.links.values())
+        static_force = GRAVITY * jnp.sum(jnp.stack([part.mass for part in parts]))
         travel = limits.maximum_spring_length - limits.minimum_spring_length
         constraints = (
             (limits.minimum_tyre_force - force) / static_force,  # Ψ₁
             (limits.minimum_spring_length - length) / travel,  # Ψ₂
             (length - limits.maximum_spring_length) / travel,  # Ψ₃
         )
-        return Response(
-            trajectory.t,
-            acceleration,
-            length,
-            force,
-            time_integral(trajectory.t, acceleration**2),
-            jnp.stack(constraints, axis=1),
-        )
+        objective = time_integral(trajectory.t, acceleration**2)
+        return Response(trajectory.t, acceleration, length, force, objective, jnp.stack(constraints, axis=1))
 
     def __call__(self, design: dict[str, Array]) -> tuple[Float[Array, ""], Float[Array, " m"]]:
         """Ψ₀ [m²/s³] and the scaled constraints in a row, those of the path and of the curves.

@@ -12,8 +12,13 @@ from lgsens.plotting._errors import (
     work_precision as work_precision,
     work_precision_panels as work_precision_panels,
 )
-from lgsens.plotting._histories import Panel as Panel, convergence as convergence, time_histories as time_histories
 from lgsens.plotting._mechanism import mechanism as mechanism
+from lgsens.plotting._panels import (
+    Panel as Panel,
+    convergence as convergence,
+    suspension_curves as suspension_curves,
+    time_histories as time_histories,
+)
 from lgsens.plotting._sensitivities import sensitivities as sensitivities
 from lgsens.plotting._style import (
     COLOURS as COLOURS,
@@ -22,4 +27,3 @@ from lgsens.plotting._style import (
     figure as figure,
     save as save,
 )
-from lgsens.plotting._suspension import suspension_curves as suspension_curves

@@ -121,15 +121,14 @@ def film(motion: Trajectory | Kinematics, speed: float, max_frames: int) -> Film
         label, unit, values = "t", "s", np.asarray(motion.t)
         clock = (values - values[0]) / speed
     count = min(len(clock), max_frames, max(2, 1 + round(PER_SECOND * clock[-1])))
-    chosen = np.unique(np.abs(clock[:, None] - np.linspace(0.0, clock[-1], count)[None]).argmin(axis=0))
-    position, orientation = (np.asarray(array)[chosen] for array in motion.states.q)
+    frames = np.unique(np.abs(clock[:, None] - np.linspace(0.0, clock[-1], count)[None]).argmin(axis=0))
+    position, orientation = (np.asarray(array)[frames] for array in motion.states.q)
     drawn = shapes(system)
     if isinstance(motion, Kinematics):  # a rig has no road
         drawn = drawn._replace(tyres=[])
-    t = jnp.asarray(motion.t)[chosen]
-    road = [np.asarray(jax.vmap(tyre.road)(t)) for tyre in drawn.tyres]
-    heights = np.stack(road, axis=1) if road else np.zeros((len(chosen), 0))
-    return Film(drawn, clock[chosen], values[chosen], label, unit, position, orientation, heights)
+    t = jnp.asarray(motion.t)[frames]
+    road = np.array([jax.vmap(tyre.road)(t) for tyre in drawn.tyres]).reshape(-1, len(frames)).T
+    return Film(drawn, clock[frames], values[frames], label, unit, position, orientation, road)
 
 
 def _digits(film: Film) -> int:

@@ -1,11 +1,11 @@
 """Errors against the step size or over time, and what a small error costs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from lgsens.plotting._style import COLOURS, CURVES, LIMIT, figure, plain
+from lgsens.plotting._style import COLOURS, CURVES, LIMIT, LIMIT_LINE, figure, legend_below, plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,20 +47,24 @@ def errors(panels: Sequence[ErrorPanel], title: str = "") -> "Figure":
     all_axes = fig.subplots(rows, columns, squeeze=False).ravel()
     for axes in all_axes[len(panels) :]:
         axes.remove()
-    names = list(dict.fromkeys(name for panel in panels for name in panel.series))
+    styles = _styles(panel.series for panel in panels)
     handles: dict[str, Any] = {}
     for axes, panel in zip(all_axes, panels):
         for name, (x, error) in panel.series.items():
-            style = CURVES[names.index(name) % len(CURVES)]
-            (handles[name],) = axes.plot(np.asarray(x), np.asarray(error), label=name, **style)
+            (handles[name],) = axes.plot(np.asarray(x), np.asarray(error), label=name, **styles[name])
         axes.set_yscale("log")
         plain(axes)
         axes.set(title=panel.title, xlabel=panel.horizontal, ylabel=panel.label)
         if panel.order is not None:
             _slope(axes, panel, panel.order)
-    style = {"ncols": -(-len(names) // 2) if len(names) > 3 else len(names), "frameon": False, "handlelength": 3.5}
-    fig.legend(handles=list(handles.values()), loc="outside lower center", **style)
+    legend_below(fig, handles, -(-len(styles) // 2) if len(styles) > 3 else len(styles))
     return fig
+
+
+def _styles(panels: Iterable[Iterable[str]]) -> dict[str, dict[str, Any]]:
+    """How the curves of all panels look, by their names."""
+    names = dict.fromkeys(name for panel in panels for name in panel)
+    return {name: CURVES[i % len(CURVES)] for i, name in enumerate(names)}
 
 
 def _slope(axes: "Axes", panel: ErrorPanel, order: int) -> None:
@@ -87,14 +91,16 @@ class WorkPrecision(NamedTuple):
     cost: Any
     error: Any
 
+    def _by_cost(self) -> tuple[np.ndarray, np.ndarray]:
+        order = np.argsort(self.cost)
+        return np.asarray(self.cost, float)[order], np.asarray(self.error, float)[order]
+
     def cost_of(self, target: float) -> float | None:
         """What an error of `target` costs: between the two settings around it, along a line in the logarithms.
 
         The first setting may be better already; None where no setting is as good.
         """
-        cost, error = (np.asarray(array, float) for array in (self.cost, self.error))
-        order = np.argsort(cost)
-        cost, error = cost[order], error[order]
+        cost, error = self._by_cost()
         met = np.flatnonzero(error <= target)
         if not len(met):
             return None
@@ -131,13 +137,11 @@ def work_precision(
     axes = fig.add_subplot()
     unit = cost.partition("[")[2].partition("]")[0]
     for i, (name, method) in enumerate(methods.items()):
-        _check_costs(name, method)
+        x, y = _drawn(name, method)
         label = name
         if target is not None:
             price = method.cost_of(target)
             label += ": not reached" if price is None else f": {price:.3g} {unit}".rstrip()
-        order = np.argsort(method.cost)
-        x, y = (np.asarray(array, float)[order] for array in method)
         axes.loglog(x, y, label=label, **CURVES[i % len(CURVES)])
     if target is not None:
         _target_line(axes, target)
@@ -168,35 +172,33 @@ def work_precision_panels(
     """
     fig = figure(1.6 + 4.8 * len(panels), 5.6, title)
     all_axes = fig.subplots(1, len(panels), squeeze=False, sharey=True).ravel()
-    names = list(dict.fromkeys(name for methods in panels.values() for name in methods))
+    styles = _styles(panels.values())
     handles: dict[str, Any] = {}
     for axes, (quantity, methods) in zip(all_axes, panels.items()):
         axes.set(xscale="log", yscale="log", xlabel=cost, ylabel=f"relative error of {quantity} [–]")
         for name, method in methods.items():
-            _check_costs(name, method)
-            style = CURVES[names.index(name) % len(CURVES)]
-            order = np.argsort(method.cost)
-            x, y = (np.asarray(array, float)[order] for array in method)
+            x, y = _drawn(name, method)
             best = y < np.minimum.accumulate(np.concatenate([[np.inf], y[:-1]]))
-            (handles[name],) = axes.plot(x[best], y[best], label=name, **style)
-            axes.plot(x[~best], y[~best], **style | {"linestyle": "", "alpha": 0.3})
+            (handles[name],) = axes.plot(x[best], y[best], label=name, **styles[name])
+            axes.plot(x[~best], y[~best], **styles[name] | {"linestyle": "", "alpha": 0.3})
         for target, points in (chosen or {}).items():
             price, reached = points[quantity]
             _target_line(axes, target, linewidth=0.6, side="right")
             axes.plot([price, price], [target, reached], color=LIMIT, linewidth=0.9, zorder=3)
             axes.plot(price, reached, marker="*", markersize=11, color=LIMIT, linestyle="", zorder=3)
         plain(axes)
-    style = {"ncols": 2 if len(names) > 3 else max(len(names), 1), "frameon": False, "handlelength": 3.5}
-    fig.legend(handles=list(handles.values()), loc="outside lower center", **style)
+    legend_below(fig, handles, 2 if len(styles) > 3 else max(len(styles), 1))
     return fig
 
 
-def _check_costs(name: str, method: WorkPrecision) -> None:
+def _drawn(name: str, method: WorkPrecision) -> tuple[np.ndarray, np.ndarray]:
+    """Costs, which a logarithmic axis can show, and errors, from the cheapest on."""
     if not np.all(np.asarray(method.cost) > 0):
         raise ValueError(f"`methods[{name!r}]`: costs must be positive, got {method.cost}.")
+    return method._by_cost()
 
 
 def _target_line(axes: "Axes", target: float, linewidth: float = 1.2, side: str = "left") -> None:
-    axes.axhline(target, color=LIMIT, linestyle=(0, (5, 3)), linewidth=linewidth)
+    axes.axhline(target, **LIMIT_LINE | {"linewidth": linewidth})
     style = {"color": LIMIT, "ha": side, "va": "bottom", "transform": axes.get_yaxis_transform()}
     axes.text({"left": 0.01, "right": 0.99}[side], target, f"target {target:g}", **style)

@@ -31,23 +31,21 @@ def mechanism(models: Mapping[str, Model], title: str = "", view: tuple[float, f
     """
     fig = figure(8.0, 7.0, title)
     axes: Any = fig.add_subplot(projection="3d")
-    points, handles = [], []
+    points, labels = [], {}
     for name, model in models.items():
         last = name == list(models)[-1]
         system = model.system()
         position, orientation = (np.asarray(array) for array in system.pose)
         scene = shapes(system)
         points.append(draw(axes, scene, position, orientation, last))
-        if not last:
-            handles += axes.plot([], [], [], color=COLOURS[0], linewidth=3, label=name)
-        elif len(models) > 1:
-            handles += axes.plot([], [], [], color=ROLES["link"], linewidth=3, label=name)
+        if len(models) > 1:
+            labels[name] = ROLES["link"] if last else COLOURS[0]
         else:
             seen = {shape.role for shape in (*scene.outlines, *scene.struts)}
-            named = [(role, colour) for role, colour in ROLES.items() if role in seen]
-            handles += [axes.plot([], [], [], color=colour, linewidth=3, label=role)[0] for role, colour in named]
+            labels = {role: colour for role, colour in ROLES.items() if role in seen}
     frame(axes, np.concatenate(points), view)
-    if handles:
+    if labels:
+        handles = [axes.plot([], [], [], color=labels[label], linewidth=3, label=label)[0] for label in labels]
         axes.legend(handles=handles, frameon=False, loc="upper center", ncols=len(handles), columnspacing=1.2)
     return fig
 

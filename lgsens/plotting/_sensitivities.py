@@ -89,7 +89,7 @@ def sensitivities(
         number = system.body_names.index(body)
         for axes, (what, part, of) in zip(row, BODY):
             panel(axes, f"{body}: {what}", f"{of}{unit}", by_body[what[0]][:, number, part], "xyz")
-    rest = grid[len(bodies) :].ravel()
+    rest = list(grid[len(bodies) :].flat)
     for axes, joint in zip(rest, joints):
         values = np.asarray(change.lam)[:, system.multiplier_rows(joint)]
         panel(axes, f"{joint}: λ′", f"N, N m{unit}", values, [str(i + 1) for i in range(values.shape[1])])

@@ -2,6 +2,7 @@
 
 import functools
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ if TYPE_CHECKING:
 
 COLOURS = ("#8c8c8c", "#1b62a5", "#d9822b", "#3a8a4d")  # before in grey, after in blue, then others
 LIMIT = "#b3262e"
+LIMIT_LINE: dict[str, Any] = {"color": LIMIT, "linestyle": (0, (5, 3)), "linewidth": 1.2}
 # For curves that may lie on each other and be printed without colours: each has a marker of its own.
 CURVES: tuple[dict[str, Any], ...] = (
     {"color": "#1b62a5", "marker": "o", "markersize": 11, "fillstyle": "none", "linestyle": "-", "linewidth": 2.4},
@@ -57,3 +59,9 @@ def plain(axes: "Axes") -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(True, color="#e4e4e4", linewidth=0.6)
     axes.set_axisbelow(True)
+
+
+def legend_below(fig: "Figure", handles: Mapping[str, Any], columns: int) -> None:
+    """One legend for all panels of a figure, under them."""
+    style = {"ncols": columns, "frameon": False, "handlelength": 3.5}
+    fig.legend(handles=list(handles.values()), loc="outside lower center", **style)
