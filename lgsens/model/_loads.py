@@ -61,15 +61,13 @@ class AbstractDynamicLoad(AbstractElement):
     """A force between two bodies that depends on states of its own, which obey ż = g(q, v, z, t).
 
     A state is the velocity of a coordinate with unit mass, of which an element has as many as states: then Q and g
-    together are one generalized force, and autodiff gives the tangents of both. `states` are their names.
+    together are one generalized force, and autodiff gives the tangents of both. `states` are their names, one or more;
+    `balanced` as in `AbstractLoad`.
     """
 
+    states: ClassVar[Any]
+    balanced: ClassVar[bool] = False
     drawn = "spring"
-
-    @property
-    @abc.abstractmethod
-    def states(self) -> tuple[str, ...]:
-        """The names of its states z, one or more."""
 
     @abc.abstractmethod
     def force(self, a: Frame, b: Frame, va, vb, t, z) -> Float[Array, "12"]:
@@ -105,7 +103,7 @@ def carriers(count: int) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(range(min(_COORDINATES, count - i))) for i in range(0, count, _COORDINATES))
 
 
-def num_states(load: AbstractLoad | AbstractDynamicLoad) -> int:
+def num_states(load: Any) -> int:
     return len(load.states) if isinstance(load, AbstractDynamicLoad) else 0
 
 

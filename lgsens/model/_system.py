@@ -1,6 +1,7 @@
 """The multibody system: an `AbstractSystem` on (R³ × SO(3))^N or a subgroup of it, assembled by element type."""
 
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -197,22 +198,21 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         return sum(map(len, self.free[len(self.body_names) :]))
 
     @property
-    def _dynamic(self) -> list[Stack[AbstractDynamicLoad]]:
+    def _dynamic(self) -> list[Stack[Any]]:
         """The stacks of loads with states."""
         return [stack for stack in self.loads if stack.carriers]
 
     def settled(self, q, v, t):
         stacks = self._dynamic
         for stack, ends in zip(stacks, at_ends(stacks, self._placed(q), self.twists(v))):
-            v = v.at[state_coordinates(stack, self.index)].set(
-                stack.map(lambda load, *args: load.initial(*args), ends, (t,))
-            )
+            begun = stack.map(lambda load, *args: load.initial(*args), ends, (t,))
+            v = v.at[state_coordinates(stack, self.index)].set(begun)
         return v
 
     def places_of_states(self) -> dict[str, dict[str, int]]:
         """By the name of each force element with states, and their names, where they are in v."""
         return {
-            owner: dict(zip(stack.elements.states, map(int, places)))
+            owner: dict(zip(stack.elements.states, places.tolist()))
             for stack in self._dynamic
             for owner, places in zip(stack.owners, state_coordinates(stack, self.index))
         }

@@ -26,7 +26,7 @@ Cardona, Numerische Mathematik 129 (2015), doi:10.1007/s00211-014-0633-1, for th
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -37,8 +37,6 @@ from lgsens._validate import as_count
 from lgsens.dynamics import RESULTS, AbstractSystem, State
 from lgsens.integrate import AbstractIntegrator, AbstractScheme, GeneralizedAlpha, scheme_of
 from lgsens.simulation._trajectory import Saved, StateError, Trajectory
-
-Run = TypeVar("Run", Trajectory, Saved)
 
 
 class Richardson(AbstractIntegrator):
@@ -133,7 +131,7 @@ def _missing(coarse, fine, power: int = 1):
     return (fine - coarse) / (4.0**power - 1.0)
 
 
-def extrapolate_runs(system: AbstractSystem, coarse: Run, fine: Run) -> Run:
+def extrapolate_runs(system: AbstractSystem, coarse: Any, fine: Any) -> Trajectory | Saved:
     """The run on the times of `coarse` from two of the same system, `fine` with half the step."""
     result = jnp.where(coarse.result == RESULTS.successful, fine.result, coarse.result)
     stats = jax.tree.map(lambda first, second: jnp.concatenate([first, second]), coarse.stats, fine.stats)

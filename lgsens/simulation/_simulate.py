@@ -197,7 +197,7 @@ def run(
     integrator: AbstractIntegrator,
     sensitivity: AbstractSensitivity,
     save: Save | None = None,
-):
+) -> tuple[Any, dict[str, Any]]:
     """`simulate` without its checks: the trajectory or what is saved of it, and what the message of a failure needs."""
     one = lambda num_steps: _single_run(system, begun, t0, t1, num_steps, integrator, sensitivity, save)
     if not integrator.extrapolated:
@@ -209,9 +209,10 @@ def run(
 
 
 def _single_run(system, begun: Begin, t0, t1, num_steps: int, integrator: AbstractIntegrator, sensitivity, save):
-    scheme = integrator.scheme
+    scheme: Any = integrator.scheme
     laid = integrator.lay(system, begun.start, begun.jerk, t0, t1, num_steps)
-    grid, t = laid.grid, laid.grid.times()
+    grid: Any = laid.grid
+    t = grid.times()
     state0, parameters = begun.start.at(system, grid.first_size), Parameters(system, grid)
     if save is None:
         if _by_diffrax(scheme):
@@ -227,7 +228,9 @@ def _single_run(system, begun: Begin, t0, t1, num_steps: int, integrator: Abstra
     if save is None:
         stages = scheme.stages(system, grid, states)
         states = scheme.physical(system, states)
-        found = Trajectory(t, states, result, stats, system, order=scheme.order, stages=stages)
+        found = Trajectory(
+            t=t, states=states, result=result, stats=stats, system=system, order=scheme.order, stages=stages
+        )
     else:
         found = Saved(t, values, scheme.physical(system, final), result, stats)
     return found, details | jax.lax.stop_gradient({"t1": t1})

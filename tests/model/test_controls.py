@@ -75,6 +75,7 @@ def test_controlled_pendulum_is_that_of_its_ode():
     assert np.all(fine <= 2e-2 * np.abs(exact()) + 1e-3)
 
 
+@pytest.mark.slow  # `test_any_number_of_states_of_ones_own` has both modes, too
 def test_gradients_by_gains_and_initial_states():
     """Both modes agree; differences of step 1e-5 have 1e-10 of third derivatives, and round-off over the step 1e-9."""
     run = lambda p: controlled(p, 20)
@@ -86,7 +87,9 @@ def test_gradients_by_gains_and_initial_states():
     np.testing.assert_allclose(forward, np.stack(differences, axis=1), rtol=1e-6, atol=1e-6 * np.abs(forward).max())
 
 
-@pytest.mark.parametrize("how", ["stabilized", "index reduced", "sparse", "merged"])
+@pytest.mark.parametrize(
+    "how", ["stabilized", "merged", *(pytest.param(how, marks=pytest.mark.slow) for how in ("index reduced", "sparse"))]
+)
 def test_every_way_to_solve_has_the_same_states(how):
     """Other integrators to their own order, another solver and merged parts to round-off of Newton."""
     integrators = {"stabilized": lg.GeneralizedAlpha(stabilized=True), "index reduced": lg.IndexReducedODE()}
@@ -102,19 +105,16 @@ def test_integral_holds_what_rests():
     """At rest there is no error, the integral carries the weight, and the motion from there stays."""
     hold = 0.3
 
-    def rest(integral):
-        p = GAINS.at[5].set(0.0).at[2].set(integral)  # the target is the offset
-        model = arm(p)
-        state = lg.equilibrium(model)
-        trajectory = lg.simulate(model, t1=0.1, num_steps=5, state0=state)
-        return trajectory.states_of("pid"), trajectory.force("pid").error
-
+    scene = lambda integral: arm(GAINS.at[5].set(0.0).at[2].set(integral))  # the target is the offset
     moment = MASS * G * ARM * np.sin(hold)
-    states, error = rest(80.0)
+    held = lg.equilibrium(scene(80.0))
+    trajectory = lg.simulate(scene(80.0), t1=0.1, num_steps=5, state0=held)
+    states, error = trajectory.states_of("pid"), trajectory.force("pid").error
     np.testing.assert_allclose(error, 0.0, atol=1e-9)  # Newton's tolerance
     np.testing.assert_allclose(states["integral"], moment / 80.0, rtol=1e-8)
     np.testing.assert_allclose(states["output"], moment, rtol=1e-8)
-    slope = jax.jacfwd(lambda i: rest(i)[0]["integral"][0])(80.0)
+    place = trajectory.system.places_of_states()["pid"]["integral"]
+    slope = jax.jit(jax.jacfwd(lambda integral: lg.equilibrium(scene(integral)).v[place]))(80.0)
     np.testing.assert_allclose(slope, -moment / 80.0**2, rtol=1e-8)
 
 
