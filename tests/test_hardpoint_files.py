@@ -161,3 +161,14 @@ def test_spring_without_leverage():
 def test_a_file_is_read_inside_of_jit():
     """Its numbers are constants there too."""
     assert jax.jit(lambda scale: scale * QuarterCar.load().spring.rate)(2.0) == 2.0 * QuarterCar.load().spring.rate
+
+
+def test_numbers_of_a_car_are_replaced_by_name():
+    car = QuarterCar.load()
+    points = car.hardpoints + 0.01
+    changed = car.with_values(stiffness=1e5, bump_height=0.02, hardpoints=points)
+    assert (changed.spring.rate, changed.bump_height, changed.damper.rate) == (1e5, 0.02, car.damper.rate)
+    np.testing.assert_array_equal(changed.hardpoints, points)
+    assert jax.tree.all(jax.tree.map(np.array_equal, car.with_values(), car))
+    with pytest.raises(ValueError, match=says("`hardpoints` must have shape (5, 3)", "(6, 3)")):
+        car.with_values(hardpoints=np.zeros((6, 3)))

@@ -16,7 +16,6 @@ CONSTRAINTS = (
     ("minimum spring length", "spring_length", "minimum_spring_length", "m"),
     ("maximum spring length", "spring_length", "maximum_spring_length", "m"),
 )
-HISTORY = ("objective", "worst_constraint", "gradient_norm")
 UNITS = {"stiffness": "N/m", "damping": "N s/m", "hardpoints": "m"}
 
 
@@ -101,7 +100,11 @@ def document(outcome: Any, settings: dict[str, Any], tolerance: float) -> dict[s
         "history": {
             "kept_step": result.step,
             "ended": result.reason,
-            **{name: _finite(getattr(result.history, name)) for name in HISTORY},
+            # JSON has no NaN; a step whose simulation failed is null
+            **{
+                name: [float(value) if np.isfinite(value) else None for value in getattr(result.history, name)]
+                for name in ("objective", "worst_constraint", "gradient_norm")
+            },
         },
         "settings": settings,
         "seconds": outcome.seconds,
@@ -152,11 +155,6 @@ def _values(design: Any, name: str, value: Any) -> Any:
     if name != "hardpoints":
         return float(value)
     return {link: np.asarray(point).tolist() for link, point in zip(sorted(design.car.links), value)}
-
-
-def _finite(values: np.ndarray) -> list[float | None]:
-    """JSON has no NaN; a step whose simulation failed is null."""
-    return [float(value) if np.isfinite(value) else None for value in values]
 
 
 def table(found: dict[str, Any]) -> str:

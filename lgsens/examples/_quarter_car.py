@@ -103,18 +103,28 @@ class QuarterCar(eqx.Module):
             return _parse(*read(path))
 
     @property
-    def hardpoints(self) -> Float[Array, "n 3"]:
-        """The chassis ends of the links in sorted order of their names [m]."""
+    def hardpoints(self) -> Float[Array, "5 3"]:
+        """The chassis ends of the links in sorted order of their names [m], shape (5, 3)."""
         return jnp.stack([self.links[name].chassis for name in sorted(self.links)])
 
     def with_values(self, *, stiffness=None, damping=None, bump_height=None, hardpoints=None) -> "QuarterCar":
-        """The car with another stiffness [N/m] or damping [N s/m], bump [m] or `hardpoints`; None: with its own."""
-        rates = lambda car: [car.spring.rate, car.damper.rate, car.bump_height]
-        members = lambda car: rates(car) + [car.links[name].chassis for name in sorted(self.links)]
-        points = [None] * len(self.links) if hardpoints is None else hardpoints
+        """The car with some numbers replaced; None: it keeps its own.
+
+        Arguments:
+            stiffness, damping, bump_height: of spring [N/m] and damper [N s/m], and of the bump [m], shape ().
+            hardpoints: as the property [m], shape (5, 3).
+
+        Raises `ValueError` for other shapes.
+        """
+        names = sorted(self.links)
+        numbers = lambda car: [car.spring.rate, car.damper.rate, car.bump_height]
+        members = lambda car: numbers(car) + [car.links[name].chassis for name in names]
+        points = [None] * len(names)
+        if hardpoints is not None:
+            points = as_float(hardpoints, (len(names), 3), "`hardpoints`")
         values = [
-            old if value is None else as_float(value, old.shape, "values of a car")
-            for old, value in zip(members(self), (stiffness, damping, bump_height, *points))
+            old if new is None else as_float(new, old.shape, "`stiffness`, `damping` or `bump_height`")
+            for old, new in zip(members(self), (stiffness, damping, bump_height, *points))
         ]
         return eqx.tree_at(members, self, values)
 
