@@ -9,7 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens.model import AbstractClosedFormLoad, AbstractForce, AbstractLoad, Frame, RigidBody, carried, load_tangents
+from lgsens.model import (
+    AbstractClosedFormLoad,
+    AbstractDynamicLoad,
+    AbstractForce,
+    AbstractLoad,
+    Frame,
+    RigidBody,
+    carried,
+    load_tangents,
+)
 from lgsens.testing._differences import SAFETY
 from lgsens.testing._poses import DIM, Poses, displaced, same, slope, vanishes
 from lgsens.testing._report import Check, Report, worst
@@ -18,8 +27,18 @@ from lgsens.testing._sensitivities import check_sensitivities
 Potential = Callable[[Any, Frame, Frame, Any], Float[Array, ""]]
 
 
+class _AtStates(AbstractLoad):
+    """A load with states, of which these are given."""
+
+    load: AbstractDynamicLoad
+    states: Float[Array, " s"]
+
+    def force(self, a, b, va, vb, t):
+        return self.load.force(a, b, va, vb, t, self.states)
+
+
 def check_force(
-    force: AbstractForce | AbstractLoad,
+    force: AbstractForce | AbstractLoad | AbstractDynamicLoad,
     *,
     potential: Potential | None = None,
     balanced: bool = True,
@@ -33,14 +52,14 @@ def check_force(
     At random poses, velocities and times: ∂Q/∂q under the retraction R exp(θ̃) and ∂Q/∂v, by autodiff and by
     differences; of a load in closed form, `tangents` against autodiff, None standing for zero. That Q is zero where it
     does not say that it `acts_on`, and on a part of a merged body that in the frame of the part. Q by every number of
-    it, as `check_sensitivities` does. Between two bodies, action and reaction:
+    it, as `check_sensitivities` does. States of its own have random values. Between two bodies, action and reaction:
 
         F_a + F_b = 0,     x_a × F_a + R_a M_a + x_b × F_b + R_b M_b = 0
 
     With a potential E, Q = −∂E/∂q at rest, and what velocities add takes energy out, (Q(v) − Q(0))·v ≤ 0.
 
     Arguments:
-        force: an `AbstractForce` or an `AbstractLoad`.
+        force: an `AbstractForce`, an `AbstractLoad` or an `AbstractDynamicLoad`.
         potential: (load, frame of a, frame of b, time [s]) ↦ E [J], shape (), written from the definition of the
             element and not from its code; None: it has none.
         balanced: whether two bodies feel opposite forces; False for one that acts on each from outside.
@@ -54,14 +73,19 @@ def check_force(
     """
     scene = Poses(seed, length)
     (part,) = Poses(seed + 1, length).frames(1)
-    if isinstance(force, AbstractLoad):
+    states = jnp.asarray(np.random.default_rng(seed).uniform(0.5, 1.5, 64))
+
+    def at_states(load: Any) -> AbstractLoad:
+        return _AtStates(load, states[: len(load.states)]) if isinstance(load, AbstractDynamicLoad) else load
+
+    if isinstance(force, AbstractLoad | AbstractDynamicLoad):
         scene_bodies = scene.bodies("ab")
         attached = [("", "a", "b")]
-        load_of = lambda force, i: force
+        load_of = lambda force, i: at_states(force)
     else:
         names = [name for name in dict.fromkeys(force.bodies) if name is not None] or ["body"]
         scene_bodies = scene.bodies(names) if bodies is None else dict(bodies)
-        load_of = lambda force, i: force.loads(scene_bodies)[i].load
+        load_of = lambda force, i: at_states(force.loads(scene_bodies)[i].load)
         attached = [
             (f"{i + 1} {type(each.load).__name__}: ", each.a, each.b)
             for i, each in enumerate(force.loads(scene_bodies))

@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 import lgsens as lg
 from lgsens.model import AbstractDynamicLoad, AbstractForce
 from lgsens.model._forces import Attached
+from lgsens.testing import check_force
 
 ORIGIN, X, G = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 9.81
 MASS, ARM, INERTIA = 2.0, 0.5, 0.1  # of the pendulum about its centre
@@ -195,6 +196,30 @@ def test_any_number_of_states_of_ones_own():
     forward, reverse = jax.jit(lambda x: (jax.jacfwd(states)(x), jax.jacrev(states)(x)))(x)
     np.testing.assert_allclose(forward, reverse, rtol=1e-10)
     np.testing.assert_allclose(forward, np.exp(-x) * np.array([1.0, x, x**2 / 2, x**3 / 6]), atol=5e-3)
+
+
+@pytest.mark.parametrize(
+    "force",
+    [
+        lg.PIDController(
+            lg.TranslationDriver(
+                "a", "b", at=(0.1, 0.2, 0.3), axis=(1.0, 2.0, 0.5), value=lg.Harmonic(amplitude=0.1, frequency=1.0)
+            ),
+            proportional=3.0,
+            derivative=2.0,
+            integral=1.5,
+            time_constant=0.3,
+        ),
+        pytest.param(
+            lg.PIDController(lg.RotationDriver("a", "b", axis=X), proportional=3.0, derivative=2.0),
+            marks=pytest.mark.slow,
+        ),
+        lg.MaxwellElement("a", "b", at_a=ORIGIN, at_b=(0.5, 0.2, 0.9), stiffness=3.0, damping=0.5),
+    ],
+)
+def test_forces_are_what_they_say(force):
+    report = check_force(force)
+    assert report, report
 
 
 def test_summary_and_bad_input():
