@@ -109,8 +109,8 @@ def test_iteration_matrix():
     @jax.jit
     def matrix_and_factors(h):
         step = STABILIZED.shared(system).step(state, Node(t, t, h))
-        defect = lambda x: jnp.concatenate(step.defect(step.motion(x[:6], x[6:]), x[6:], t))
-        factors, _ = step.factors(step.motion(unknowns[:6], unknowns[6:]), unknowns[6:], t)
+        defect = lambda x: jnp.concatenate(step.defect(step.motion(x[:6], x[6:]), x[6:]))
+        factors, _ = step.factors(step.motion(unknowns[:6], unknowns[6:]), unknowns[6:])
         matrix = jax.jacfwd(defect)(unknowns)
         columns = jax.vmap(lambda x: jnp.concatenate(factors.solve(x[:6], x[6:])), 1, 1)
         rows = jax.vmap(lambda x: jnp.concatenate(factors.solve(x[:6], x[6:], transposed=True)))
