@@ -35,7 +35,7 @@ Hairer & Wanner, Solving Ordinary Differential Equations II (1996), §VII.2; lin
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -132,8 +132,8 @@ class IndexReducedODE(AbstractScheme):
         if self.solver is not None:
             _tableau(self.solver)
 
-    tolerance = 0.0  # nothing is iterated
-    max_iterations = 1
+    tolerance: ClassVar[float] = 0.0  # nothing is iterated
+    max_iterations: ClassVar[int] = 1
     order = 4
     failure = RESULTS.integration_failed
     has_stages = True

@@ -15,7 +15,7 @@ its arrays have places ends with such. For its equations it has the size before 
 
 import abc
 import dataclasses
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import equinox as eqx
 import jax
@@ -146,15 +146,12 @@ class UnevenGrid(AbstractGrid):
     t0: Float[Array, ""]
     h: Float[Array, " n"]
     before: Float[Array, ""]  # the size of the step that led to t0, to which the a there belongs
+    num_steps: ClassVar[Any] = property(lambda self: self.h.shape[-1])  # no argument, where the base has a field
 
     @classmethod
     def first(cls, t0, h) -> "UnevenGrid":
         """From a state at t0 whose a belongs to the first step."""
         return cls(t0, h, h[0])
-
-    @property
-    def num_steps(self) -> int:
-        return self.h.shape[-1]
 
     @property
     def first_size(self):

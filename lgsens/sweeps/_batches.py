@@ -70,7 +70,7 @@ def _bytes_per_turn(jaxpr: Any) -> int:
     """The bytes that a turn of the largest loop in a program reads: what it carries, and its share of what it scans."""
     largest = 0
     for equation in jaxpr.eqns:
-        inner = list(jaxprs_in_params(equation.params))
+        inner: list[Any] = list(jaxprs_in_params(equation.params))
         if equation.primitive.name in ("scan", "while"):
             largest = max(largest, *(sum(v.aval.size * v.aval.dtype.itemsize for v in body.invars) for body in inner))
         largest = max([largest, *map(_bytes_per_turn, inner)])
