@@ -147,19 +147,15 @@ def test_gradients_by_the_signal_in_both_modes(name):
 SPRING, LOAD, BEGUN = 40.0, 2.0, 0.1  # k, mass on it, time of the equilibrium
 
 
-def from_equilibrium(x, num_steps, integrator):
-    """A load that hangs on a spring and damper from a slide, from the equilibrium of a time at which the slide moves.
-
-    By amplitude and frequency of the slide and the damping: place and speed at the end, force of the slide then and at
-    the start.
-    """
+def hung(x):
+    """A load that hangs on a spring and damper from a slide: amplitude and frequency of the slide, damping."""
     slide = lg.TranslationDriver(
         None, "slide", at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0), value=lg.Harmonic(amplitude=x[0], frequency=x[1])
     )
     spring = lg.SpringDamper(
         "slide", "load", at_a=(0.0, 0.0, 0.0), at_b=(0.0, 0.0, -1.0), stiffness=SPRING, damping=x[2], free_length=1.0
     )
-    model = lg.Model(
+    return lg.Model(
         {
             "slide": lg.RigidBody(1.0, None, position=(0.0, 0.0, 0.0), free="z"),
             "load": lg.RigidBody(LOAD, None, position=(0.0, 0.0, -1.0), free="z"),
@@ -167,6 +163,11 @@ def from_equilibrium(x, num_steps, integrator):
         {"slide": slide},
         {"spring": spring, "weight": lg.Gravity(GRAVITY)},
     )
+
+
+def from_equilibrium(x, num_steps, integrator):
+    """Place and speed of the load at the end, force of the slide then and at the start, from an equilibrium."""
+    model = hung(x)
     rest = lg.equilibrium(model, t0=BEGUN)
     found = lg.simulate(model, t0=BEGUN, t1=BEGUN + END, num_steps=num_steps, integrator=integrator, state0=rest)
     load, force = found.body("load"), found.multiplier("slide")
@@ -193,8 +194,30 @@ def test_motion_begins_from_an_equilibrium_with_the_rate_of_its_driver(name):
     run = jax.jit(partial(from_equilibrium, integrator=INTEGRATORS[name]), static_argnums=1)
     coarse, fine = (np.abs(run(x, n) - exact) for n in (40, 80))
     assert coarse[3] < 1e-9  # at the start, to the round-off of Newton's iteration there
-    assert np.all(fine[:3] < np.maximum(coarse[:3] / 3.5, 1e-9)) and coarse.max() < 1e-2 * np.abs(exact).max()  # order 2
-    check_gradients(partial(from_equilibrium, num_steps=8, integrator=INTEGRATORS[name]), x)
+    # order 2; in λ of index 3 there is also what a given state excites, h v̈ at first, which decays with n ρⁿ
+    assert np.all(fine[:3] < np.maximum(coarse[:3] / 3.5, 1e-9)) and fine.max() < 1e-3 * np.abs(exact).max()
+
+
+def test_gradients_of_an_equilibrium_with_a_moving_driver():
+    def state(x):
+        found = lg.equilibrium(hung(x), t0=x[3])
+        return jnp.concatenate([found.q.position[:, 2], found.v, found.vdot, found.lam])
+
+    check_gradients(state, np.array([0.1, 1.3, 3.0, BEGUN]))
+
+
+def test_redundant_driver_has_no_motion_from_equilibrium():
+    model = hung(np.array([0.1, 1.3, 3.0]))
+    line = {"at_a": (0.0, 0.0, 1.0), "at_b": (0.0, 0.0, 0.0), "length": 1.0}  # holds the slide where the driver does
+    twice = lg.Model(model.bodies, model.joints | {"rod": lg.DistanceJoint(None, "slide", **line)}, model.forces)
+    with pytest.raises(ValueError, match="redundant"):
+        lg.equilibrium(twice)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_gradients_from_an_equilibrium_with_a_moving_driver(name):
+    check_gradients(partial(from_equilibrium, num_steps=8, integrator=INTEGRATORS[name]), np.array([0.1, 1.3, 3.0]))
 
 
 @pytest.mark.slow

@@ -4,10 +4,10 @@ Rows of velocity level hold at rest wherever the mechanism is, if b = 0; their �
 equations less than unknowns (a wheel on springs may rest wherever it was rolled to), and in place of each the equation
 0 = 0, which leaves the shortest solution. b ≠ 0 forbids rest.
 
-Drivers go on from there: where rows depend on time, the state is that of the motion which begins in this place. v is the
-velocity of least kinetic energy with c(q, v, t) = 0, v̇ and λ are those of (q, v), so it is at rest in static balance
-where drivers have neither rate nor acceleration. With v = 0 a step would give them their rate by an impulse, as a force
-∝ 1/h that alternates from step to step.
+Drivers go on from there: where rows depend on time, the state is that of the motion which begins in this place. v is
+the velocity of least kinetic energy with c(q, v, t) = 0, v̇ and λ are those of (q, v): at rest, in static balance, where
+drivers have neither rate nor acceleration. With v = 0 the first steps would give them their rate, by a force ∝ 1/h that
+alternates from step to step.
 
 States z of elements do not vanish at rest, their rates do: of their coordinates the velocity is unknown and not the
 place, and C_t has the columns of their derivatives.

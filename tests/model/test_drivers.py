@@ -134,7 +134,7 @@ def test_gradients_of_a_driven_motion_by_the_numbers_of_the_signal():
 
 
 def test_equilibrium_holds_a_driver_at_t0():
-    """A pendulum held by a rod whose length is a signal hangs where the rod of that length lets it, and moves with it."""
+    """A pendulum on a rod whose length is a signal hangs where the rod of that length lets it, and moves with it."""
     body = lg.RigidBody(1.0, (0.1, 0.1, 0.1), position=(0.0, 0.0, -1.0))
     signal = lg.Ramp(start=1.0, end=1.5, duration=1.0)
     rod = lg.DistanceJoint(None, "b", at_a=(0.0, 0.0, 0.0), at_b=(0.0, 0.0, -1.0), length=signal)
