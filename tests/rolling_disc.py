@@ -15,13 +15,13 @@ N = np.array([0.0, 0.0, 1.0])
 TILT, SPIN = 0.35, np.array([0.4, 6.0, 0.5])  # of the reference: about x; and Ω in the body frame
 
 
-def scene(tilt=TILT, spin=SPIN, radius=RADIUS) -> lg.Model:
+def scene(tilt=TILT, spin=SPIN, radius=RADIUS, mass=MASS) -> lg.Model:
     """The disc at rest of centre, of which the joint makes a rolling one."""
     c, s = jnp.cos(tilt), jnp.sin(tilt)
     zero, one = jnp.zeros_like(c), jnp.ones_like(c)
     turn = jnp.stack([jnp.stack([one, zero, zero]), jnp.stack([zero, c, -s]), jnp.stack([zero, s, c])])
     height = jnp.stack([zero, zero, radius * c])
-    disc = lg.RigidBody(MASS, MOMENTS, position=height, orientation=turn, angular_velocity=spin)
+    disc = lg.RigidBody(mass, MOMENTS, position=height, orientation=turn, angular_velocity=spin)
     rolling = lg.Rolling("disc", at=height, axis=turn[:, 1], radius=radius)
     return lg.Model({"disc": disc}, {"rolling": rolling}, {"weight": lg.Gravity(tuple(G))})
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import EPS, GRAVITY
+from scipy.integrate import solve_ivp
 
 import lgsens as lg
 from lgsens.accuracy._balance import quality
@@ -141,6 +142,82 @@ def test_gradients_by_the_signal_in_both_modes(name):
     """By amplitude, frequency, length and the initial time, at which the signal has a rate."""
     end = lambda x: shaken(x[:3], num_steps=8, t0=x[3], integrator=INTEGRATORS[name])
     check_gradients(end, np.append(NUMBERS, 0.1))
+
+
+SPRING, LOAD, BEGUN = 40.0, 2.0, 0.1  # k, mass on it, time of the equilibrium
+
+
+def hung(x):
+    """A load that hangs on a spring and damper from a slide: amplitude and frequency of the slide, damping."""
+    slide = lg.TranslationDriver(
+        None, "slide", at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0), value=lg.Harmonic(amplitude=x[0], frequency=x[1])
+    )
+    spring = lg.SpringDamper(
+        "slide", "load", at_a=(0.0, 0.0, 0.0), at_b=(0.0, 0.0, -1.0), stiffness=SPRING, damping=x[2], free_length=1.0
+    )
+    return lg.Model(
+        {
+            "slide": lg.RigidBody(1.0, None, position=(0.0, 0.0, 0.0), free="z"),
+            "load": lg.RigidBody(LOAD, None, position=(0.0, 0.0, -1.0), free="z"),
+        },
+        {"slide": slide},
+        {"spring": spring, "weight": lg.Gravity(GRAVITY)},
+    )
+
+
+def from_equilibrium(x, num_steps, integrator):
+    """Place and speed of the load at the end, force of the slide then and at the start, from an equilibrium."""
+    model = hung(x)
+    rest = lg.equilibrium(model, t0=BEGUN)
+    found = lg.simulate(model, t0=BEGUN, t1=BEGUN + END, num_steps=num_steps, integrator=integrator, state0=rest)
+    load, force = found.body("load"), found.multiplier("slide")
+    return jnp.stack([load.position[-1, 2], load.velocity[-1, 2], force[-1, 0], force[0, 0]])
+
+
+def by_height(x):
+    """The same by the height of the load: m z̈ = f − m g with f = k (s − 1 − z) + c (ṡ − ż), which does not move yet."""
+    amplitude, omega, damping = x[0], 2 * np.pi * x[1], x[2]
+    place = lambda t: amplitude * np.sin(omega * t)
+    rate = lambda t: amplitude * omega * np.cos(omega * t)
+    force = lambda t, y: SPRING * (place(t) - 1.0 - y[0]) + damping * (rate(t) - y[1])
+    start = [place(BEGUN) - 1.0 - LOAD * 9.81 / SPRING, 0.0]
+    rates = lambda t, y: [y[1], force(t, y) / LOAD - 9.81]
+    y = solve_ivp(rates, (BEGUN, BEGUN + END), start, method="DOP853", rtol=1e-12, atol=1e-13).y
+    # λ pulls the slide, of 1 kg, downwards
+    load = lambda t, y: -force(t, y) - 9.81 + omega**2 * place(t)
+    return np.array([*y[:, -1], load(BEGUN + END, y[:, -1]), load(BEGUN, start)])
+
+
+@pytest.mark.parametrize("name", ["index 3", *(pytest.param(n, marks=pytest.mark.slow) for n in list(INTEGRATORS)[1:])])
+def test_motion_begins_from_an_equilibrium_with_the_rate_of_its_driver(name):
+    x, exact = np.array([0.1, 1.3, 3.0]), by_height(np.array([0.1, 1.3, 3.0]))
+    run = jax.jit(partial(from_equilibrium, integrator=INTEGRATORS[name]), static_argnums=1)
+    coarse, fine = (np.abs(run(x, n) - exact) for n in (40, 80))
+    assert coarse[3] < 1e-9  # at the start, to the round-off of Newton's iteration there
+    # order 2; in λ of index 3 there is also what a given state excites, h v̈ at first, which decays with n ρⁿ
+    assert np.all(fine[:3] < np.maximum(coarse[:3] / 3.5, 1e-9)) and fine.max() < 1e-3 * np.abs(exact).max()
+
+
+def test_gradients_of_an_equilibrium_with_a_moving_driver():
+    def state(x):
+        found = lg.equilibrium(hung(x), t0=x[3])
+        return jnp.concatenate([found.q.position[:, 2], found.v, found.vdot, found.lam])
+
+    check_gradients(state, np.array([0.1, 1.3, 3.0, BEGUN]))
+
+
+def test_redundant_driver_has_no_motion_from_equilibrium():
+    model = hung(np.array([0.1, 1.3, 3.0]))
+    line = {"at_a": (0.0, 0.0, 1.0), "at_b": (0.0, 0.0, 0.0), "length": 1.0}  # holds the slide where the driver does
+    twice = lg.Model(model.bodies, model.joints | {"rod": lg.DistanceJoint(None, "slide", **line)}, model.forces)
+    with pytest.raises(ValueError, match="redundant"):
+        lg.equilibrium(twice)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_gradients_from_an_equilibrium_with_a_moving_driver(name):
+    check_gradients(partial(from_equilibrium, num_steps=8, integrator=INTEGRATORS[name]), np.array([0.1, 1.3, 3.0]))
 
 
 @pytest.mark.slow

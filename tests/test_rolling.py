@@ -20,11 +20,11 @@ INTEGRATORS = {
     "stabilized": lg.GeneralizedAlpha(stabilized=True),
     "index reduced": lg.IndexReducedODE(),
 }
-P = jnp.array([0.35, 6.0, 0.3, 0.5])  # tilt, spin, radius, rate of yaw of the disc
+P = jnp.array([0.35, 6.0, 0.3, 0.5, rolling_disc.MASS])  # tilt, spin, radius, rate of yaw, mass of the disc
 
 
 def scene(p):
-    return rolling_disc.scene(p[0], jnp.stack([jnp.full((), 0.4), p[1], p[3]]), p[2])
+    return rolling_disc.scene(p[0], jnp.stack([jnp.full((), 0.4), p[1], p[3]]), p[2], p[4])
 
 
 def disc(p, num_steps, integrator):

@@ -63,3 +63,13 @@ def fixed_velocity_rate(system: AbstractSystem, q, v, t) -> Float[Array, " m"]:
     """γ: d/dt c at v̇ = 0."""
     motion = system.group.to_ambient(q, v), jnp.ones_like(t)
     return jax.jvp(lambda q, t: constraint_velocity(system, q, v, t), (q, t), motion)[1]
+
+
+def depends_on_time(system: AbstractSystem, q, v, t) -> bool:
+    """Whether a row depends on t, as far as its program says (an operation that t enters)."""
+    rows = jax.make_jaxpr(lambda q, v, t: _with_level(system, q, v, t, system.constraint(q, t)))(q, v, t).jaxpr
+    reached = {id(rows.invars[-1])}
+    for operation in rows.eqns:
+        if any(id(entry) in reached for entry in operation.invars):
+            reached.update(map(id, operation.outvars))
+    return any(id(row) in reached for row in rows.outvars)

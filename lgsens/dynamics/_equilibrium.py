@@ -4,6 +4,11 @@ Rows of velocity level hold at rest wherever the mechanism is, if b = 0; their �
 equations less than unknowns (a wheel on springs may rest wherever it was rolled to), and in place of each the equation
 0 = 0, which leaves the shortest solution. b ≠ 0 forbids rest.
 
+Drivers go on from there: where rows depend on time, the state is that of the motion which begins in this place. v is
+the velocity of least kinetic energy with c(q, v, t) = 0, v̇ and λ are those of (q, v): at rest, in static balance, where
+drivers have neither rate nor acceleration. With v = 0 the first steps would give them their rate, by a force ∝ 1/h that
+alternates from step to step.
+
 States z of elements do not vanish at rest, their rates do: of their coordinates the velocity is unknown and not the
 place, and C_t has the columns of their derivatives.
 """
@@ -13,8 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from lgsens.dynamics._initial import Initial
-from lgsens.dynamics._matrices import mass_scale
+from lgsens.dynamics._constraints import depends_on_time
+from lgsens.dynamics._initial import Initial, accelerations, consistent_velocity, is_redundant
+from lgsens.dynamics._matrices import constraint_jacobian, mass_scale
+from lgsens.dynamics._redundant import softness
 from lgsens.dynamics._results import RESULTS
 from lgsens.dynamics._system import AbstractSystem, State
 
@@ -22,7 +29,7 @@ _MAX_ITERATIONS = 60
 
 
 def equilibrium(system: AbstractSystem, t) -> Initial:
-    """The static equilibrium near the reference configuration, as an initial state at rest.
+    """The static equilibrium near the reference configuration, as an initial state.
 
     Newton's iteration on x and λ in q = q_ref exp(x̃), with the matrix [[K_t T, Jᵀ], [B T, 0]] at v = 0. A mechanism
     may turn freely about some axis (a wheel on its hinge): the step and the derivative are the shortest
@@ -88,9 +95,15 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
 
     z = lax.custom_root(equation, jnp.zeros(k + m, dtype), newton, tangent_solve)
     x, v, lam = split(z)
-    state = State(q=group.retract(q_ref, x), v=v, vdot=zero, lam=lam, a=zero)
+    q, vdot = group.retract(q_ref, x), zero
     # Forces balance to √eps of the largest joint force or moment, taken as mass scale × 1 m/s² at least.
-    left = jnp.max(jnp.abs(jnp.concatenate([equation(z), system.velocity_constraint(state.q, v, t)])))
+    left = jnp.max(jnp.abs(jnp.concatenate([equation(z), system.velocity_constraint(q, v, t)])))
     balanced = left <= jnp.sqrt(eps) * (1.0 + jnp.max(jnp.abs(z[k:]), initial=0.0))
     result = jnp.where(balanced, RESULTS.successful, RESULTS.equilibrium_failed).astype(jnp.int32)
-    return Initial(state, zero, result, system.constraint(state.q, t))
+    if depends_on_time(system, q, v, t):
+        v = consistent_velocity(system, q, v, t)
+        vdot, lam = accelerations(system, q, v, t)
+        if softness(system) is None:
+            redundant = (result == RESULTS.successful) & is_redundant(system, constraint_jacobian(system, q, t))
+            result = jnp.where(redundant, RESULTS.redundant_constraints, result).astype(jnp.int32)
+    return Initial(State(q=q, v=v, vdot=vdot, lam=lam, a=vdot), zero, result, system.constraint(q, t))

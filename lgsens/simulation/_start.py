@@ -57,10 +57,12 @@ def equilibrium(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) ->
 
     Arguments:
         model: the scene, or an `AbstractSystem`. Its velocities are ignored.
-        t0: the time at which time-dependent forces are taken [s], shape ().
+        t0: the time at which time-dependent forces are taken and drivers are held [s], shape ().
         throw: raise if no equilibrium is found.
 
-    Returns the state at rest there, to be used as `state0` of `simulate`. Differentiable, by the implicit
+    Returns the state at rest there, to be used as `state0` of `simulate` at the same time. Where drivers have a rate or
+    an acceleration at t0, its velocities are those that they give the mechanism at rest, as from an impulse (least
+    kinetic energy), its accelerations and multipliers those of the motion that begins. Differentiable, by the implicit
     function theorem; where a body turns freely (a wheel on its hinge) both the state and its derivative are
     those closest to the reference. Raises `SimulationError` if none is found; inside `jit`, JAX's runtime
     error with the same message.
