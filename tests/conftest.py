@@ -6,6 +6,7 @@ end at it): what is left takes half as long. `pytest --optimized` compiles as us
 common, mostly single operations, are compiled once in a run: JAX keeps them in a folder that ends with it.
 """
 
+import gc
 import os
 import tempfile
 
@@ -16,6 +17,9 @@ import pytest
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+# A trace is millions of small objects that live until it ends; to look through them seldom saves a tenth of the time.
+gc.set_threshold(200_000, 20, 100)
 
 
 def pytest_addoption(parser):

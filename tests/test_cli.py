@@ -190,6 +190,7 @@ def sensitivities(text):
     return {name.strip(): float(value) for name, value in re.findall(r"^(\S.*?)  +(-0\.\d{15,})", text, re.MULTILINE)}
 
 
+@pytest.mark.slow  # three runs
 def test_top_agrees_with_the_reference_as_its_order_says(capsys):
     reference = -0.0021318254254500
     status, text, _ = run(capsys, "top", "--h", 2e-3)

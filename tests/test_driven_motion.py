@@ -114,6 +114,7 @@ def by_angle(x):
 NUMBERS = np.array([0.1, 1.3, 0.8])
 
 
+@pytest.mark.slow  # a load that hangs from a slide is below
 def test_shaken_pendulum_is_that_of_its_ode():
     """The motion, and its derivatives by the signal and the rod, at second order."""
     expected, slope = by_angle(NUMBERS), jax.jit(jax.jacfwd(by_angle))(jnp.asarray(NUMBERS))
@@ -137,7 +138,8 @@ def check_gradients(end, x):
     np.testing.assert_allclose(forward, np.stack(difference, axis=1), rtol=0, atol=3e-7 * size)
 
 
-@pytest.mark.parametrize("name", ["index 3", pytest.param("stabilized", marks=pytest.mark.slow)])
+@pytest.mark.slow  # a driven rotation: `model/test_drivers.py`
+@pytest.mark.parametrize("name", ["index 3", "stabilized"])
 def test_gradients_by_the_signal_in_both_modes(name):
     """By amplitude, frequency, length and the initial time, at which the signal has a rate."""
     end = lambda x: shaken(x[:3], num_steps=8, t0=x[3], integrator=INTEGRATORS[name])

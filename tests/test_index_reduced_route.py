@@ -215,6 +215,7 @@ def test_error_control():
 TOP = load("spinning_top_brulls")
 
 
+@pytest.mark.slow  # the four-bar is below
 def test_top():
     """x, λ and ∂x/∂α₀ at t = 1 s, l = 0.5 m, of the file; joint and rotations hold."""
 

@@ -126,6 +126,7 @@ class Blade(AbstractJoint):
         return (KnifeEdge(b.local_point(self.at), b.local_axis(jnp.array([0.0, 1.0, 0.0]))),)
 
 
+@pytest.mark.slow  # a rolling disc is above
 def test_chaplygin_sleigh():
     """With the centre of mass at d ahead of the blade: u̇ = d ω², (J + m d²) ω̇ = −m d u ω, and energy is kept.
 
@@ -170,6 +171,7 @@ def test_chaplygin_sleigh():
     np.testing.assert_allclose(forward, difference, rtol=1e-5)  # 1e-8 of third derivatives
 
 
+@pytest.mark.slow  # a driven length of a rod: `model/test_drivers.py`
 def test_two_bodies_on_a_link_of_given_length():
     """Two points that turn about their centre of mass: r = ℓ(t), r² θ̇ constant, tension −μ (ℓ̈ − ℓ θ̇²)."""
     mass, spin, end = (1.0, 3.0), 2.0, 0.5

@@ -28,7 +28,7 @@ from lgsens.testing import check_joint
 ZERO = np.zeros(())
 
 
-@pytest.mark.parametrize("ground", [None, "a"])
+@pytest.mark.parametrize("ground", ["a", pytest.param(None, marks=pytest.mark.slow)])
 def test_every_derivative_of_the_joint(ground):
     point = {"point": (0.3, 0.0, 0.1)} if ground else {}
     joint = lg.Rolling(
@@ -198,7 +198,7 @@ def test_what_a_planar_wheel_cannot_do():
         planar_wheel("x ry").system()
 
 
-@pytest.mark.parametrize("free", ["x z ry", "x y z rx ry rz"])
+@pytest.mark.parametrize("free", ["x z ry", pytest.param("x y z rx ry rz", marks=pytest.mark.slow)])
 def test_equilibrium_of_a_wheel_on_a_slope(free):
     """The spring holds the weight along the slope; the ground carries what is across it, and no friction."""
     model, slope = planar_wheel(free), 0.2

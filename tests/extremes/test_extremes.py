@@ -8,7 +8,7 @@ from extremes_rows import Row, linear_error, worst_row
 from extremes_scales import unit_rows
 from hypothesis import given, settings, strategies as st
 
-QUICK = ("rotation", "failures")  # the others compile larger programs, or run for a minute
+QUICK = ("failures",)  # the others compile larger programs, or run for a minute
 LABELLED = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in EXTREMES]
 
 

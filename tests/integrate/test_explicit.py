@@ -44,7 +44,7 @@ def inner(one, other):
     return sum(a @ b for a, b in pairs), sum(np.abs(a) @ np.abs(b) for a, b in pairs)
 
 
-@pytest.mark.parametrize("uneven", [False, True])
+@pytest.mark.parametrize("uneven", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_sweeps_solve_the_linearized_equations(uneven):
     """L times the solution of the direct sweep is its right-hand side, with rows everywhere; Lᵀ is the adjoint's.
 
@@ -79,6 +79,7 @@ def differences(f, step=1e-3):
     return np.array([central(lambda s, e=e: compiled(P + s * e), step) for e in jnp.eye(3)])
 
 
+@pytest.mark.slow  # first ones on given steps are below
 def test_first_and_second_derivatives():
     """In reverse mode, against differences of sixth order."""
     gradient = jax.jit(jax.value_and_grad(psi))
@@ -115,6 +116,7 @@ def side(s):
     return s.body("top").position[0] ** 2 + 1e-5 * s.multiplier("pivot")[2]
 
 
+@pytest.mark.slow  # as the combinations
 def test_outputs_and_checkpoints():
     """`save`, with checkpoints and without, is the trajectory by Gregory's rule."""
 
@@ -134,6 +136,7 @@ def test_outputs_and_checkpoints():
         np.testing.assert_allclose(found[1], slope, rtol=1e-9)
 
 
+@pytest.mark.slow  # two programs
 def test_growth_and_control():
     """What else knows schemes only: the growth of changes, and steps under error control."""
     growth = lg.sensitivity_growth(build(P), t1=0.1, num_steps=STEPS, integrator=TSIT5)

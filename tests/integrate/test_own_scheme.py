@@ -81,7 +81,9 @@ def differences(f):
     return np.array([central(lambda s, e=e: compiled(P + s * e), 1e-3) for e in jnp.eye(3)])
 
 
-@pytest.mark.parametrize("integrator", [MIDPOINT, GIVEN], ids=["equal", "given"])
+@pytest.mark.parametrize(
+    "integrator", [pytest.param(MIDPOINT, marks=pytest.mark.slow, id="equal"), pytest.param(GIVEN, id="given")]
+)
 def test_both_modes_on_every_grid(integrator):
     f = lambda p: psi(p, integrator=integrator)
     expected = differences(f)
@@ -91,6 +93,7 @@ def test_both_modes_on_every_grid(integrator):
     np.testing.assert_allclose(reverse, forward, rtol=1e-10)  # the same systems, other order of round-off
 
 
+@pytest.mark.slow  # two programs
 def test_adaptive_steps_are_given_steps():
     """The derivative is that on the grid found."""
     adaptive, room = lg.AdaptiveSteps(MIDPOINT, tolerance=1e-2, longest=1.0), 20
@@ -130,6 +133,7 @@ def test_outputs_and_checkpoints(integrator, method):
     np.testing.assert_allclose(slope, jax.jit(jax.jacfwd(plain))(P), rtol=1e-8)
 
 
+@pytest.mark.slow  # two programs
 def test_second_derivatives():
     f = lambda p: psi(p, integrator=MIDPOINT)
     hessian = jax.jit(jax.hessian(f))(P)

@@ -89,7 +89,7 @@ def test_gradients_by_gains_and_initial_states():
 
 
 @pytest.mark.parametrize(
-    "how", ["stabilized", "merged", *(pytest.param(how, marks=pytest.mark.slow) for how in ("index reduced", "sparse"))]
+    "how", ["stabilized", *(pytest.param(how, marks=pytest.mark.slow) for how in ("merged", "index reduced", "sparse"))]
 )
 def test_every_way_to_solve_has_the_same_states(how):
     """Other integrators to their own order, another solver and merged parts to round-off of Newton."""

@@ -39,7 +39,11 @@ if CHROMIUM:
         return browser.picture()[top : top + height, left : left + width]
 
     def slide(browser, data, frame):
-        """Take the slider by its knob and drag it to a frame; the knob, 16 pixels wide, stays within the slider."""
+        """Take the slider by its knob and drag it to a frame; the knob, 16 pixels wide, stays within the slider.
+
+        Paused before: a knob that is dragged to where it is already says nothing, and a page that plays goes on.
+        """
+        browser.ask("(play => play.textContent === 'Pause' && play.click())(document.getElementById('play'))")
         left, top, width, height = box(browser, "slider")
         last = len(data["clock"]) - 1
         place = lambda at: (left + 8 + (width - 16) * at / last, top + height / 2)

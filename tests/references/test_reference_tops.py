@@ -17,7 +17,12 @@ FREE = document("free_rigid_body.json")
 FILES = ("spinning_top_brulls.", "heavy_top_bruls2012.", "lagrange_top_analytic.", "free_rigid_body.")
 
 
-LONG = ("spinning_top_brulls.as_printed_l_0.5", "heavy_top_bruls2012.to_1s")  # as others, at other numbers
+LONG = (  # as others, at other numbers
+    "spinning_top_brulls.as_printed_l_0.5",
+    "heavy_top_bruls2012.to_1s",
+    "heavy_top_bruls2012.to_2s",
+    "lagrange_top_analytic.nutating",
+)
 
 
 @pytest.mark.parametrize(
