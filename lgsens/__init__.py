@@ -8,7 +8,7 @@ group, Multibody System Dynamics, 2014). SI units; `jax.config.update("jax_enabl
 
 import importlib
 
-from lgsens._xla import without_wrong_sums
+from lgsens._xla import compilation_cache as compilation_cache, without_wrong_sums
 from lgsens.analysis import (
     ConstraintRank as ConstraintRank,
     Growth as Growth,
@@ -87,7 +87,9 @@ from lgsens.simulation import (
     StateError as StateError,
     Trajectory as Trajectory,
     equilibrium as equilibrium,
+    failures_by_callback as failures_by_callback,
     initial_state as initial_state,
+    raise_if_failed as raise_if_failed,
     richardson as richardson,
     simulate as simulate,
 )

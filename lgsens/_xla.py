@@ -1,4 +1,4 @@
-"""What XLA has to be told for results to be right.
+"""What XLA has to be told for results to be right, and where its programs are kept.
 
 From jaxlib 0.10.2 on XLA hands sums on a CPU to YNNPACK ("YNN fusions"), alone or with the product before them, and
 what comes back can be wrong without a word. Measured, the largest error relative to the largest result:
@@ -20,7 +20,10 @@ those that it starts.
 
 import os
 import warnings
+from pathlib import Path
 
+import jax
+from jax.experimental.compilation_cache import compilation_cache as jax_cache
 from jaxlib.version import __version_info__ as _VERSION
 
 _OPTION = "--xla_cpu_experimental_ynn_fusion_type"
@@ -50,3 +53,36 @@ def without_wrong_sums() -> None:
         )
         return
     os.environ["XLA_FLAGS"] = f"{flags} {_WITHOUT_SUMS}".strip()
+
+
+def compilation_cache(folder: str | os.PathLike | None = None) -> Path:
+    """Keep compiled programs in a folder, in which the next process finds them: there a gradient is only traced.
+
+    ```python
+    import lgsens as lg
+
+    lg.compilation_cache()
+    ```
+
+    Arguments:
+        folder: where; None: where JAX keeps them already (`JAX_COMPILATION_CACHE_DIR`), or else `lgsens` in the user's
+            folder of caches, `$XDG_CACHE_HOME` or `~/.cache`.
+
+    Returns the folder. JAX's persistent cache is a setting of the process (`jax_compilation_cache_dir`), which nothing
+    but this function and the command line touches; `JAX_ENABLE_COMPILATION_CACHE=false` switches it off. Programs that
+    take less than half a second are not kept, nor those with a callback to Python (`failures_by_callback`,
+    `jax.debug.print`). Raises `ValueError` for a folder that cannot be written.
+    """
+    given = folder if folder is not None else jax.config.jax_compilation_cache_dir
+    home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
+    found = home / "lgsens" if given is None else Path(given).expanduser()
+    try:
+        found.mkdir(parents=True, exist_ok=True)
+        (found / ".writable").touch()
+    except OSError as error:
+        raise ValueError(f"`folder` {str(found)!r} cannot be written ({error}); name another one.") from error
+    if str(found) != jax.config.jax_compilation_cache_dir:
+        jax.config.update("jax_compilation_cache_dir", str(found))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+        jax_cache.reset_cache()  # else a process that has compiled before keeps to the folder it had
+    return found

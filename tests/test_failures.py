@@ -181,18 +181,41 @@ def test_newton_failure_as_data():
 
 
 def test_newton_failure_inside_jit():
+    """NaN in what is computed of the motion and in its derivatives; what comes out says why, and raises where asked."""
+
+    def run(push):
+        trajectory = fail(push)
+        return jnp.sum(trajectory.body("bob").position[:, 0]), trajectory
+
+    (value, trajectory), slope = jax.jit(jax.value_and_grad(run, has_aux=True))(30.0)
+    assert np.isnan(value) and np.isnan(slope)
+    assert trajectory.result == lg.RESULTS.newton_failed
+    said = says("did not converge", "step 6 of 10, t = 0.6 s, after 1 iterations: last increment", "residual")
+    with pytest.raises(lg.SimulationError, match=said):
+        lg.raise_if_failed(trajectory)
+    (value, trajectory), _ = jax.jit(jax.value_and_grad(run, has_aux=True))(0.0)
+    assert lg.raise_if_failed(trajectory) is trajectory
+    np.testing.assert_array_equal(value, jnp.sum(fail(0.0).body("bob").position[:, 0]))
+
+
+def test_first_failure_of_a_batch_is_raised():
+    trajectories = jax.jit(jax.vmap(fail))(jnp.asarray([0.0, 30.0]))
+    positions = trajectories.body("bob").position
+    assert np.all(np.isfinite(positions[0])) and np.all(np.isnan(positions[1]))
+    with pytest.raises(lg.SimulationError, match="at step 6 of 10"):
+        lg.raise_if_failed(trajectories)
+
+
+def test_callbacks_raise_inside_jit():
     """JAX's runtime error, with the same text; the run that works is untouched."""
-    path = jax.jit(lambda push: fail(push).body("bob").position[:, 0])
-    with pytest.raises(jax.errors.JaxRuntimeError, match=FAILURE):
-        jax.block_until_ready(path(30.0))
-    np.testing.assert_array_equal(path(0.0), fail(0.0).body("bob").position[:, 0])
-
-
-def test_newton_failure_under_vmap():
-    paths = jax.jit(jax.vmap(lambda push: fail(push).body("bob").position[:, 0]))
-    with pytest.raises(jax.errors.JaxRuntimeError, match=FAILURE):
-        jax.block_until_ready(paths(jnp.asarray([0.0, 30.0])))
-    assert np.all(np.isfinite(paths(jnp.zeros(2))))
+    path = lambda push: fail(push).body("bob").position[:, 0]
+    with lg.failures_by_callback():
+        one, every = jax.jit(path), jax.jit(jax.vmap(path))
+        with pytest.raises(jax.errors.JaxRuntimeError, match=FAILURE):
+            jax.block_until_ready(one(30.0))
+        with pytest.raises(jax.errors.JaxRuntimeError, match=FAILURE):
+            jax.block_until_ready(every(jnp.asarray([0.0, 30.0])))
+        assert np.all(np.isfinite(every(jnp.zeros(2))))
 
 
 def test_newton_failure_under_differentiation():
@@ -202,8 +225,15 @@ def test_newton_failure_under_differentiation():
 
 
 def test_mechanism_that_cannot_be_assembled_inside_jit():
-    with pytest.raises(jax.errors.JaxRuntimeError, match=UNREACHABLE):
-        jax.block_until_ready(jax.jit(lambda length: lg.initial_state(pendulum(length=length)).q)(5.0))
+    start = lambda length: lg.initial_state(pendulum(length=length)).v
+    assert np.all(np.isnan(jax.jit(start)(5.0)))
+    with lg.failures_by_callback(), pytest.raises(jax.errors.JaxRuntimeError, match=UNREACHABLE):
+        jax.block_until_ready(jax.jit(start)(5.0))
+    run = lambda length: lg.simulate(pendulum(length=length), t1=0.1, num_steps=2)
+    with pytest.raises(ValueError, match=UNREACHABLE):
+        lg.raise_if_failed(jax.jit(run)(5.0))
+    with pytest.raises(ValueError, match="for what comes out of `jit`"):
+        jax.jit(lambda length: lg.raise_if_failed(run(length)))(5.0)
 
 
 # What a trajectory is asked for.

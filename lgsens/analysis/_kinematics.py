@@ -83,7 +83,7 @@ def kinematics(
     Differentiable by every number of the model and by the driven values, by the implicit function theorem: one
     factorization per position for all of them. Raises `ValueError` for names that are not drivers, values of different
     lengths, joints that only constrain velocities, a mechanism with other degrees of freedom than the driven ones, and
-    positions that do not exist; inside `jit`, JAX's runtime error with that message. Source: Haug (1989), chapter 3.
+    positions that do not exist; inside `jit` the states are NaN and `result` says why. Source: Haug (1989), chapter 3.
     """
     if not isinstance(model, Model):
         raise ValueError(f"`model` must be a Model, got {type(model).__name__}.")
@@ -140,10 +140,9 @@ def kinematics(
     time = jnp.broadcast_to(start, shape) if t is None else times[0]
     clock = jnp.zeros_like(time) if t is None else jnp.ones_like(time)
     (states, result), details = _kinematics_jit(drive, (values, time), (speed, clock))
-    found = Kinematics(values=dict(zip(names, columns)), t=time, states=states, result=result, system=system)
     if throw:
-        found = throw_if_failed(found, found.result, details, system.constraint_names)
-    return found
+        states = throw_if_failed(states, result, details, system.constraint_names)
+    return Kinematics(values=dict(zip(names, columns)), t=time, states=states, result=result, system=system)
 
 
 @eqx.filter_jit

@@ -1,6 +1,7 @@
 """The console script `lgsens`: arguments in, an exit status out; 2 and one line on stderr for bad input."""
 
 import argparse
+import contextlib
 import io
 import math
 import sys
@@ -10,6 +11,7 @@ from typing import Any, NoReturn
 
 import jax
 
+from lgsens._xla import compilation_cache
 from lgsens.cli import _curves, _optimize, _paper, _top, _tradeoff
 from lgsens.cli._report import version
 from lgsens.examples import PARAMETERS
@@ -156,6 +158,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="replace")
     arguments = _parser().parse_args(argv)
     jax.config.update("jax_enable_x64", True)  # an application may; the library never does
+    with contextlib.suppress(ValueError):  # where nothing can be kept, all is compiled each time
+        compilation_cache()
     try:
         return arguments.run(arguments)
     except (ValueError, OSError, ImportError, SimulationError) as error:

@@ -77,7 +77,8 @@ def differentiate(
             differentiated, then integrated. For comparison: `Autodiff()`, `FiniteDifferences()`, `IndexReduced()`.
             None: direct or adjoint, as `direct_or_adjoint` advises for these numbers of parameters and criteria.
         state0: p ↦ the state at t0 (one of `equilibrium`, say). None: the consistent initial state.
-        throw: raise if the simulation fails. With False `result` says so, and values and gradients are NaN.
+        throw: raise if the simulation fails. With False, and inside `jit`, `result` says so, and values and gradients
+            are NaN.
 
     The first two methods give the derivative of the numerical solution, to round-off; the continuous ones and
     `IndexReduced` that of the motion, to their own accuracy. Compiled once for the same functions: define
@@ -282,6 +283,7 @@ def _continuous_adjoint(task: _Task, p, method: ContinuousAdjoint, uses: list[Us
 
 def _differences(task: _Task, p, method: FiniteDifferences) -> _Found:
     value, (trajectory, details) = task.simulate(p, DirectDifferentiation())
+    task = task._replace(integrator=task.integrator.frozen(trajectory))  # a derivative is that on the grid found
     distance = method.step * jnp.where(p == 0.0, 1.0, jnp.abs(p))
 
     def slope(direction):

@@ -87,8 +87,7 @@ def integrate_index_reduced(
     meant to be differentiated.
 
     Raises `ValueError` for bad arguments, tolerances beyond the precision, a mechanism that cannot be assembled or has
-    redundant constraints, and `SimulationError` when `max_steps` are not enough; inside `jit`, JAX's runtime error
-    with the same message.
+    redundant constraints, and `SimulationError` when `max_steps` are not enough; inside `jit` all is NaN then.
     """
     p, t0, t1 = as_float(p, None, "`p`"), as_float(t0, (), "`t0`"), as_float(t1, (), "`t1`")
     if p.ndim != 1 or p.size == 0:
@@ -112,7 +111,9 @@ def integrate_index_reduced(
     )
     if is_concrete(finished) and not bool(finished):
         raise SimulationError(message)
-    return run if is_concrete(finished) else eqx.error_if(run, ~finished, message)
+    return run._replace(
+        value=jnp.where(finished, run.value, jnp.nan), gradient=jnp.where(finished, run.gradient, jnp.nan)
+    )
 
 
 @eqx.filter_jit

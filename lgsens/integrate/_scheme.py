@@ -123,6 +123,10 @@ class AbstractIntegrator(eqx.Module):
         """The grid of a run from t0 to t1: here equal steps."""
         return Laid(EqualGrid(t0, (t1 - t0) / num_steps, num_steps))
 
+    def frozen(self, trajectory: Any) -> "AbstractIntegrator":
+        """The steps of a trajectory, where they were chosen for it."""
+        return self
+
 
 def scheme_of(owner: str, integrator: Any) -> "AbstractScheme":
     """The scheme that an integrator is to lay steps for; `ValueError` where that is none."""

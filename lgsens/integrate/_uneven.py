@@ -165,6 +165,9 @@ class AdaptiveSteps(AbstractIntegrator):
         grid = UnevenGrid.first(t0, sizes / frozen[4] * mean)
         return Laid(grid, (states, Stats(*stats[: len(Stats._fields)])), stats, reached)
 
+    def frozen(self, trajectory):
+        return GivenSteps.of(trajectory, self.integrator)
+
 
 class ControlledStats(NamedTuple):
     """What Newton and the error control did in each step.

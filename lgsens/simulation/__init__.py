@@ -2,8 +2,9 @@
 
 from lgsens.simulation._errors import (
     SimulationError as SimulationError,
-    failures_as_nan as failures_as_nan,
+    failures_by_callback as failures_by_callback,
     left_null_space as left_null_space,
+    raise_if_failed as raise_if_failed,
     redundant_names as redundant_names,
     throw_if_failed as throw_if_failed,
 )

@@ -8,11 +8,12 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 
-from lgsens.dynamics import RESULTS
+from lgsens.dynamics import RESULTS, full_jacobian, initial_state
+from lgsens.integrate import singular_steps
 from lgsens.linear import Matrix, SparseMatrix
 
-# Whether a failure becomes NaN. JAX keys its caches on it: what was compiled for one is traced again for the other.
-_failures_as_nan = jax.make_user_context(False)
+# Whether a failure inside `jit` calls back. JAX keys its caches on it: both are traced.
+_by_callback = jax.make_user_context(False)
 
 # Which of several runs: `details["run"]`.
 _RUNS = ("", " of the coarser of two runs", " of the finer of two runs")
@@ -22,9 +23,18 @@ class SimulationError(RuntimeError):
     """A simulation or an equilibrium that failed; the message says at which step, when, and what to try."""
 
 
-def failures_as_nan():
-    """A context in which what is traced turns failures into NaN, in the values and in every derivative of them."""
-    return _failures_as_nan(True)
+def failures_by_callback(active: bool = True):
+    """A context in which what `jit` compiles raises its failures itself, by a callback to Python.
+
+    ```python
+    with lg.failures_by_callback():
+        step = jax.jit(step).lower(p).compile()   # raises JAX's runtime error with step, time and advice
+    ```
+
+    Without it a failure inside `jit` is NaN in the values and in every derivative of them, and `raise_if_failed` raises
+    from what comes out. A program with a callback is not kept in JAX's persistent cache, nor can it be exported.
+    """
+    return _by_callback(active)
 
 
 def redundant_names(jacobian: Matrix, names: tuple[str, ...]) -> list[str]:
@@ -47,11 +57,13 @@ def left_null_space(jacobian: np.ndarray) -> tuple[np.ndarray, int]:
 def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> str:
     """The message of a failure; `details` are those of `outcome`, or what else the code wants to know."""
     code = RESULTS(result)
+    if not details:
+        return code.message
     if code is RESULTS.redundant_constraints:
         return f"{code.message} Joints involved: {redundant_names(details['jacobian'], names)}."
     step, num_steps = int(details.get("step", 0)), int(details.get("num_steps", 0))
     place, time = f"step {step} of {num_steps}", f"t = {details.get('time', 0.0):.6g} s"
-    violation, worst = np.abs(details["violation"]), ""
+    violation, worst = np.abs(details.get("violation", ())), ""
     if violation.size:
         i = int(np.argmax(np.where(np.isfinite(violation), violation, np.inf)))
         worst = f"Left over: |Φ| = {violation[i]:.3g}, largest in joint {names[i]!r}."
@@ -59,10 +71,11 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
         case RESULTS.assembly_failed:
             more = worst
         case RESULTS.newton_failed:
+            asked = f" (tolerance {details['tolerance']:.3g})" if "tolerance" in details else ""
             more = (
                 f"It failed at {place}{_RUNS[int(details.get('run', 0))]}, {time}, after {int(details['iterations'])} "
-                f"iterations: last increment {details['increment']:.3g} (tolerance {details['tolerance']:.3g}), "
-                f"residual {details['residual']:.3g}. `throw=False` returns the data up to the step before."
+                f"iterations: last increment {details['increment']:.3g}{asked}, residual {details['residual']:.3g}. "
+                "`throw=False` returns the data up to the step before."
             )
         case RESULTS.singular_configuration:
             more = f"It does so about {place}, {time}. `throw=False` returns the data, which follow one branch."
@@ -95,13 +108,12 @@ def _exception(result: int, details: dict[str, Any], names: tuple[str, ...], not
 
 
 def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tuple[str, ...], note: str = "") -> Any:
-    """`tree` unchanged, unless `result` is a failure: then raise, now or, inside a trace, when it runs.
+    """`tree` unchanged, unless `result` is a failure: then raise or, inside a trace, make it NaN.
 
     `note` is what else to say where the constraints are redundant.
 
-    Inside a trace the exception is JAX's runtime error with the same message. The callback runs only in the
-    failing branch (under `vmap`, always, and names the first lane that failed). Under `failures_as_nan` nothing is
-    raised there.
+    Under `failures_by_callback` the exception inside a trace is JAX's runtime error with the same message. The callback
+    runs only in the failing branch (under `vmap`, always, and names the first lane that failed).
     """
 
     def host(result, details) -> np.ndarray:
@@ -120,10 +132,9 @@ def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tupl
             raise _exception(int(result), values, names, note)
         return tree
 
-    result, details = lax.stop_gradient((result, details))
-    if _failures_as_nan.value:
-        passed = result == RESULTS.successful
-    else:
+    passed = result == RESULTS.successful
+    if _by_callback.value:
+        result, details = lax.stop_gradient((result, details))
         shape = jax.ShapeDtypeStruct((), bool)
         fail = lambda *operands: jax.pure_callback(host, shape, *operands, vmap_method="broadcast_all")
         passed = lax.cond(result != RESULTS.successful, fail, lambda *_: jnp.ones((), bool), result, details)
@@ -131,6 +142,56 @@ def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tupl
     # failure are NaN too, where those of a selection would be zero.
     poison = lambda leaf: leaf * jnp.where(passed, 1.0, jnp.nan).astype(leaf.dtype)
     return jax.tree.map(lambda leaf: poison(leaf) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, tree)
+
+
+def raise_if_failed(found: Any) -> Any:
+    """What comes out of `jit` or `vmap` as it is, unless it failed: then raise, as `simulate` does outside of `jit`.
+
+    ```python
+    trajectory = lg.raise_if_failed(jax.jit(run)(p))
+    ```
+
+    Arguments:
+        found: a `Trajectory`, or anything else with a `result`: `Saved`, `Kinematics`, `Sensitivities`; of a batch
+            the first one that failed counts.
+
+    Inside `jit` failures are NaN, in values and derivatives, and `result` says why. Raises `ValueError` for a mechanism
+    that cannot be assembled or has redundant constraints, and where `found` is traced; else `SimulationError`.
+    """
+    if isinstance(found.result, Tracer):
+        raise ValueError(
+            "`raise_if_failed` is for what comes out of `jit` or `vmap`: inside, no number is known yet. Return the "
+            "trajectory or its `result` from there, or trace under `failures_by_callback`."
+        )
+    codes = np.asarray(found.result)
+    failed = np.argwhere(codes != RESULTS.successful)
+    if not len(failed):
+        return found
+    lane = tuple(failed[0])
+    code = int(codes[lane])
+    one = lambda name: jax.tree.map(lambda leaf: jnp.asarray(leaf)[lane], getattr(found, name, None))
+    system, t, stats = one("system"), one("t"), one("stats")
+    details: dict[str, Any] = {}
+    if system is not None and code in (RESULTS.assembly_failed, RESULTS.redundant_constraints):
+        initial = initial_state(system, t[0])
+        jacobian = full_jacobian(system, initial.state.q, t[0])
+        details = {"violation": np.asarray(initial.violation), "jacobian": np.asarray(jacobian)}
+    elif code in (RESULTS.newton_failed, RESULTS.integration_failed, RESULTS.singular_configuration):
+        details = _of_steps(code, t, stats)
+    raise _exception(code, details, () if system is None else system.constraint_names, "")
+
+
+def _of_steps(code: int, t, stats: Any) -> dict[str, Any]:
+    """What statistics say of a step that failed."""
+    singular, explicit = code == RESULTS.singular_configuration, code == RESULTS.integration_failed
+    at = int(np.argmax(singular_steps(stats.margin)) if singular else np.argmin(stats.converged))
+    count, i, run, times = len(t) - 1, at, 0, np.asarray(t)
+    if len(stats.converged) > count:  # those of two runs
+        run, i = (1, at) if at < count else (2, at - count)
+        times = np.linspace(times[0], times[-1], run * count + 1)
+    of = {"iterations": "steps"} if explicit else {name: name for name in ("iterations", "increment", "residual")}
+    known = {name: np.asarray(getattr(stats, field))[at] for name, field in of.items()}
+    return known | {"run": run, "step": i + 1, "num_steps": len(times) - 1, "begin": times[i], "time": times[i + 1]}
 
 
 def _value(array: Any) -> Any:

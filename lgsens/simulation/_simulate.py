@@ -1,5 +1,6 @@
 """`simulate`: the model in, a trajectory out."""
 
+import dataclasses
 import warnings
 from collections.abc import Callable
 from typing import Any, overload
@@ -90,15 +91,16 @@ def simulate(
             result is a `Saved`. Without derivatives no state is stored, so that a batch of
             designs takes the memory of what it asks for. Define it once: a new lambda in each call compiles anew.
             Numbers that it depends on come through the model, or are constants.
-        throw: raise if the simulation fails. With False `Trajectory.result` says so, and the data are
-            finite up to the failure and NaN from there on.
+        throw: raise if the simulation fails; inside `jit` and `vmap`, where nothing can be raised, all data are NaN and
+            `Trajectory.result` says why (`raise_if_failed`). With False it says so, and the data are finite up to the
+            failure and NaN from there on.
 
     The derivative of the trajectory with respect to every number of the model, the initial state and the
     times is that of the numerical solution, to round-off.
 
     Raises `ValueError` for bad arguments, a mechanism that cannot be assembled or has redundant constraints,
     and `SimulationError` for a step that does not converge, a singular configuration, or a body that turns by more
-    than π in a step while its angular velocity changes; inside `jit`, JAX's runtime error with the same message.
+    than π in a step while its angular velocity changes.
     Source: Sonneville & Brüls (2014), §4 and §6.2.
     """
     system = as_system(model)
@@ -127,7 +129,10 @@ def simulate(
     t0, t1 = interval(t0, t1)
     found, details = _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, save)
     if throw:
-        found = throw_if_failed(found, found.result, details, system.constraint_names)
+        fields = ("states", "error", "stages") if save is None else ("values", "final")  # the others say what happened
+        motion = {name: getattr(found, name) for name in fields}
+        motion = throw_if_failed(motion, found.result, details, system.constraint_names)
+        found = dataclasses.replace(found, **motion)
     return found
 
 

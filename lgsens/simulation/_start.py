@@ -46,8 +46,8 @@ def initial_state(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) 
         t0: initial time [s], shape ().
         throw: raise if the mechanism cannot be assembled or has redundant constraints.
 
-    Differentiable, by the implicit function theorem. Raises `ValueError` as said under `throw`; inside
-    `jit`, JAX's runtime error with the same message.
+    Differentiable, by the implicit function theorem. Raises `ValueError` as said under `throw`; inside `jit` the state
+    is NaN.
     """
     return _found_state(_initial_jit, model, t0, throw)
 
@@ -64,8 +64,7 @@ def equilibrium(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) ->
     an acceleration at t0, its velocities are those that they give the mechanism at rest, as from an impulse (least
     kinetic energy), its accelerations and multipliers those of the motion that begins. Differentiable, by the implicit
     function theorem; where a body turns freely (a wheel on its hinge) both the state and its derivative are
-    those closest to the reference. Raises `SimulationError` if none is found; inside `jit`, JAX's runtime
-    error with the same message.
+    those closest to the reference. Raises `SimulationError` if none is found; inside `jit` the state is NaN.
     """
     return _found_state(_equilibrium_jit, model, t0, throw)
 

@@ -20,7 +20,7 @@ from jaxtyping import PyTree
 
 from lgsens.dynamics import RESULTS
 from lgsens.linear import many_runs, tuned
-from lgsens.simulation import Saved, Trajectory, failures_as_nan
+from lgsens.simulation import Saved, Trajectory, failures_by_callback
 
 AXIS = "designs"
 
@@ -89,7 +89,7 @@ def trace(fn: Callable[[PyTree], PyTree], designs: PyTree) -> Traced:
         return values, succeeded(values)
 
     started = time.perf_counter()
-    with failures_as_nan(), many_runs():
+    with failures_by_callback(False), many_runs():
         jaxpr, (shapes, _) = jax.make_jaxpr(single, return_shape=True)(*one)
     run = jaxpr_as_fun(jaxpr)
     return Traced(run, shapes, _bytes_per_turn(jaxpr.jaxpr), time.perf_counter() - started)
