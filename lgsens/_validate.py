@@ -97,6 +97,7 @@ def axis_field(name: str) -> Any:
 
     def convert(value: Any) -> Array:
         axis = as_float(value, (3,), f"`{name}`")
+        require(lambda axis: np.isfinite(axis).all(), f"`{name}` must be finite, got {axis}.", axis)
         require(
             lambda axis: np.linalg.norm(axis) > 0,
             f"`{name}` has zero length; give a direction, e.g. (0, 0, 1).",

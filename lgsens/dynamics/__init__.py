@@ -55,5 +55,6 @@ from lgsens.dynamics._system import (
     Tangents as Tangents,
     autodiff_constraint_jacobian as autodiff_constraint_jacobian,
     autodiff_tangents as autodiff_tangents,
+    finite as finite,
 )
 from lgsens.dynamics._turning import unsteady_rate as unsteady_rate

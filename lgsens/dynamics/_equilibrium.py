@@ -106,4 +106,5 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
         if softness(system) is None:
             redundant = (result == RESULTS.successful) & is_redundant(system, constraint_jacobian(system, q, t))
             result = jnp.where(redundant, RESULTS.redundant_constraints, result).astype(jnp.int32)
+    result = jnp.where(system.is_valid(), result, RESULTS.invalid_numbers).astype(jnp.int32)
     return Initial(State(q=q, v=v, vdot=vdot, lam=lam, a=vdot), zero, result, system.constraint(q, t))

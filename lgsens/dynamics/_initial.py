@@ -12,7 +12,7 @@ from lgsens.dynamics._constraints import fixed_velocity_rate, prescribed_velocit
 from lgsens.dynamics._matrices import ConstrainedMass, constraint_jacobian, factorized, for_once
 from lgsens.dynamics._redundant import softness
 from lgsens.dynamics._results import RESULTS
-from lgsens.dynamics._system import AbstractSystem, State
+from lgsens.dynamics._system import AbstractSystem, State, finite
 from lgsens.linear import Factors, Inverse, Matrix, SparseMatrix, diagonal
 
 _MAX_ITERATIONS = 30
@@ -170,9 +170,8 @@ def initial_state(system: AbstractSystem, t) -> Initial:
     length = jnp.max(system.coordinate_scale())
     largest = jnp.max(jnp.abs(violation), initial=0.0)
     assembled = largest <= 1e3 * jnp.finfo(dtype).eps * jnp.maximum(length, 1.0)  # NaN is not assembled
-    result = jnp.where(
-        assembled,
-        jnp.where(redundant, RESULTS.redundant_constraints, RESULTS.successful),
-        RESULTS.assembly_failed,
-    ).astype(jnp.int32)
+    result = jnp.where(finite(state), RESULTS.successful, RESULTS.invalid_numbers)
+    result = jnp.where(redundant, RESULTS.redundant_constraints, result)
+    result = jnp.where(assembled, result, RESULTS.assembly_failed)
+    result = jnp.where(system.is_valid(), result, RESULTS.invalid_numbers).astype(jnp.int32)
     return Initial(state, vddot, result, violation, factors)

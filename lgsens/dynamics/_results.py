@@ -16,6 +16,7 @@ class RESULTS(IntEnum):
     steps_exhausted = 7
     singular_configuration = 8
     turn_not_resolved = 9
+    invalid_numbers = 10
 
     @property
     def message(self) -> str:
@@ -61,6 +62,11 @@ _MESSAGES = {
         "No position satisfies the joints for these values of the driven ones: they are out of reach, or the mechanism "
         "passes a dead centre, where the driven values do not determine it. Ask for values within reach, drive another "
         "coordinate, or come there in smaller steps."
+    ),
+    RESULTS.invalid_numbers: (
+        "A number of the scene is not finite, or one that no body has (a mass that is not positive, an inertia whose "
+        "moments break the triangle inequality, an orientation far from a rotation), or `t1` is not later than `t0`. "
+        "Bound what an optimizer may change; a model that is built outside of `jit` names the element."
     ),
     RESULTS.steps_exhausted: (
         "Error control needs more steps than `num_steps` allows. Try more `num_steps` or a looser `tolerance`."

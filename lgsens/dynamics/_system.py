@@ -6,7 +6,9 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float
 
 from lgsens.liegroups import AbstractLieGroup
 from lgsens.linear import AbstractLinearSolver, Elimination, Matrix, SparseMatrix
@@ -105,6 +107,10 @@ class AbstractSystem(eqx.Module):
     def tangents(self, q, v, vdot, lam, t) -> Tangents:
         """The exact tangents K_t, C_t and J = [B; A]. `autodiff_tangents` is a ready implementation."""
 
+    def is_valid(self) -> Bool[Array, ""]:
+        """Whether all numbers are finite, and such as a system has; without derivative."""
+        return finite(self)
+
     @property
     def num_velocity_rows(self) -> int:
         """m_v: how many rows A v + b = 0 have velocity level only (nonholonomic constraints)."""
@@ -171,6 +177,12 @@ class AbstractSparseSystem(AbstractSystem):
     def tangent_operators(self, x) -> Float[Array, "N 3 3"]:
         """T(x) on the rotations of each body, zero in the rows and columns of those that it does not have; T = I on
         translations."""
+
+
+def finite(*trees: Any) -> Bool[Array, ""]:
+    """Whether all floats of some pytrees are finite; without derivative."""
+    numbers = ravel_pytree(lax.stop_gradient(eqx.filter(trees, eqx.is_inexact_array)))[0]
+    return jnp.all(jnp.isfinite(numbers))
 
 
 def autodiff_tangents(system: AbstractSystem, q, v, vdot, lam, t) -> Tangents:

@@ -90,6 +90,14 @@ class RigidBody(eqx.Module):
                 f"centre of mass, shape (3, 3), got shape {self.inertia.shape}."
             )
         require(
+            _is_rotation,
+            "RigidBody: `orientation` must be a rotation matrix (RᵀR = I, det R = 1); its columns are the "
+            "body's axes in the inertial frame.",
+            self.orientation,
+        )
+
+    def __check_init__(self):
+        require(
             lambda mass: mass > 0 and np.isfinite(mass),
             f"RigidBody: `mass` must be positive, got {self.mass} kg.",
             self.mass,
@@ -102,16 +110,6 @@ class RigidBody(eqx.Module):
                 "axes and the centre of mass).",
                 self.inertia,
             )
-        require(
-            _is_rotation,
-            "RigidBody: `orientation` must be a rotation matrix (RᵀR = I, det R = 1); its columns are the "
-            "body's axes in the inertial frame.",
-            self.orientation,
-        )
-
-        self._check_free()
-
-    def _check_free(self) -> None:
         if self.inertia is None and {*self.free} & {*ROTATIONS}:
             raise ValueError(
                 f"RigidBody: a point mass (`inertia` = None) has no rotations, got `free` = {self.free!r}; leave them "

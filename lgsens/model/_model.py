@@ -9,11 +9,12 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from lgsens._validate import is_concrete
+from lgsens._validate import is_concrete, require
 from lgsens.liegroups import nearest_rotation
 from lgsens.linear import AbstractLinearSolver
 from lgsens.model._assemble import assemble, assemble_merged
 from lgsens.model._body import RigidBody
+from lgsens.model._checks import checked, far_from_rotation
 from lgsens.model._evaluate_by_kind import stacked
 from lgsens.model._forces import AbstractForce
 from lgsens.model._frames import Frame
@@ -133,8 +134,11 @@ class Model(eqx.Module):
                     )
 
     def system(self) -> MultibodySystem:
-        """The equations of motion, elements stacked by type."""
-        names = sorted(self.bodies)
+        """The equations of motion, elements stacked by type.
+
+        Raises `ValueError` for numbers that have come in since construction and that no scene has, if they are known.
+        """
+        names, self = sorted(self.bodies), self._checked()
         # An optimizer that updates a whole model leaves SO(3) by the square of its step.
         rotations = nearest_rotation(stacked([self.bodies[name].orientation for name in names]))
         bodies = {
@@ -149,6 +153,21 @@ class Model(eqx.Module):
         return dataclasses.replace(
             system, linear_solver=self.linear_solver, minimum_norm=self.redundant == "minimum_norm"
         )
+
+    def _checked(self) -> "Model":
+        """The same model with checked numbers."""
+        members = [
+            {name: checked(f"{what} {name!r}", member) for name, member in of.items()}
+            for what, of in (("Body", self.bodies), ("Joint", self.joints), ("Force", self.forces))
+        ]
+        for name, body in members[0].items():
+            require(
+                lambda orientation: not far_from_rotation(orientation),
+                f"Body {name!r}: `orientation` {body.orientation} is far from a rotation; leave it to the model "
+                "(`equinox.partition`), or take smaller steps.",
+                body.orientation,
+            )
+        return eqx.tree_at(lambda model: (model.bodies, model.joints, model.forces), self, tuple(members))
 
     @property
     def _groups(self) -> tuple[Group, ...] | None:

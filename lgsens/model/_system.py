@@ -11,9 +11,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens._validate import suggestion
-from lgsens.dynamics import AbstractRedundantSystem, AbstractSparseSystem, Tangents, least_norm
+from lgsens.dynamics import AbstractRedundantSystem, AbstractSparseSystem, Tangents, finite, least_norm
 from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew, turn
 from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, chosen
+from lgsens.model._checks import are_bodies
 from lgsens.model._constraints import AbstractRows
 from lgsens.model._frames import BODY_DIM, ROTATION, motion_at
 from lgsens.model._loads import AbstractDynamicLoad, AbstractLoad, generalized_force
@@ -85,9 +86,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     def twists(self, v: Float[Array, "*batch k"]) -> Float[Array, "*batch N 6"]:
         """[ẋ, Ω] of each body, or their rates of change, from v or v̇: zero where a body is not free."""
         group = self.group
-        if isinstance(group, Poses):
-            return group.rows(v)
-        return v.reshape(*v.shape[:-1], -1, BODY_DIM)
+        return group.rows(v) if isinstance(group, Poses) else v.reshape(*v.shape[:-1], -1, BODY_DIM)
 
     def angular_velocities(self, v):
         return self.twists(v)[..., ROTATION]
@@ -174,6 +173,9 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             return lam[..., self.multiplier_rows(joint)]
         return self.parts.multiplier(joint, self.multiplier_rows, q, v, vdot, lam, t)
 
+    def is_valid(self):
+        return finite(self) & are_bodies(self.mass, self.inertia, self.pose.orientation)
+
     def reference(self):
         return self.pose, self.velocity
 
@@ -183,8 +185,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         for stack in (*self.constraints, *self.loads):
             extents += [jnp.abs(arm).max(axis=0) for arm in stack.elements.fixed("point")]
         length = jnp.max(jnp.stack(extents))
-        body = jnp.ones(BODY_DIM, length.dtype)
-        scale = body.at[: ROTATION.start].set(jnp.where(length > 0, length, 1.0))
+        scale = jnp.ones(BODY_DIM, length.dtype).at[: ROTATION.start].set(jnp.where(length > 0, length, 1.0))
         if not isinstance(self.group, Poses):
             return jnp.tile(scale, len(self.body_names))
         every = scale[np.concatenate([np.asarray(own, int) for own in self.free])]
@@ -250,9 +251,8 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
 
     @_traced_once
     def residual(self, q, v, vdot, lam, t):
-        q, twist = self._placed(q), self.twists(v)
+        q, twist, acceleration = self._placed(q), self.twists(v), self.twists(vdot)
         spin = twist[:, ROTATION]
-        acceleration = self.twists(vdot)
         turned = jax.vmap(turn)
         force = self.mass[:, None] * acceleration[:, : ROTATION.start]
         moment = turned(self.inertia, acceleration[:, ROTATION])

@@ -11,6 +11,7 @@ from jax.core import Tracer
 from lgsens.dynamics import RESULTS, full_jacobian, initial_state
 from lgsens.integrate import singular_steps
 from lgsens.linear import Matrix, SparseMatrix
+from lgsens.model import MultibodySystem, invalid_numbers
 
 # Whether a failure inside `jit` calls back. JAX keys its caches on it: both are traced.
 _by_callback = jax.make_user_context(False)
@@ -70,6 +71,8 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
     match code:
         case RESULTS.assembly_failed:
             more = worst
+        case RESULTS.invalid_numbers if "numbers" in details:
+            more = f"Found: {'; '.join(details['numbers'])}."
         case RESULTS.newton_failed:
             asked = f" (tolerance {details['tolerance']:.3g})" if "tolerance" in details else ""
             more = (
@@ -101,7 +104,12 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
 
 
 def _exception(result: int, details: dict[str, Any], names: tuple[str, ...], note: str) -> Exception:
-    bad_input = (RESULTS.assembly_failed, RESULTS.redundant_constraints, RESULTS.position_failed)
+    bad_input = (
+        RESULTS.assembly_failed,
+        RESULTS.redundant_constraints,
+        RESULTS.position_failed,
+        RESULTS.invalid_numbers,
+    )
     kind = ValueError if result in bad_input else SimulationError
     note = note if result == RESULTS.redundant_constraints else ""
     return kind(f"{note} {_describe(result, details, names)}".strip())
@@ -176,6 +184,13 @@ def raise_if_failed(found: Any) -> Any:
         initial = initial_state(system, t[0])
         jacobian = full_jacobian(system, initial.state.q, t[0])
         details = {"violation": np.asarray(initial.violation), "jacobian": np.asarray(jacobian)}
+    elif code == RESULTS.invalid_numbers:
+        known = invalid_numbers(system) if isinstance(system, MultibodySystem) else []
+        details = (
+            {"numbers": known or [f"t0 = {float(t[0]) + 0.0:.6g} s, t1 = {float(t[-1]):.6g} s"]}
+            if system is not None
+            else {}
+        )
     elif code in (RESULTS.newton_failed, RESULTS.integration_failed, RESULTS.singular_configuration):
         details = _of_steps(code, t, stats)
     raise _exception(code, details, () if system is None else system.constraint_names, "")

@@ -177,6 +177,7 @@ def outcome(scheme: AbstractScheme, begun: Begin, stats: Stats, turns, t, laid: 
         stopped = ~laid.reached & (result == RESULTS.successful)
         result = jnp.where(stopped, RESULTS.steps_exhausted, result).astype(jnp.int32)
         time = jnp.where(stopped, t[-1], time)
+    result = jnp.where(t[-1] > t[0], result, RESULTS.invalid_numbers).astype(jnp.int32)
     details = {
         "violation": begun.violation,
         "jacobian": begun.jacobian,

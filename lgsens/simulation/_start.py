@@ -16,6 +16,7 @@ from lgsens.dynamics import (
     State,
     constraint_jacobian,
     equilibrium as _equilibrium,
+    finite,
     full_jacobian,
     initial_state as _initial,
 )
@@ -105,8 +106,9 @@ def begin(
     """The state at t0: `state0` as it is, or the consistent one of the reference configuration, `initial` if known."""
     if state0 is not None:
         jacobian, start = constraint_jacobian(system, state0.q, t0), Start(scheme.resumed(system, state0, t0))
-        none = jnp.zeros((), jnp.int32)
-        return Begin(start, jnp.zeros_like(state0.v), state0.v, none, system.constraint(state0.q, t0), jacobian)
+        valid = system.is_valid() & finite(state0)
+        result = jnp.where(valid, RESULTS.successful, RESULTS.invalid_numbers).astype(jnp.int32)
+        return Begin(start, jnp.zeros_like(state0.v), state0.v, result, system.constraint(state0.q, t0), jacobian)
     initial = _initial(system, t0) if initial is None else initial
     usable = initial.result == RESULTS.successful
     start = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), scheme.start(system, initial, t0))

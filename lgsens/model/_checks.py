@@ -1,0 +1,108 @@
+"""Numbers that come in after construction: leaves that an optimizer or `tree_at` replaced, and traced values.
+
+Where a system is assembled the same rules hold as in constructors. Known numbers are looked at there, and the message
+names element and field; traced ones are looked at by the program (`MultibodySystem.is_valid`), whose result says so.
+
+A body of positive mass density has J = ∫ ρ (|x|² I − x xᵀ) dV, so E = ½ tr(J) I − J = ∫ ρ x xᵀ dV is positive
+semidefinite: that is the triangle inequality of its principal moments, and J has no negative ones then. E is where its
+seven principal minors are not negative.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from lgsens._validate import as_float, is_concrete, leaf_name
+
+
+def checked(what: str, element: Any) -> Any:
+    """A body, joint or force with strongly typed float arrays as numbers.
+
+    Raises `ValueError`, with `what` ("Body 'top'") and the field, for one that is no number or known not to be finite,
+    and for numbers that its constructor would refuse.
+    """
+
+    def number(path, leaf):
+        field = f"{what}: `{leaf_name(path, type(element).__name__)}`"
+        array = as_float(leaf, None, field)
+        if is_concrete(array) and not np.isfinite(array).all():
+            raise ValueError(f"{field} must be finite, got {np.asarray(leaf)}; bound what an optimizer may change.")
+        return array
+
+    element = jax.tree_util.tree_map_with_path(number, element)
+    try:
+        _check_again(element)
+    except ValueError as error:
+        raise ValueError(f"{what}: {error}") from error
+    return element
+
+
+def _check_again(module: eqx.Module) -> None:
+    """The checks of the constructors of a module and of those in it."""
+    for kind in type(module).__mro__:
+        if "__check_init__" in vars(kind):
+            vars(kind)["__check_init__"](module)
+    for part in vars(module).values():
+        if isinstance(part, eqx.Module):
+            _check_again(part)
+
+
+def far_from_rotation(orientation, error: float = 0.1) -> Any:
+    """Whether RᵀR is not the unit matrix but for an error (0.1 is what `nearest_rotation` mends), or R is a reflection.
+
+    Of NumPy's arrays by NumPy: inside `jit` JAX would trace it.
+    """
+    xp: Any = np if isinstance(orientation, np.ndarray) else jnp
+    x, y, z = (orientation[..., i] for i in range(3))
+    dot = lambda a, b: xp.sum(a * b, axis=-1)
+    errors = [abs(dot(a, a) - 1.0) for a in (x, y, z)] + [abs(dot(a, b)) for a, b in ((x, y), (y, z), (z, x))]
+    handed = dot(xp.cross(x, y), z)
+    return ~((xp.max(xp.stack(errors), axis=0) <= error) & (handed > 0.0))  # NaN is far
+
+
+def is_inertia(inertia: Float[Array, "*n 3 3"]) -> Bool[Array, "*n"]:
+    """Whether E of the formulas above is positive semidefinite, to a few thousand round-offs; zero is."""
+    diagonal = jnp.moveaxis(jnp.diagonal(inertia, axis1=-2, axis2=-1), -1, 0)
+    size = jnp.maximum(jnp.max(jnp.abs(inertia), axis=(-1, -2)), jnp.finfo(inertia.dtype).tiny)
+    a, b, c = (jnp.sum(diagonal, axis=0)[None] / 2.0 - diagonal) / size[None]
+    d, e, f = (inertia[..., i, j] / size for i, j in ((1, 2), (0, 2), (0, 1)))
+    determinant = a * (b * c - d * d) - b * e * e - c * f * f - 2.0 * d * e * f
+    minors = jnp.stack([a, b, c, b * c - d * d, a * c - e * e, a * b - f * f, determinant])
+    return jnp.min(minors, axis=0) >= -4096 * jnp.finfo(inertia.dtype).eps
+
+
+def are_bodies(mass: Float[Array, " n"], inertia: Float[Array, "n 3 3"], orientation: Float[Array, "n 3 3"]):
+    """Whether bodies have such numbers; without derivative."""
+    mass, inertia, orientation = lax.stop_gradient((mass, inertia, orientation))
+    tilted = far_from_rotation(orientation, float(jnp.finfo(orientation.dtype).eps ** 0.5))
+    return jnp.all((mass > 0.0) & is_inertia(inertia) & ~tilted)
+
+
+def invalid_numbers(system: Any) -> list[str]:
+    """What `are_bodies` and finiteness find wrong in a `MultibodySystem`, by the names of its elements."""
+    found = []
+    for i, name in enumerate(system.body_names):
+        own = slice(i, i + 1)
+        parts = {
+            "mass": system.mass[own],
+            "inertia": system.inertia[own],
+            "pose": tuple(leaf[own] for leaf in system.pose),
+        }
+        wrong = [part for part, numbers in parts.items() if not _finite(numbers)]
+        if not wrong and not are_bodies(system.mass[own], system.inertia[own], system.pose.orientation[own]):
+            wrong = [f"mass {float(system.mass[i]):.6g} kg, inertia or orientation"]
+        found += [f"body {name!r}: {part}" for part in wrong]
+    for stack in (*system.constraints, *system.loads):
+        for path, leaf in jax.tree_util.tree_leaves_with_path(stack.elements):
+            bad = sorted({owner for owner, row in zip(stack.owners, np.asarray(leaf)) if not np.all(np.isfinite(row))})
+            found += [f"{owner!r}: {leaf_name(path, type(stack.elements).__name__)}" for owner in bad]
+    return found
+
+
+def _finite(numbers: Any) -> bool:
+    return all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(numbers))

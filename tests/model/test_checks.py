@@ -1,0 +1,115 @@
+"""Numbers that come in after construction: found where the system is assembled, and by the program inside jit."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import says
+
+import lgsens as lg
+from lgsens.model._checks import far_from_rotation, is_inertia
+
+NAN = jnp.asarray(jnp.nan)
+
+
+def scene():
+    at = jnp.array([0.0, 0.0, -1.0])
+    body = lg.RigidBody(2.0, (0.3, 0.2, 0.4), position=at, angular_velocity=(0.0, 1.0, 0.0))
+    hinge = lg.RevoluteJoint(None, "bob", at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+    spring = lg.SpringDamper(None, "bob", at_a=(1.0, 0.0, 0.0), at_b=at, stiffness=10.0)
+    rod = lg.DistanceJoint(None, "foot", at_a=(2.0, 0.0, 0.0), at_b=(3.0, 0.0, 0.0), length=1.0)
+    foot = lg.RigidBody(1.0, None, position=(3.0, 0.0, 0.0), free="x y")
+    gravity = lg.Gravity((0.0, 0.0, -9.81))
+    return lg.Model({"bob": body, "foot": foot}, {"hinge": hinge, "rod": rod}, {"spring": spring, "gravity": gravity})
+
+
+def bob(model):
+    return model.bodies["bob"]
+
+
+BAD = {
+    "NaN position": (
+        lambda m: bob(m).position,
+        jnp.array([jnp.nan, 0.0, 0.0]),
+        "Body 'bob': `position`.*finite",
+        "bob",
+    ),
+    "negative mass": (
+        lambda m: bob(m).mass,
+        jnp.asarray(-0.5),
+        "Body 'bob'.*`mass` must be positive, got -0.5",
+        "-0.5",
+    ),
+    "a Python float": (lambda m: bob(m).mass, -0.5, "Body 'bob'.*`mass` must be positive, got -0.5", "-0.5"),
+    "infinite mass": (lambda m: bob(m).mass, jnp.asarray(jnp.inf), "Body 'bob': `mass` must be finite", "bob"),
+    "inertia": (lambda m: bob(m).inertia, jnp.array([1.0, 1.0, 3.0]), "Body 'bob'.*not the inertia of a body", "bob"),
+    "scaled": (lambda m: bob(m).orientation, 1.5 * jnp.eye(3), "Body 'bob': `orientation`.*far from a rotation", "bob"),
+    "reflected": (lambda m: bob(m).orientation, -jnp.eye(3), "Body 'bob': `orientation`.*far from a rotation", "bob"),
+    "NaN axis": (lambda m: m.joints["hinge"].axis, jnp.full(3, NAN), "Joint 'hinge': `axis` must be finite", "hinge"),
+    "length": (lambda m: m.joints["rod"].length, jnp.asarray(-1.0), "Joint 'rod'.*`length` must be positive", None),
+    "NaN stiffness": (lambda m: m.forces["spring"].stiffness, NAN, "Force 'spring': `stiffness`.*finite", "spring"),
+    "a word": (lambda m: bob(m).mass, "heavy", "Body 'bob': `mass` must be a number", None),
+}
+
+
+def run(model):
+    return lg.simulate(model, t1=0.1, num_steps=2)
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_known_numbers_are_named(name):
+    where, value, message, _ = BAD[name]
+    with pytest.raises(ValueError, match=f"(?s){message}"):
+        run(eqx.tree_at(where, scene(), value))
+
+
+def test_traced_numbers_end_a_run():
+    """Values are NaN inside jit, the result says so, and what comes out names the element."""
+    numbers, rest = eqx.partition(scene(), eqx.is_inexact_array)
+    program = jax.jit(lambda numbers: run(eqx.combine(numbers, rest)))
+    assert lg.raise_if_failed(program(numbers)).result == lg.RESULTS.successful
+    for name, (where, value, _, found) in BAD.items():
+        if found is None:
+            continue
+        bad = eqx.tree_at(where, numbers, jnp.asarray(value))
+        trajectory = program(bad)
+        assert trajectory.result == lg.RESULTS.invalid_numbers, name
+        assert np.all(np.isnan(trajectory.states.v))
+        with pytest.raises(ValueError, match=f"(?s)not finite, or one that no body has.*Found:.*{found}"):
+            lg.raise_if_failed(trajectory)
+
+
+def test_times_in_the_wrong_order():
+    program = jax.jit(lambda t1: lg.simulate(scene(), t1=t1, num_steps=2))
+    trajectory = program(-1.0)
+    assert trajectory.result == lg.RESULTS.invalid_numbers
+    with pytest.raises(ValueError, match=says("`t1` is not later than `t0`", "Found: t0 = 0 s, t1 = -1 s")):
+        lg.raise_if_failed(trajectory)
+
+
+def test_equilibrium_and_derivatives_of_bad_numbers():
+    state = jax.jit(lambda mass: lg.equilibrium(eqx.tree_at(lambda m: bob(m).mass, scene(), mass)))(-1.0)
+    assert np.all(np.isnan(state.v))
+    build = lambda mass: eqx.tree_at(lambda m: bob(m).mass, scene(), mass)
+    criterion = lg.Criterion(terminal=lambda s, p: s.body("bob").position[0])
+    with pytest.raises(ValueError, match="one that no body has"):
+        lg.differentiate(criterion, build, jnp.asarray(-1.0), t1=0.1, num_steps=2)
+
+
+def test_an_optimizer_may_leave_the_rotations_a_little():
+    turned = eqx.tree_at(lambda m: bob(m).orientation, scene(), jnp.eye(3) + 0.02)
+    assert run(turned).result == lg.RESULTS.successful
+
+
+def test_inertias_are_those_of_bodies():
+    """By the eigenvalues, for random matrices, some of which no body has."""
+    rng = np.random.default_rng(0)
+    turn = np.linalg.qr(rng.normal(size=(200, 3, 3)))[0]
+    moments = rng.uniform(-0.2, 1.0, size=(200, 3))
+    inertia = np.einsum("nij,nj,nkj->nik", turn, moments, turn)
+    expected = (2 * moments.max(axis=1) <= moments.sum(axis=1)) & (moments.min(axis=1) >= 0.0)
+    assert 20 < expected.sum() < 180
+    np.testing.assert_array_equal(is_inertia(jnp.asarray(inertia)), expected)
+    assert is_inertia(jnp.zeros((1, 3, 3)))[0]
+    assert not far_from_rotation(turn[0] * np.linalg.det(turn[0])) and far_from_rotation(np.full((3, 3), np.nan))
