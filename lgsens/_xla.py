@@ -21,6 +21,7 @@ those that it starts.
 import os
 import warnings
 from pathlib import Path
+from typing import Any
 
 import jax
 from jax.experimental.compilation_cache import compilation_cache as jax_cache
@@ -73,7 +74,8 @@ def compilation_cache(folder: str | os.PathLike | None = None) -> Path:
     take less than half a second are not kept, nor those with a callback to Python (`failures_by_callback`,
     `jax.debug.print`). Raises `ValueError` for a folder that cannot be written.
     """
-    given = folder if folder is not None else jax.config.jax_compilation_cache_dir
+    config: Any = jax.config  # its settings are declared at run time
+    given = folder if folder is not None else config.jax_compilation_cache_dir
     home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
     found = home / "lgsens" if given is None else Path(given).expanduser()
     try:
@@ -81,8 +83,8 @@ def compilation_cache(folder: str | os.PathLike | None = None) -> Path:
         (found / ".writable").touch()
     except OSError as error:
         raise ValueError(f"`folder` {str(found)!r} cannot be written ({error}); name another one.") from error
-    if str(found) != jax.config.jax_compilation_cache_dir:
-        jax.config.update("jax_compilation_cache_dir", str(found))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    if str(found) != config.jax_compilation_cache_dir:
+        config.update("jax_compilation_cache_dir", str(found))
+        config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
         jax_cache.reset_cache()  # else a process that has compiled before keeps to the folder it had
     return found
