@@ -1,13 +1,17 @@
 """The console script: what it prints, what it writes, and what it says about bad input."""
 
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from importlib import resources
 
 import pytest
 
+from lgsens.cli import _optimize
 from lgsens.cli._main import main
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -213,3 +217,44 @@ def test_the_module_is_the_script():
     for arguments, text in ((["--version"], r"^lgsens \S+\n$"), (["--help"], r"optimize[\s\S]*top")):
         done = subprocess.run([sys.executable, "-m", "lgsens", *arguments], capture_output=True, text=True, check=True)
         assert re.search(text, done.stdout)
+
+
+QUICK = ["--t1", "0.2", "--dt", "0.01", "--steps", "40", "--quiet"]
+
+
+@pytest.mark.slow  # four processes that compile
+def test_an_interrupted_command_writes_what_there_is_and_goes_on(tmp_path):
+    """Ctrl-C during the search: the best so far, and with --resume the optimum of a run that nobody stopped."""
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "programs")}
+
+    def command(out, *more):
+        arguments = [sys.executable, "-m", "lgsens", "optimize", "quarter-car", "--out", str(tmp_path / out), *QUICK]
+        return subprocess.Popen([*arguments, *more], stderr=subprocess.PIPE, text=True, env=environment)
+
+    optimum = lambda out: json.loads((tmp_path / out / "result.json").read_text(encoding="utf-8"))
+    assert command("whole").wait() in (0, 1)
+    stopped = command("stopped")
+    while not (tmp_path / "stopped" / "search.npz").exists():
+        assert stopped.poll() is None
+        time.sleep(0.01)
+    stopped.send_signal(signal.SIGINT)
+    said = stopped.communicate()[1]
+    assert stopped.returncode == 130 and "--resume goes on" in said and "Traceback" not in said
+    assert optimum("stopped")["history"]["ended"] == "interrupted"
+    assert {"response.png", "search.npz"} <= {path.name for path in (tmp_path / "stopped").iterdir()}
+    assert command("stopped", "--resume").wait() in (0, 1)
+    assert not (tmp_path / "stopped" / "search.npz").exists()
+    for name in ("design", "objective", "history"):
+        assert optimum("stopped")[name] == optimum("whole")[name]
+
+
+def test_an_interrupt_before_there_is_anything(tmp_path, capsys, monkeypatch):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_optimize, "_optimize", stop)
+    status, _, said = run(capsys, "optimize", "quarter-car", *QUICK, "--out", tmp_path / "new")
+    assert status == 130 and "interrupted before anything was found" in said
+    assert not (tmp_path / "new").exists()
+    status, _, said = run(capsys, "optimize", "quarter-car", "--out", tmp_path / "new", "--resume")
+    assert status == 2 and "search.npz', from which to go on, is not there" in said

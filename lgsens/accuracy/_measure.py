@@ -33,6 +33,8 @@ def work_precision(
     reference: Reference | None = None,
     rounds: int = _LEAST_ROUNDS,
     progress: bool = True,
+    known: Table | None = None,
+    keep: Callable[[Table], Any] | None = None,
 ) -> Table:
     """What each setting costs on a scene, and what it loses of a criterion Ψ and of its gradient.
 
@@ -53,6 +55,8 @@ def work_precision(
         rounds: times are medians of so many calls, at least 5, after one that warms up; settings take turns, eight at
             a time.
         progress: show a bar, where tqdm is installed.
+        known: a table of the same scene that was not finished: its rows and its reference are not measured again.
+        keep: called with the table so far after each eight settings.
 
     One program is compiled for every setting, and half a dozen for the reference. A setting that fails is a row that
     says why. Raises `ValueError` for bad arguments, and where no reference is found.
@@ -63,6 +67,7 @@ def work_precision(
     if as_count(rounds, "rounds") < _LEAST_ROUNDS:
         raise ValueError(f"`rounds` must be at least {_LEAST_ROUNDS}, got {rounds}: a median of fewer says little.")
     study = Study.of(fn, build, p, scale, t0, t1)
+    reference = known.reference if reference is None and known is not None else reference
     if reference is not None and np.shape(reference.gradient) != study.scale.shape:
         raise ValueError(
             f"`reference`: its gradient must have shape {study.scale.shape}, got {np.shape(reference.gradient)}."
@@ -75,11 +80,19 @@ def work_precision(
 
         if reference is None:
             reference = converge(study, min(setting.num_steps for setting in settings), done)
-        rows = []
-        for i in range(0, len(settings), tuned.PROGRAMS_TOGETHER):
-            rows += _measured(study, settings[i : i + tuned.PROGRAMS_TOGETHER], reference, rounds, bar.update)
+        rows = {} if known is None else {(row.setting.label, row.setting.num_steps): row for row in known}
+        of = lambda setting: (setting.label, setting.num_steps)
+        found = lambda: Table(tuple(rows[of(each)] for each in settings if of(each) in rows), reference, rounds)
+        rows = {of(each): dataclasses.replace(rows[of(each)], setting=each) for each in settings if of(each) in rows}
+        bar.update(len(rows))
+        missing = [setting for setting in settings if of(setting) not in rows]
+        for i in range(0, len(missing), tuned.PROGRAMS_TOGETHER):
+            some = missing[i : i + tuned.PROGRAMS_TOGETHER]
+            rows |= {of(row.setting): row for row in _measured(study, some, reference, rounds, bar.update)}
             jax.clear_caches()
-    return Table(tuple(rows), reference, rounds)
+            if keep is not None:
+                keep(found())
+    return found()
 
 
 def _measured(

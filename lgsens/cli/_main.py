@@ -13,7 +13,7 @@ import jax
 
 from lgsens._xla import compilation_cache
 from lgsens.cli import _curves, _optimize, _paper, _top, _tradeoff
-from lgsens.cli._report import version
+from lgsens.cli._report import UNFINISHED, interrupted, version
 from lgsens.examples import PARAMETERS
 from lgsens.simulation import SimulationError
 
@@ -34,6 +34,12 @@ class _Parser(argparse.ArgumentParser):
         """`--out` and `--overwrite`."""
         self.option("--out", Path(default), f"new folder for {written}", type=Path, metavar="DIR")
         self.add_argument("--overwrite", action="store_true", help="write into --out even if it exists")
+
+    def resume(self) -> None:
+        """`--resume`."""
+        self.add_argument(
+            "--resume", action="store_true", help="go on where the same command was interrupted, in --out"
+        )
 
     def hardpoints(self) -> None:
         """`--hardpoints`."""
@@ -73,6 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     optimize.set_defaults(run=_optimize.run)
     optimize.add_argument("problem", choices=["quarter-car"], help="what to optimize")
     optimize.out("out/quarter-car", "result.json and the figures")
+    optimize.resume()
     optimize.hardpoints()
     optimize.option(
         "--parameters",
@@ -141,6 +148,7 @@ def _parser() -> argparse.ArgumentParser:
         "`parameters` and `t1`, and if it likes `settings`, `scale` and `t0`, as in lgsens.accuracy.work_precision",
     )
     tradeoff.out("out/tradeoff", "tradeoff.json and tradeoff.png")
+    tradeoff.resume()
     targets = "relative errors for which to recommend a setting (default: 1e-2 1e-4 1e-6 1e-8)"
     tradeoff.add_argument("--targets", type=_positive, nargs="+", default=list(_tradeoff.TARGETS), help=targets)
     tradeoff.option("--rounds", 5, "timed calls, at least 5", type=_count)
@@ -162,6 +170,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         compilation_cache()
     try:
         return arguments.run(arguments)
+    except KeyboardInterrupt:
+        kept = any((vars(arguments).get("out", Path()) / name).is_file() for name in UNFINISHED)
+        return interrupted(arguments.command, "what was found is kept" if kept else None)
     except (ValueError, OSError, ImportError, SimulationError) as error:
         print(f"lgsens {arguments.command}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return BAD_INPUT

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from lgsens import plotting
-from lgsens.cli._report import document, output_folder, table, write_json, written
+from lgsens.cli._report import document, interrupted, output_folder, table, unfinished, write_json, written
 from lgsens.dynamics import RESULTS
 from lgsens.examples import CurveBounds, QuarterCar, Response, SuspensionCurves, SuspensionDesign
 from lgsens.optimize import GradientCheck, OptimizationResult, check_gradient, minimize
@@ -39,19 +39,24 @@ class Outcome(NamedTuple):
 
 def run(arguments: argparse.Namespace) -> int:
     """Optimize, write `result.json` and the figures, print a table; 1 if no design met the constraints."""
-    with output_folder(arguments.out, arguments.overwrite) as out:
+    with output_folder(arguments.out, arguments.overwrite or arguments.resume) as out:
         plotting.figure()  # asks for matplotlib now, not after minutes
-        outcome = _optimize(_design(arguments), arguments.steps, progress=not arguments.quiet)
+        search = unfinished(out, "search.npz", arguments.resume)
+        outcome = _optimize(_design(arguments), arguments.steps, search, progress=not arguments.quiet)
         if "hardpoints" in outcome.design.start:
             travel = np.linspace(-arguments.travel, arguments.travel, CURVE_POINTS)
             curves = {label: car.curves(travel) for label, car in outcome.cars.items()}
             outcome = outcome._replace(curves=curves)
-        settings = {name: value for name, value in vars(arguments).items() if name not in ("run", "command")}
+        settings = {name: value for name, value in vars(arguments).items() if name not in ("run", "command", "resume")}
         found = document(outcome, settings, TOLERANCE)
         write_json(found, out / "result.json", indent=2, default=str)
         _figures(outcome, out)
+        if outcome.result.reason != "interrupted":
+            search.unlink()
         if not arguments.quiet:
             print(table(found), written(out), sep="\n")
+    if outcome.result.reason == "interrupted":
+        return interrupted("optimize", f"this is the best of {len(outcome.result.history.objective)} designs so far")
     return 0 if outcome.result.feasible else 1
 
 
@@ -70,7 +75,7 @@ def _design(arguments: argparse.Namespace) -> SuspensionDesign:
     return SuspensionDesign.load(path, keep=keep, **settings)
 
 
-def _optimize(design: SuspensionDesign, steps: int, progress: bool) -> Outcome:
+def _optimize(design: SuspensionDesign, steps: int, search: Path, progress: bool) -> Outcome:
     """The start design, the search, the best design, and the gradients at both against differences."""
 
     def criteria(x):
@@ -100,7 +105,7 @@ def _optimize(design: SuspensionDesign, steps: int, progress: bool) -> Outcome:
     before, check_before = respond(design.start)
     lower, upper = design.bounds
     bounds = {"lower": lower, "upper": upper, "log_scale": design.log_scale, "constraint_tolerance": TOLERANCE}
-    result = minimize(design, design.start, **bounds, num_steps=steps, progress=progress)
+    result = minimize(design, design.start, **bounds, num_steps=steps, progress=progress, checkpoint=search)
     after, check_after = respond(result.x)
     seconds = {
         "compilation": compiled - started + result.compile_seconds,

@@ -3,6 +3,8 @@
 import contextlib
 import json
 import platform
+import sys
+import tempfile
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
@@ -16,6 +18,7 @@ CONSTRAINTS = (
     ("minimum spring length", "spring_length", "minimum_spring_length", "m"),
     ("maximum spring length", "spring_length", "maximum_spring_length", "m"),
 )
+UNFINISHED = "search.npz", "tradeoff.json"  # from which --resume goes on
 UNITS = {"stiffness": "N/m", "damping": "N s/m", "hardpoints": "m"}
 
 
@@ -26,7 +29,9 @@ def output_folder(out: Path, overwrite: bool) -> Iterator[Path]:
         remedy = "choose another --out DIR, or give --overwrite to replace the files in it"
         raise ValueError(f"output directory {str(out)!r} exists already: {remedy}")
     created = not out.exists()
-    out.mkdir(parents=True, exist_ok=True)  # asks for the right to write now, too
+    out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=out):  # asks for the right to write now, and not after minutes
+        pass
     try:
         yield out
     except BaseException:
@@ -34,6 +39,23 @@ def output_folder(out: Path, overwrite: bool) -> Iterator[Path]:
             with contextlib.suppress(OSError):
                 out.rmdir()
         raise
+
+
+def unfinished(out: Path, name: str, resume: bool) -> Path:
+    """The file in a folder from which an interrupted command goes on. Raises `ValueError` where that has none."""
+    path = out / name
+    if resume and not path.is_file():
+        raise ValueError(f"--resume: {str(path)!r}, from which to go on, is not there; leave --resume out")
+    if not resume:
+        path.unlink(missing_ok=True)
+    return path
+
+
+def interrupted(command: str, found: str | None) -> int:
+    """Say so, what there is and how to go on; the exit status that shells have for it."""
+    more = f": {found}; the same command with --resume goes on" if found else " before anything was found"
+    print(f"\nlgsens {command}: interrupted{more}", file=sys.stderr)
+    return 130
 
 
 def version(distribution: str = "lgsens") -> str:

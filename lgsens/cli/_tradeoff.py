@@ -1,6 +1,7 @@
 """`lgsens tradeoff`: what settings cost and lose on a scene, and which to take for how many digits."""
 
 import argparse
+import json
 import os
 import runpy
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 
 from lgsens import plotting
 from lgsens.accuracy import Recommendation, Setting, Table, grid, ladder, plot, recommend, work_precision
-from lgsens.cli._report import output_folder, versions, write_json
+from lgsens.cli._report import interrupted, output_folder, unfinished, versions, write_json
 from lgsens.criteria import Criterion
 from lgsens.examples import PROBLEMS, QuarterCar
 from lgsens.integrate import GeneralizedAlpha, IndexReducedODE
@@ -129,15 +130,26 @@ def run(arguments: argparse.Namespace) -> int:
     """Measure a scene, print the table and the recommendations, write `tradeoff.json` and `tradeoff.png`."""
     plotting.figure()  # asks for matplotlib now, not after minutes
     scene = SCENES[arguments.scene]() if arguments.scene in SCENES else from_file(Path(arguments.scene))
-    with output_folder(arguments.out, arguments.overwrite) as out:
-        what = {"t0": scene.t0, "t1": scene.t1, "scale": scene.scale}
+    with output_folder(arguments.out, arguments.overwrite or arguments.resume) as out:
+        path = unfinished(out, "tradeoff.json", arguments.resume)
+        known = Table.from_document(json.loads(path.read_text(encoding="utf-8"))) if arguments.resume else None
+        kept = [] if known is None else [known]
+        what = {"t0": scene.t0, "t1": scene.t1, "scale": scene.scale, "known": known, "keep": kept.append}
         how = {"rounds": arguments.rounds, "progress": not arguments.quiet}
-        table = work_precision(scene.criterion, scene.build, scene.parameters, scene.settings, **what, **how)
+        stopped = False
+        try:
+            table = work_precision(scene.criterion, scene.build, scene.parameters, scene.settings, **what, **how)
+        except KeyboardInterrupt:
+            if not kept:
+                raise
+            table, stopped = kept[-1], True
         found = [recommend(table, target, by=arguments.by) for target in arguments.targets]
         write_json(document(scene, table, found), out / "tradeoff.json", indent=1, ensure_ascii=False)
         plotting.save(plot(table, arguments.targets, by=arguments.by, title=scene.title), out / "tradeoff.png")
     if not arguments.quiet:
         print(table, *found, f"written to {out}: tradeoff.json, tradeoff.png", sep="\n\n")
+    if stopped:
+        return interrupted("tradeoff", f"these are {len(table)} of {len(scene.settings)} settings")
     return 0 if all(found) else 1
 
 

@@ -51,7 +51,8 @@ class OptimizationResult(NamedTuple):
         constraints: g(x), in the shape `fun` gave them.
         feasible: whether max g(x) ≤ constraint_tolerance.
         reason: why the search ended: "converged"; "steps", all of them were taken; "stalled", no step along −∇L
-            lowers L any more: round-off, or a gradient that is wrong; "infeasible", the violation has a minimum here.
+            lowers L any more: round-off, or a gradient that is wrong; "infeasible", the violation has a minimum here;
+            "interrupted" from the keyboard (Ctrl-C) after the first evaluation: nothing that was found is lost.
         step: the evaluation at which x was found.
         history: the course of the minimization.
         multipliers: μ at the end, shaped as the constraints: the gain in f/|f(x₀)| per unit by which a constraint is
@@ -136,23 +137,32 @@ def minimize(
             f"The objective, a constraint or the gradient is not finite at `x0` (objective {float(first.objective)}); "
             "start from a design that can be simulated."
         )
-    rows, store = [], None
+    rows, store, interrupted = [], None, False
     if checkpoint is not None:
         store = Checkpoint(checkpoint, box, x, (tolerance, constraint_tolerance))
         carry, rows = store.load(carry, first)
+    found = carry, rows  # one value: an interrupt sees both or neither
     with progress_bar(num_steps, "step", progress, initial=len(rows)) as bar:
-        while len(rows) < num_steps and not int(carry.search.ended):
-            carry, row = step(carry) if rows else (after, first)
-            rows.append(jax.tree.map(np.asarray, row))
+        try:
+            while len(found[1]) < num_steps and not int(found[0].search.ended):
+                carry, row = step(found[0]) if found[1] else (after, first)
+                found = carry, [*found[1], jax.tree.map(np.asarray, row)]
+                if store is not None:
+                    store.save(*found)
+                f, worst = float(row.objective), float(row.worst)
+                bar.set_postfix({"objective": f"{f:.4g}", "worst constraint": f"{worst:+.1e}"}, refresh=False)
+                bar.update()
+                if callback is not None:
+                    callback(len(found[1]) - 1, f, worst)
+        except KeyboardInterrupt:
+            if not found[1]:
+                raise
+            interrupted = True
             if store is not None:
-                store.save(carry, rows)
-            f, worst = float(row.objective), float(row.worst)
-            bar.set_postfix({"objective": f"{f:.4g}", "worst constraint": f"{worst:+.1e}"}, refresh=False)
-            bar.update()
-            if callback is not None:
-                callback(len(rows) - 1, f, worst)
+                store.save(*found)
     finished = time.perf_counter()
 
+    carry, rows = found
     x, *numbers = columns(rows).values()
     history = History(*numbers, design=jax.tree.map(np.asarray, jax.vmap(unravel)(jnp.asarray(x))))
     search = carry.search
@@ -162,7 +172,7 @@ def minimize(
         objective=float(history.objective[step]),
         constraints=np.asarray(best.constraints).reshape(shape),
         feasible=bool(best.worst <= constraint_tolerance),
-        reason=REASONS[int(search.ended)],
+        reason="interrupted" if interrupted else REASONS[int(search.ended)],
         step=step,
         history=history,
         multipliers=np.asarray(search.multipliers).reshape(shape),

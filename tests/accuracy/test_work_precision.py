@@ -118,6 +118,20 @@ def test_text_and_json(table, tmp_path):
     assert lg.plotting.save(figure, tmp_path / "a.png").stat().st_size > 10_000  # an empty canvas has some 3 kB
 
 
+def test_an_unfinished_table_is_gone_on_with(table):
+    """What it has is not measured again, also where it comes from a file and knows its settings by name."""
+    read = accuracy.Table.from_document(table.document())
+    known = accuracy.Table(read.rows[:4], read.reference, read.rounds)
+    kept = []
+    settings = {"t1": T1, "progress": False, "keep": kept.append}
+    found = work_precision(CRITERION, build, P, SETTINGS, known=known, **settings)  # the last one cannot be compiled
+    assert len(kept) == 1 and len(kept[0]) == len(SETTINGS) == len(found)
+    assert [row.setting for row in found] == list(SETTINGS)
+    assert [row.seconds for row in found.rows[:3]] == [row.seconds for row in table.rows[:3]]
+    assert found.reference is known.reference and found.rows[-1].failure
+    assert len(work_precision(CRITERION, build, P, SETTINGS[:2], known=known, **settings)) == 2 and len(kept) == 1
+
+
 @pytest.mark.slow  # nine programs
 def test_a_function_of_the_trajectory_is_enough():
     """The reference is what the function gives in the limit, its own rule included, and says how well it knows it."""
