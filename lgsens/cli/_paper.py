@@ -52,7 +52,7 @@ class Curves(NamedTuple):
     methods: Mapping[str, Method] = METHODS
 
 
-class Study(NamedTuple):
+class PaperStudy(NamedTuple):
     """One figure: panels whose numbers come from the same calls of `differentiate`.
 
     `problem` is the scene, `free` names the parameters by which is differentiated; the others keep their values.
@@ -77,7 +77,7 @@ class Study(NamedTuple):
         return self.problem.build({**self.problem.parameters, **p})
 
 
-def _top() -> Study:
+def _top() -> PaperStudy:
     problem = PROBLEMS["spinning_top_brulls.l_1.0_reproduces_published_number"]
     panel = Curves(
         label="dPsi/dalpha_0",
@@ -90,10 +90,10 @@ def _top() -> Study:
         source="lgsens.examples.spinning_top: Runge-Kutta and generalized-alpha, both converged",
     )
     scene, num_steps = "spinning top, l = 1 m, alpha_0 = pi/4", (100, 200, 500, 1000, 2000)
-    return Study(scene, problem, ("alpha0",), problem.criteria, {"fig2": panel}, num_steps, coarse=(100, 200))
+    return PaperStudy(scene, problem, ("alpha0",), problem.criteria, {"fig2": panel}, num_steps, coarse=(100, 200))
 
 
-def _quarter_car() -> Study:
+def _quarter_car() -> PaperStudy:
     problem = PROBLEMS["five_link_quarter_car"]
     at_instant = PROBLEMS["five_link_quarter_car.at_0.3s"]
     source = "tests/data/five_link_quarter_car.json: Bulirsch-Stoer of order 14 on quaternions in 80 bits"
@@ -119,7 +119,7 @@ def _quarter_car() -> Study:
         source=source,
         methods=METHODS | TREATMENTS,
     )
-    return Study(
+    return PaperStudy(
         scene="five-link quarter-car",
         problem=problem,
         free=("k", "c"),
@@ -132,7 +132,7 @@ def _quarter_car() -> Study:
     )
 
 
-STUDIES: dict[str, Callable[[], Study]] = {"fig2": _top, "fig4": _quarter_car}
+STUDIES: dict[str, Callable[[], PaperStudy]] = {"fig2": _top, "fig4": _quarter_car}
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -168,7 +168,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def measure(study: Study, coarse: bool, progress: bool) -> dict[str, dict[str, Any]]:
+def measure(study: PaperStudy, coarse: bool, progress: bool) -> dict[str, dict[str, Any]]:
     """Everything about the panels of a study by their names, as for JSON."""
     found = {}
     for key, panel in study.panels.items():
@@ -210,13 +210,13 @@ def measure(study: Study, coarse: bool, progress: bool) -> dict[str, dict[str, A
     return found
 
 
-def _gradient(study: Study, panel: Curves, method: Method, num_steps: int) -> float:
+def _gradient(study: PaperStudy, panel: Curves, method: Method, num_steps: int) -> float:
     settings = {"t1": panel.t1, "num_steps": num_steps, "integrator": GeneralizedAlpha(RHO_INF), "method": method}
     found = differentiate(study.criteria, study.build, study.parameters, **settings)
     return float(found.gradient[panel.criterion][panel.parameter])
 
 
-def _timed(study: Study, panel: Curves, method: Method, num_steps: int, reference: float) -> dict[str, float]:
+def _timed(study: PaperStudy, panel: Curves, method: Method, num_steps: int, reference: float) -> dict[str, float]:
     """The entries of a curve at one step size."""
     seconds, value = [], 0.0
     for _ in range(1 + CALLS):

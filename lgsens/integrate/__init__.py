@@ -7,7 +7,7 @@ from lgsens.integrate._generalized_alpha import GeneralizedAlpha as GeneralizedA
 from lgsens.integrate._grid import (
     AbstractGrid as AbstractGrid,
     EqualGrid as EqualGrid,
-    Link as Link,
+    StepLink as StepLink,
     UnevenGrid as UnevenGrid,
     earlier as earlier,
     later as later,

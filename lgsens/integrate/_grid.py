@@ -33,7 +33,7 @@ class Resizes(Protocol):
     def resized(self, vdot, a, ratio) -> Float[Array, " k"]: ...
 
 
-class Link(eqx.Module):
+class StepLink(eqx.Module):
     """How a step follows the one before, linearized; stacked, all of them. Between equal steps nothing changes."""
 
     scheme: Resizes = eqx.field(static=True)
@@ -84,9 +84,9 @@ class AbstractGrid(eqx.Module):
     def node(self, place: Any) -> Node:
         """The step at a place."""
 
-    def link(self, scheme: Resizes, place: Any, previous: State) -> Link:
+    def link(self, scheme: Resizes, place: Any, previous: State) -> StepLink:
         """How the step at a place follows the state before it."""
-        return Link(scheme)
+        return StepLink(scheme)
 
     def begun(self, scheme: Resizes, place: Any, state: State) -> State:
         """What the step at a place begins with."""
@@ -172,7 +172,7 @@ class UnevenGrid(AbstractGrid):
 
     def link(self, scheme, place, previous):
         by_ratio = jax.jacfwd(lambda ratio: scheme.resized(previous.vdot, previous.a, ratio))(place.ratio)
-        return Link(scheme, place.ratio, by_ratio, self.empty(place))
+        return StepLink(scheme, place.ratio, by_ratio, self.empty(place))
 
     def begun(self, scheme, place, state):
         return dataclasses.replace(state, a=scheme.resized(state.vdot, state.a, place.ratio))

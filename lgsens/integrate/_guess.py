@@ -57,7 +57,7 @@ class Pace(NamedTuple):
         return renewed_where(jnp.asarray(made), by_mass, jnp.full_like(of_matrix, jnp.nan))
 
 
-class Past(NamedTuple):
+class PastValues(NamedTuple):
     """What the next value of a vector x is predicted from.
 
     The parabola through the last three values predicts p_n = 3 x_{n−1} − 3 x_{n−2} + x_{n−3} and misses x_n by e_n. In
@@ -77,7 +77,7 @@ class Past(NamedTuple):
     missed: Float[Array, " n"]  # e_{n−1}
 
     @classmethod
-    def none(cls, x) -> "Past":
+    def none(cls, x) -> "PastValues":
         return cls(x, x, x, jnp.zeros_like(x))
 
     def predicted(self, x, weights: Weights = None) -> Float[Array, " n"]:
@@ -88,8 +88,8 @@ class Past(NamedTuple):
         theta = jnp.where(jnp.isfinite(theta), jnp.clip(theta, -1.0, 1.0), 0.0)
         return self._parabola(x, weights) + theta * missed
 
-    def after(self, x, weights: Weights = None) -> "Past":
-        return Past(x, self.last, self._parabola(x, weights), x - self.expected)
+    def after(self, x, weights: Weights = None) -> "PastValues":
+        return PastValues(x, self.last, self._parabola(x, weights), x - self.expected)
 
     def _parabola(self, x, weights: Weights):
         if weights is None:
@@ -101,8 +101,8 @@ class Guess(NamedTuple):
     """Where the next step's iteration starts, from past accelerations and multipliers, and how fast modified Newton
     contracted in this one."""
 
-    a: Past
-    lam: Past
+    a: PastValues
+    lam: PastValues
     contraction: Float[Array, ""]
     pace: Pace
 
@@ -110,7 +110,7 @@ class Guess(NamedTuple):
     def first(cls, state0: State, *, uneven: bool) -> "Guess":
         dtype = state0.a.dtype
         pace = Pace(jnp.zeros(3, dtype) if uneven else None)
-        return cls(Past.none(state0.a), Past.none(state0.lam), jnp.ones((), dtype), pace)
+        return cls(PastValues.none(state0.a), PastValues.none(state0.lam), jnp.ones((), dtype), pace)
 
     def weights(self, h, delta: float) -> tuple[Weights, Weights]:
         """Those of a and of λ in a step of size h."""

@@ -114,7 +114,7 @@ class Index3Step(AbstractStep):
         return jnp.abs(du)
 
 
-class Loads(NamedTuple):
+class Index3Loads(NamedTuple):
     """What the equations of a step depend on the parameters by."""
 
     residual: Float[Array, " k"]
@@ -179,7 +179,7 @@ class Index3LinearizedStep(AbstractLinearizedStep):
             + (h * (1.0 - scheme.gamma)) * mu_v
             + (alpha_m / (1.0 - alpha_f)) * mu_vdot,
         )
-        return previous, Loads(-mu_a, -mu_phi, mu_x, mu_v), Variation(mu_w, mu_v, mu_vdot, mu_lam, mu_a)
+        return previous, Index3Loads(-mu_a, -mu_phi, mu_x, mu_v), Variation(mu_w, mu_v, mu_vdot, mu_lam, mu_a)
 
 
 class Index3(AbstractEquations):
@@ -207,7 +207,7 @@ class Index3(AbstractEquations):
             violation = system.constraint(state.q, node.t)
             if self.softness is not None:
                 violation = violation * (lax.stop_gradient(h) / h) ** 2
-            return Loads(
+            return Index3Loads(
                 system.residual(state.q, state.v, state.vdot, state.lam, node.t),
                 violation,
                 increment(scheme, previous, state.a, h),

@@ -42,7 +42,7 @@ from lgsens.integrate._linearized import AbstractLinearizedStep, Variation
 from lgsens.integrate._singular import margin_by_mass
 
 
-class Loads(NamedTuple):
+class LevelLoads(NamedTuple):
     """What the equations of a step depend on the parameters by."""
 
     residual: Float[Array, " k"]
@@ -122,7 +122,7 @@ class LevelLinearizedStep(AbstractLinearizedStep):
             + (h * (1.0 - scheme.gamma)) * mu_v
             + (alpha_m / (1.0 - alpha_f)) * mu_vdot,
         )
-        of_loads = Loads(-mu_a, -phi, -rate, mu_y, mu_x, mu_v)
+        of_loads = LevelLoads(-mu_a, -phi, -rate, mu_y, mu_x, mu_v)
         return previous, of_loads, Variation(mu_w, mu_v, mu_vdot, mu_lam, mu_a)
 
 
@@ -165,7 +165,7 @@ class Levels(AbstractEquations):
         def function(system, node):
             h = node.h
             y = lax.stop_gradient(self.inverse_mass @ self._correction(system, before, nu, node.begin))
-            return Loads(
+            return LevelLoads(
                 residual=system.residual(state.q, state.v, state.vdot, lam, node.t),
                 violation=system.constraint(state.q, node.t),
                 rate=counts.rate(system, state.q, state.v, node.t),

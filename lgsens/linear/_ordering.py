@@ -55,7 +55,7 @@ class Graph(NamedTuple):
     whole: frozenset[int]
 
 
-class Part(NamedTuple):
+class GraphPart(NamedTuple):
     """Bodies that are gone, and what is known of the joints between them that are gone."""
 
     hanging: int = 0  # how many of them have a body that remains
@@ -68,9 +68,9 @@ class Part(NamedTuple):
         return not self.hanging or (early and not self.loops and self.whole and self.hanging + self.grounded == 1)
 
 
-def _together(parts: Sequence[Part], *, closed: bool = False) -> Part:
+def _together(parts: Sequence[GraphPart], *, closed: bool = False) -> GraphPart:
     """Parts connected to each other; `closed`: some of them twice."""
-    return Part(
+    return GraphPart(
         sum(part.hanging for part in parts),
         sum(part.grounded for part in parts),
         closed or any(part.loops for part in parts),
@@ -81,7 +81,7 @@ def _together(parts: Sequence[Part], *, closed: bool = False) -> Part:
 class Cluster(NamedTuple):
     nodes: tuple[int, ...]
     boundary: frozenset[int]
-    part: Part
+    part: GraphPart
     absorbed: frozenset[int]  # the parts that it connects
 
 
@@ -90,7 +90,7 @@ class _Gone:
 
     def __init__(self, graph: Graph, *, early: bool):
         self.graph, self.early = graph, early
-        self.parts: dict[int, Part] = {}
+        self.parts: dict[int, GraphPart] = {}
         self._home: dict[int, int] = {}  # of each body its part, and of a part the one that it became
         self._waiting: dict[int, list[int]] = defaultdict(list)  # the parts that hang on a body
 
@@ -101,11 +101,11 @@ class _Gone:
 
     def start(self, node: int, near: set[int]) -> Cluster | None:
         """A node on its own, if it may go."""
-        empty = Cluster((), frozenset(near), Part(), frozenset())
+        empty = Cluster((), frozenset(near), GraphPart(), frozenset())
         if node in self.graph.joints:
             return self.with_joint(empty._replace(boundary=frozenset(near | {node})), node, near)
         hanging = [part for part in map(self._part_of, self._waiting[node]) if part is not None]
-        own = Part(-len(hanging), whole=node in self.graph.whole)
+        own = GraphPart(-len(hanging), whole=node in self.graph.whole)
         parts = [own, *(self.parts[part] for part in set(hanging))]
         found = _together(parts, closed=len(set(hanging)) < len(hanging))
         return Cluster((node,), frozenset(near), found, frozenset(hanging))
@@ -119,7 +119,7 @@ class _Gone:
             places.append(-1 if body in cluster.nodes or part in cluster.absorbed else part)
         inside = [place for place in places if place is not None]
         others = {place for place in inside if place >= 0}
-        own = Part(len(places) - len(inside), int(joint.grounded), whole=joint.relative)
+        own = GraphPart(len(places) - len(inside), int(joint.grounded), whole=joint.relative)
         parts = [cluster.part, own, *(self.parts[place] for place in others)]
         found = _together(parts, closed=len(set(inside)) < len(inside))
         nodes = (*cluster.nodes, node)

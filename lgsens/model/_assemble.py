@@ -10,12 +10,12 @@ import numpy as np
 
 from lgsens.liegroups import Pose
 from lgsens.model._body import RigidBody
-from lgsens.model._evaluate_by_kind import Row, evaluated, joined, stacked
+from lgsens.model._evaluate_by_kind import StackRow, evaluated, joined, stacked
 from lgsens.model._forces import AbstractForce
 from lgsens.model._frames import Frame, ground_frame
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._loads import carriers, num_states
-from lgsens.model._merge import Group, Place, Places, merged
+from lgsens.model._merge import Group, Placement, Placements, merged
 from lgsens.model._merged_parts import Parts
 from lgsens.model._on_merged_bodies import carried
 from lgsens.model._stack import Placed, stack
@@ -30,7 +30,7 @@ def assemble(
     forces: Mapping[str, AbstractForce],
 ) -> MultibodySystem:
     """The equations of bodies whose orientations are rotations; `frames`: theirs, by their names."""
-    places: Places = {None: Place(None, None)} | {name: Place(name, None) for name in bodies}
+    places: Placements = {None: Placement(None, None)} | {name: Placement(name, None) for name in bodies}
     return _assemble(bodies, bodies, frames, places, joints, forces)
 
 
@@ -66,7 +66,7 @@ def _assemble(
     moving: Mapping[str, RigidBody],
     bodies: Mapping[str, RigidBody],
     frames: Frame,
-    places: Places,
+    places: Placements,
     joints: Mapping[str, AbstractJoint],
     forces: Mapping[str, AbstractForce],
     parts: Parts[MultibodySystem] | None = None,
@@ -79,7 +79,7 @@ def _assemble(
     names = tuple(sorted(moving))
     ordered = [moving[name] for name in names]
     number = {None: None} | {name: i for i, name in enumerate(names)}
-    frame = {None: None} | {name: Row(frames, i) for i, name in enumerate(sorted(bodies))}
+    frame = {None: None} | {name: StackRow(frames, i) for i, name in enumerate(sorted(bodies))}
 
     between = [(name, joint) for name, joint in sorted(joints.items()) if places[joint.a].body != places[joint.b].body]
     members = [
@@ -94,7 +94,7 @@ def _assemble(
         single = [jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), of) for of in row.of]
         for i, (of, kept) in enumerate(zip(row.of, violable_rows(name, joint, single, own))):
             if any(kept):
-                constraints.append(Placed(Row(of, row.index), a, b, name, kept, i))
+                constraints.append(Placed(StackRow(of, row.index), a, b, name, kept, i))
     loads, free = [], [body.coordinates for body in ordered]
     for name, force in sorted(forces.items()):
         for load, *ends in force.loads(moving if force.on_merged else bodies):

@@ -15,7 +15,7 @@ import numpy as np
 from lgsens._validate import is_concrete
 
 
-class Row(NamedTuple):
+class StackRow(NamedTuple):
     """One entry along the leading axis of a pytree of arrays."""
 
     of: Any
@@ -33,7 +33,7 @@ def stacked(leaves: Sequence[Any]):
 
 def joined(members: Sequence[Any]) -> Any:
     """Pytrees, or rows of such, along a new leading axis: of one structure but for names, of which the first counts."""
-    if not isinstance(members[0], Row):
+    if not isinstance(members[0], StackRow):
         leaves = zip(*map(jax.tree.leaves, members))
         return jax.tree.unflatten(jax.tree.structure(members[0]), map(stacked, leaves))
     sources = list({id(row.of): row.of for row in members}.values())
@@ -50,7 +50,7 @@ def joined(members: Sequence[Any]) -> Any:
     return jax.tree.map(chosen, *sources)
 
 
-def evaluated(function: Callable, members: Sequence[tuple[Any, ...]], kinds: Sequence[Hashable]) -> list[Row]:
+def evaluated(function: Callable, members: Sequence[tuple[Any, ...]], kinds: Sequence[Hashable]) -> list[StackRow]:
     """`function(*member)` of each member, in their order; those of one kind at once.
 
     A member is a tuple of pytrees, rows of such and None; those of one kind have one structure but for names.
@@ -58,12 +58,12 @@ def evaluated(function: Callable, members: Sequence[tuple[Any, ...]], kinds: Seq
     places: dict[Hashable, list[int]] = {}
     for i, kind in enumerate(kinds):
         places.setdefault(kind, []).append(i)
-    found: dict[int, Row] = {}
+    found: dict[int, StackRow] = {}
     for own in places.values():
         columns = zip(*(members[i] for i in own))
         arguments = [None if column[0] is None else joined(column) for column in columns]
         results = _each(function, arguments)
-        found |= {i: Row(results, place) for place, i in enumerate(own)}
+        found |= {i: StackRow(results, place) for place, i in enumerate(own)}
     return [found[i] for i in range(len(members))]
 
 

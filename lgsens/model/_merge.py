@@ -45,14 +45,14 @@ class Group(NamedTuple):
     turns: bool
 
 
-class Place(NamedTuple):
+class Placement(NamedTuple):
     """The body that moves another one, None for the ground, and the frame of the other in its own; None: its own."""
 
     body: str | None
     offset: Frame | None
 
 
-Places = Mapping[str | None, Place]
+Placements = Mapping[str | None, Placement]
 
 
 def groups(bodies: Mapping[str, RigidBody], joints: Mapping[str, AbstractJoint]) -> tuple[Group, ...]:
@@ -121,22 +121,22 @@ def _group(parts: Sequence[str], bodies: Mapping[str, RigidBody], *, on_ground: 
     return Group(name, parts, free, lead, turns)
 
 
-def merged(bodies: Mapping[str, RigidBody], found: Sequence[Group]) -> tuple[dict[str, RigidBody], Places]:
-    """The bodies that move, by name; and the `Place` of every body."""
+def merged(bodies: Mapping[str, RigidBody], found: Sequence[Group]) -> tuple[dict[str, RigidBody], Placements]:
+    """The bodies that move, by name; and the `Placement` of every body."""
     moving: dict[str, RigidBody] = {}
-    where: dict[str | None, Place] = {None: Place(None, None)}
+    where: dict[str | None, Placement] = {None: Placement(None, None)}
     for group in found:
         frame = None
         if group.name is not None:
             body = moving[group.name] = _as_one(group, bodies)
-            where[group.name] = Place(group.name, None)
+            where[group.name] = Placement(group.name, None)
             if len(group.parts) > 1:
                 frame = body.frame
         else:
             frame = ground_frame(bodies[group.parts[0]].mass.dtype)
         if frame is not None:
             for part in group.parts:
-                where[part] = Place(group.name, _seen_from(frame, bodies[part].frame))
+                where[part] = Placement(group.name, _seen_from(frame, bodies[part].frame))
     return moving, where
 
 

@@ -21,7 +21,7 @@ from lgsens.model._constraints import (
     AbstractRows,
     AbstractVelocityConstraint,
 )
-from lgsens.model._evaluate_by_kind import Row, joined
+from lgsens.model._evaluate_by_kind import StackRow, joined
 from lgsens.model._frames import ALL, BODY_A, BODY_B, BODY_DIM, ROTATION, TURNING_A, TURNING_B, Frame, ground_frame
 from lgsens.model._loads import (
     AbstractClosedFormLoad,
@@ -38,11 +38,11 @@ Element = TypeVar("Element", AbstractRows, AbstractLoad | AbstractDynamicLoad)
 
 
 class Placed(NamedTuple, Generic[Element]):
-    """An element, or a `Row` of such, the numbers of its two bodies (None: the ground), the name of its owner; of a
+    """An element or a `StackRow`, the numbers of its two bodies (None: the ground), the name of its owner; of a
     constraint, which of its equations are kept, and which one of its joint's it is; of a load, what carries its states.
     """
 
-    element: Element | Row
+    element: Element | StackRow
     a: int | None
     b: int | None
     owner: str
@@ -169,7 +169,7 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
     """Group elements by type and ground side, keeping their order within a group; rows of velocity level are last."""
     groups: dict[Any, list[Placed[Element]]] = {}
     for item in placed:
-        of, axes = (item.element.of, 1) if isinstance(item.element, Row) else (item.element, 0)
+        of, axes = (item.element.of, 1) if isinstance(item.element, StackRow) else (item.element, 0)
         leaves, structure = jax.tree.flatten(of)
         key = (structure, tuple((leaf.shape[axes:], leaf.dtype) for leaf in leaves), item.a is None, item.b is None)
         groups.setdefault(key, []).append(item)

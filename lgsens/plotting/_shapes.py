@@ -27,7 +27,7 @@ class Outline(NamedTuple):
     filled: bool = False
 
 
-class Strut(NamedTuple):
+class StrutShape(NamedTuple):
     """What stretches between two bodies: a coil ("spring"), a tube ("damper") or a rod ("link"); points [m]."""
 
     role: str
@@ -38,7 +38,7 @@ class Strut(NamedTuple):
     radius: float  # of the coil [m]
 
 
-class Mark(NamedTuple):
+class CentreMark(NamedTuple):
     """A point of a body [m]: a joint, or a tyre's centre."""
 
     body: int
@@ -48,7 +48,7 @@ class Mark(NamedTuple):
 class Tyre(NamedTuple):
     """A wheel's centre, and the road under it."""
 
-    centre: Mark
+    centre: CentreMark
     road: Any  # t ↦ height [m]
 
 
@@ -56,8 +56,8 @@ class Shapes(NamedTuple):
     """The shapes of a scene; bodies are numbered as in its system, −1 is the ground."""
 
     outlines: list[Outline]
-    struts: list[Strut]
-    joints: list[Mark]
+    struts: list[StrutShape]
+    joints: list[CentreMark]
     tyres: list[Tyre]
 
 
@@ -70,7 +70,7 @@ def shapes(system: MultibodySystem) -> Shapes:
         for i, owner in enumerate(stack.owners):
             element: Any = jax.tree.map(lambda leaf, i=i: leaf[i], stack.elements)
             ends = {"a": GROUND if stack.a is None else stack.a[i], "b": GROUND if stack.b is None else stack.b[i]}
-            marks = [Mark(ends[end], np.asarray(at)) for end in ends for at in element.fixed("point", end)]
+            marks = [CentreMark(ends[end], np.asarray(at)) for end in ends for at in element.fixed("point", end)]
             role = element.drawn if marks else None
             if not marks and element.fixed("axis", "b"):
                 axes.setdefault(owner, []).append((*ends.values(), np.asarray(element.fixed("axis", "b")[0])))
@@ -82,14 +82,14 @@ def shapes(system: MultibodySystem) -> Shapes:
             if role in ("link", "spring", "damper") and len(marks) > 1:
                 (a, at_a), (b, at_b) = marks[0], marks[-1]
                 line = _world(position, orientation, b, at_b) - _world(position, orientation, a, at_a)
-                struts.append(Strut(role, a, at_a, b, at_b, _RADIUS * float(np.linalg.norm(line))))
+                struts.append(StrutShape(role, a, at_a, b, at_b, _RADIUS * float(np.linalg.norm(line))))
             if role == "wheel":
                 tyres.append(Tyre(marks[-1], element.road))
     if system.centre is not None:  # a body with a pivot has it in place of a joint
         for body, (own, centre) in enumerate(zip(held, np.asarray(system.centre))):
             if centre.any():
                 own.append(np.zeros(3))
-                joints.append(Mark(body, np.zeros(3)))
+                joints.append(CentreMark(body, np.zeros(3)))
     wheels = {tyre.centre.body: tyre.centre.at for tyre in tyres}
     outlines = []
     for body, points in enumerate(held):
@@ -106,12 +106,12 @@ def _world(position, orientation, body: int, at) -> np.ndarray:
     return at if body == GROUND else position[body] + at @ orientation[body].T
 
 
-def placed(shape: Outline | Mark, position, orientation) -> np.ndarray:
+def placed(shape: Outline | CentreMark, position, orientation) -> np.ndarray:
     """The points of an outline, or a mark, in the inertial frame, at the given poses of all bodies."""
     return _world(position, orientation, shape.body, shape.points if isinstance(shape, Outline) else shape.at)
 
 
-def stretched(strut: Strut, position, orientation) -> list[np.ndarray]:
+def stretched(strut: StrutShape, position, orientation) -> list[np.ndarray]:
     """The lines that a strut is drawn with, in the inertial frame: a coil; a rod and its tube; a line."""
     a = _world(position, orientation, strut.a, strut.at_a)
     b = _world(position, orientation, strut.b, strut.at_b)

@@ -34,8 +34,8 @@ from jaxtyping import Array, Float
 
 from lgsens.dynamics import AbstractSystem, State, mass_scale
 from lgsens.integrate import GeneralizedAlpha, earlier, with_last
-from lgsens.sensitivity._criterion_terms import Functional, Point, gradients, near
-from lgsens.sensitivity._linear_alpha import Motion, Node, advance, start
+from lgsens.sensitivity._criterion_terms import Functional, PathPoint, gradients, near
+from lgsens.sensitivity._linear_alpha import LinearMotion, LinearNode, advance, start
 from lgsens.sensitivity._linearization import Parameters
 
 
@@ -73,20 +73,20 @@ def along(function, system: AbstractSystem, state: State):
 
 
 def continuous_adjoint_sweep(
-    scheme: GeneralizedAlpha, path: Point, parameters: Parameters, functional: Functional, p, terms
+    scheme: GeneralizedAlpha, path: PathPoint, parameters: Parameters, functional: Functional, p, terms
 ) -> Cotangents:
     """The cotangents of c criteria, by the second-order adjoint equations; `terms` is one of `_criterion_terms`."""
     system, sizes = parameters.system, jnp.diff(path.t)
     group, mass = system.group, system.mass_matrix()
 
-    def node(point: Point) -> tuple[Node, Any]:
+    def node(point: PathPoint) -> tuple[LinearNode, Any]:
         state, t = point.state, point.t
         k_t, c_t, jacobian = system.tangents(state.q, state.v, state.vdot, state.lam, t)
         motion = (group.to_ambient(state.q, state.v), state.vdot, jnp.ones_like(t))
         damping = lambda q, v, t: system.tangents(q, v, state.vdot, state.lam, t).damping
         _, c_t_rate = jax.jvp(damping, (state.q, state.v, t), motion)
         bracket, of = group.ad(state.v), terms(functional, p, system, point)
-        return Node(
+        return LinearNode(
             damping=(c_t + mass @ bracket).T,
             stiffness=(k_t + c_t @ bracket - c_t_rate).T,
             constraint_jacobian=jacobian,
@@ -102,7 +102,7 @@ def continuous_adjoint_sweep(
     begin = start(scheme, mass, nodes, s, final.mu, -final.mu_rate, sizes[-1])
 
     # in the time that runs backwards a step of size h[n] leads to the n-th point, and follows one of size h[n + 1]
-    def step(motion: Motion, inputs):
+    def step(motion: LinearMotion, inputs):
         point, h, ratio = inputs
         motion = advance(scheme, mass, motion, node(point)[0], h, ratio)
         return motion, (motion.x, motion.lam)
@@ -120,7 +120,9 @@ def continuous_adjoint_sweep(
     return Cotangents(-pi.T, -rho.T, *bar)
 
 
-def _final_conditions(functional: Functional, p, system: AbstractSystem, point: Point, node: Node, of) -> Final:
+def _final_conditions(
+    functional: Functional, p, system: AbstractSystem, point: PathPoint, node: LinearNode, of
+) -> Final:
     state, mass = point.state, system.mass_matrix()
     terminal = near(functional.final, p, system, state, point.t)
     g = gradients(lambda state: terminal(p, system, state, point.t), system.group, state)
@@ -133,7 +135,7 @@ def _final_conditions(functional: Functional, p, system: AbstractSystem, point: 
     return Final(mu, mu_rate, eta1, -minus_eta2)
 
 
-def final_cotangents(functional: Functional, p, system: AbstractSystem, point: Point, eta1, eta2):
+def final_cotangents(functional: Functional, p, system: AbstractSystem, point: PathPoint, eta1, eta2):
     """G_p + η₁ᵀ(Φ̇)_p + η₂ᵀΦ_p, on the numbers of the system and on p."""
     state = point.state
     terminal = near(functional.final, p, system, state, point.t)
@@ -146,7 +148,7 @@ def final_cotangents(functional: Functional, p, system: AbstractSystem, point: P
     return jax.vmap(pull_back)((jnp.eye(values[0].shape[0], dtype=state.v.dtype), eta1.T, eta2.T))
 
 
-def accumulated(bar, functional: Functional, p, system: AbstractSystem, path: Point, mu, nu):
+def accumulated(bar, functional: Functional, p, system: AbstractSystem, path: PathPoint, mu, nu):
     """bar + ∫ (F_p + μᵀr_p + νᵀΦ_p) dt for every criterion, by the trapezoidal rule, from μ and ν of all points."""
 
     def add(bar, inputs):

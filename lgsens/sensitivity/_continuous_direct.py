@@ -22,7 +22,7 @@ from jax import lax
 
 from lgsens.dynamics import State, consistent_velocity, full_jacobian, kkt_solve
 from lgsens.integrate import GeneralizedAlpha, Variation, earlier, later, with_first
-from lgsens.sensitivity._linear_alpha import Motion, Node, advance, started
+from lgsens.sensitivity._linear_alpha import LinearMotion, LinearNode, advance, started
 from lgsens.sensitivity._linearization import Parameters, node_tangent
 
 
@@ -34,14 +34,14 @@ def continuous_direct_sweep(
     group, mass = system.group, system.mass_matrix()
     places, d_places = jax.jvp(lambda grid: grid.places(), (grid,), (d.grid,))
 
-    def node(state: State, place, d_place) -> Node:
+    def node(state: State, place, d_place) -> LinearNode:
         t, d_t = grid.node(place).t, node_tangent(grid, d.grid, place, d_place).t
         k_t, c_t, jacobian = system.tangents(state.q, state.v, state.vdot, state.lam, t)
         bracket = group.ad(state.v)
         residual = lambda system, t: system.residual(state.q, state.v, state.vdot, state.lam, t)
         loads = lambda system, t: (residual(system, t), system.constraint(state.q, t))
         r_p, phi_p = jax.jvp(loads, (system, t), (d.system, d_t))[1]
-        return Node(
+        return LinearNode(
             damping=c_t + mass @ bracket,
             stiffness=k_t + c_t @ bracket + mass @ group.ad(state.vdot),
             constraint_jacobian=jacobian,
@@ -51,7 +51,7 @@ def continuous_direct_sweep(
 
     motion = _begin(scheme, system, jax.tree.map(lambda leaf: leaf[0], states), first, d, grid.t0, grid.first_size)
 
-    def sweep(previous: Motion, inputs):
+    def sweep(previous: LinearMotion, inputs):
         state, place, d_place, link = inputs
         h = grid.node(place).h
         current = advance(
@@ -66,14 +66,14 @@ def continuous_direct_sweep(
     return jax.vmap(partial(_variation, group))(states, motion)
 
 
-def _variation(group, state: State, motion: Motion) -> Variation:
+def _variation(group, state: State, motion: LinearMotion) -> Variation:
     bracket = group.ad(state.v)
     v = motion.rate + bracket @ motion.x
     vdot = motion.acceleration + bracket @ motion.rate + group.ad(state.vdot) @ motion.x
     return Variation(motion.x, v, vdot, motion.lam, vdot)
 
 
-def _begin(scheme: GeneralizedAlpha, system, state: State, first: Variation, d: Parameters, t0, h) -> Motion:
+def _begin(scheme: GeneralizedAlpha, system, state: State, first: Variation, d: Parameters, t0, h) -> LinearMotion:
     """w, ẇ, ẅ, λ' and the algorithmic acceleration of the linear scheme at t0."""
     ad, delta = system.group.ad, scheme.alpha_m - scheme.alpha_f
     bracket, of_vdot = ad(state.v), ad(state.vdot)
@@ -84,7 +84,7 @@ def _begin(scheme: GeneralizedAlpha, system, state: State, first: Variation, d: 
     # a' stands for v̇' = ẅ + ad(v) ẇ + ad(v̇) w at t0 + Δ h, and a_0 for v̇ there
     change = (delta * h) * (bracket @ acceleration + 2.0 * of_vdot @ rate) + ad(state.a - state.vdot) @ w
     a = first.a - bracket @ rate - of_vdot @ w - change
-    exact = Motion(*(column[:, None] for column in (w, rate, acceleration, first.lam, a)))
+    exact = LinearMotion(*(column[:, None] for column in (w, rate, acceleration, first.lam, a)))
     return started(scheme, system.mass_matrix(), full_jacobian(system, state.q, t0), exact, h)
 
 

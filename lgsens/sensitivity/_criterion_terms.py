@@ -50,7 +50,7 @@ class Functional(NamedTuple):
     final: Pointwise | OfState  # G
 
 
-class Point(NamedTuple):
+class PathPoint(NamedTuple):
     """One converged state, its time, and the further derivatives of v̇ and λ, where they are used."""
 
     state: State
@@ -107,7 +107,7 @@ def near(function: Pointwise | OfState, p, system: AbstractSystem, state: State,
     return fixed
 
 
-def plain_terms(functional: Functional, p, system: AbstractSystem, point: Point) -> Terms:
+def plain_terms(functional: Functional, p, system: AbstractSystem, point: PathPoint) -> Terms:
     """The terms of an F(q, v, t, p) that does not depend on v̇ and λ (any more)."""
     state, t, group = point.state, point.t, system.group
 
@@ -125,7 +125,7 @@ def plain_terms(functional: Functional, p, system: AbstractSystem, point: Point)
     )
 
 
-def derivative_terms(functional: Functional, p, system: AbstractSystem, point: Point) -> Terms:
+def derivative_terms(functional: Functional, p, system: AbstractSystem, point: PathPoint) -> Terms:
     """The terms of F(q, v, v̇, λ, t, p), with y, z, λ̇ and λ̈ of the point."""
     state, t, group = point.state, point.t, system.group
     bracket, bracket_rate = group.ad(state.v), group.ad(state.vdot)
@@ -183,10 +183,10 @@ def differentiated(scheme: GeneralizedAlpha, values: Float[Array, "n d"], h) -> 
     return jnp.concatenate([first[None], rest])
 
 
-def points(scheme: GeneralizedAlpha, states: State, t, h, *, derivatives: bool) -> Point:
+def points(scheme: GeneralizedAlpha, states: State, t, h, *, derivatives: bool) -> PathPoint:
     """All points of a trajectory, stacked."""
     if not derivatives:
         none = jnp.zeros((t.shape[0], 0), t.dtype)
-        return Point(states, t, (none, none), (none, none))
+        return PathPoint(states, t, (none, none), (none, none))
     y, lam_rate = differentiated(scheme, states.vdot, h), differentiated(scheme, states.lam, h)
-    return Point(states, t, (y, differentiated(scheme, y, h)), (lam_rate, differentiated(scheme, lam_rate, h)))
+    return PathPoint(states, t, (y, differentiated(scheme, y, h)), (lam_rate, differentiated(scheme, lam_rate, h)))

@@ -40,25 +40,25 @@ from lgsens.sensitivity._continuous_adjoint import (
     constrained_solve,
     final_cotangents,
 )
-from lgsens.sensitivity._criterion_terms import Functional, Point, gradients
+from lgsens.sensitivity._criterion_terms import Functional, PathPoint, gradients
 from lgsens.sensitivity._linearization import Parameters
 
 
-def first_order_adjoint_sweep(path: Point, parameters: Parameters, functional: Functional, p) -> Cotangents:
+def first_order_adjoint_sweep(path: PathPoint, parameters: Parameters, functional: Functional, p) -> Cotangents:
     """The cotangents of c criteria."""
     system, h = parameters.system, parameters.grid.h
     group, mass = system.group, system.mass_matrix()
     k = mass.shape[0]
     s = 2.0 * h / 3.0
 
-    def equations(point: Point):
+    def equations(point: PathPoint):
         """K_tᵀ, C_tᵀ, B, ad(v)ᵀ and the gradients of F as columns."""
         state = point.state
         k_t, c_t, jacobian = system.tangents(state.q, state.v, state.vdot, state.lam, point.t)
         f = gradients(lambda state: functional.rate(p, system, state, point.t), group, state)
         return k_t.T, c_t.T, jacobian, group.ad(state.v).T, jax.tree.map(jnp.transpose, f)
 
-    def advance(nearer, far, point: Point):
+    def advance(nearer, far, point: PathPoint):
         """η_q, η_v, μ, ν at a point from η at the two points after it."""
         k_tT, c_tT, jacobian, bracketT, f = equations(point)
         b_q, b_v = ((4.0 * n - f) / 3.0 for n, f in zip(nearer, far))
@@ -72,7 +72,7 @@ def first_order_adjoint_sweep(path: Point, parameters: Parameters, functional: F
     eta, mu, eta1, eta2 = _final_conditions(functional, p, system, at(-1), *equations(at(-1)))
     (near, far), (mu1, mu2), (nu1, nu2) = _start(mass, eta, equations(at(-2)), equations(at(-3)), h)
 
-    def step(carry, point: Point):
+    def step(carry, point: PathPoint):
         near, far = carry
         eta, mu, nu = advance(far, near, point)
         return (far, eta), (mu, nu)
@@ -87,7 +87,7 @@ def first_order_adjoint_sweep(path: Point, parameters: Parameters, functional: F
     return Cotangents(-eta_q.T, -eta_v.T, *bar)
 
 
-def _final_conditions(functional: Functional, p, system: AbstractSystem, point: Point, k_tT, c_tT, jacobian, _, f):
+def _final_conditions(functional: Functional, p, system: AbstractSystem, point: PathPoint, k_tT, c_tT, jacobian, _, f):
     """(η_q, η_v), μ, η₁ and η₂ at t_f."""
     state, t, group, mass = point.state, point.t, system.group, system.mass_matrix()
     g = jax.tree.map(jnp.transpose, gradients(lambda state: functional.final(p, system, state, t), group, state))

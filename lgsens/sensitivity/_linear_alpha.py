@@ -23,7 +23,7 @@ from lgsens.integrate import GeneralizedAlpha
 from lgsens.linear import Factors
 
 
-class Node(NamedTuple):
+class LinearNode(NamedTuple):
     """The equations at one time."""
 
     damping: Float[Array, "k k"]  # D
@@ -33,7 +33,7 @@ class Node(NamedTuple):
     level: Float[Array, "m c"]  # g
 
 
-class Motion(NamedTuple):
+class LinearMotion(NamedTuple):
     """The solution at one time: x, ẋ, ẍ, λ, and the algorithmic acceleration a."""
 
     x: Float[Array, "k c"]
@@ -43,7 +43,9 @@ class Motion(NamedTuple):
     a: Float[Array, "k c"]
 
 
-def start(scheme: GeneralizedAlpha, mass, nodes: tuple[Node, Node, Node, Node], s, x, rate, h) -> Motion:
+def start(
+    scheme: GeneralizedAlpha, mass, nodes: tuple[LinearNode, LinearNode, LinearNode, LinearNode], s, x, rate, h
+) -> LinearMotion:
     """The starting values that follow from x and ẋ at the first of four nodes, the others at distances s_i h from it.
 
     The second derivative of the constraint would give ẍ; it asks for B̈ and g̈. Here x is instead a polynomial of degree
@@ -78,10 +80,10 @@ def start(scheme: GeneralizedAlpha, mass, nodes: tuple[Node, Node, Node, Node], 
     left = first.load - mass @ acceleration - first.damping @ rate - first.stiffness @ x
     _, lam = kkt_solve(mass, first.constraint_jacobian, left, jnp.zeros_like(first.level))
     a = acceleration + (scheme.alpha_m - scheme.alpha_f) * jerk
-    return started(scheme, mass, first.constraint_jacobian, Motion(x, rate, acceleration, lam, a), h)
+    return started(scheme, mass, first.constraint_jacobian, LinearMotion(x, rate, acceleration, lam, a), h)
 
 
-def started(scheme: GeneralizedAlpha, mass, jacobian, exact: Motion, h) -> Motion:
+def started(scheme: GeneralizedAlpha, mass, jacobian, exact: LinearMotion, h) -> LinearMotion:
     """What the scheme starts from, given exact values and a = ẍ_0 + (α_m − α_f) h x⃛_0.
 
     ẋ_0 receives h² P c, c = (1/6 − β − Δ/2) x⃛_0, Δ = α_m − α_f: as in `simulate` for the nonlinear scheme; here T = I.
@@ -94,7 +96,7 @@ def started(scheme: GeneralizedAlpha, mass, jacobian, exact: Motion, h) -> Motio
     return exact._replace(rate=exact.rate + h * (missed - tangential))
 
 
-def advance(scheme: GeneralizedAlpha, mass, previous: Motion, node: Node, h, ratio) -> Motion:
+def advance(scheme: GeneralizedAlpha, mass, previous: LinearMotion, node: LinearNode, h, ratio) -> LinearMotion:
     """One step, `ratio` times as long as the one before: one factorization, one solve for all columns."""
     previous = previous._replace(a=scheme.resized(previous.acceleration, previous.a, ratio))
     x = previous.x + h * previous.rate + (h**2 * (0.5 - scheme.beta)) * previous.a
@@ -107,7 +109,7 @@ def advance(scheme: GeneralizedAlpha, mass, previous: Motion, node: Node, h, rat
         node.load - mass @ acceleration - node.damping @ rate - node.stiffness @ x,
         (node.level - jacobian @ x) / (scheme.beta * h**2),
     )
-    return Motion(
+    return LinearMotion(
         x=x + (scheme.beta * h**2) * u,
         rate=rate + (scheme.gamma * h) * u,
         acceleration=acceleration + scheme.inertia_factor * u,

@@ -22,8 +22,8 @@ from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate import (
     AbstractGrid,
     AbstractScheme,
-    Link,
     Node,
+    StepLink,
     Variation,
     earlier,
     later,
@@ -43,7 +43,7 @@ class Step(NamedTuple):
     """One converged step: where it is, how it follows the one before, what it begins with, and its end."""
 
     place: Any
-    link: Link
+    link: StepLink
     begun: State
     state: State
 

@@ -30,14 +30,14 @@ from lgsens.linear import tuned
 from lgsens.sensitivity._linearization import Parameters, Step, node_tangent, place_tangents, steps
 
 
-class Blocks(NamedTuple):
+class StepBlocks(NamedTuple):
     """How `num_steps` steps are divided: `length` in a block, `padding` in the last one."""
 
     length: int
     padding: int
 
     @classmethod
-    def of(cls, num_steps: int, numbers: int) -> "Blocks":
+    def of(cls, num_steps: int, numbers: int) -> "StepBlocks":
         """Blocks for factors of `numbers` numbers; without padding where a divisor is near."""
         longest = max(1, min(num_steps, tuned.BLOCK_STEPS, tuned.BLOCK_NUMBERS // numbers))
         divisors = [n for n in range((longest + 1) // 2, longest + 1) if num_steps % n == 0]
@@ -77,7 +77,7 @@ def direct_sweep(scheme: AbstractScheme, states: State, parameters: Parameters, 
     The steps after the last, which fill its block, are computed and dropped.
     """
     system, grid = parameters
-    shared, blocks = scheme.shared(system), Blocks.of(grid.num_steps, scheme.numbers(system))
+    shared, blocks = scheme.shared(system), StepBlocks.of(grid.num_steps, scheme.numbers(system))
 
     def prepare(step: Step, d_place):
         node = grid.node(step.place)
@@ -106,7 +106,7 @@ def direct_sweep(scheme: AbstractScheme, states: State, parameters: Parameters, 
 def adjoint_sweep(scheme: AbstractScheme, states: State, parameters: Parameters, c: Variation, c_p: Parameters):
     """Solve Lᵀ (μ, p̄) = (c, c_p) backwards in time; returns μ stacked (row 0: the cotangent of δ_0), and p̄."""
     system, grid = parameters
-    shared, blocks = scheme.shared(system), Blocks.of(grid.num_steps, scheme.numbers(system))
+    shared, blocks = scheme.shared(system), StepBlocks.of(grid.num_steps, scheme.numbers(system))
 
     def prepare(step: Step):
         return scheme.linearized(system, shared, grid.node(step.place), step.begun, step.state)

@@ -25,7 +25,7 @@ from lgsens.simulation import Saved, Trajectory, failures_by_callback
 AXIS = "designs"
 
 
-class Program(NamedTuple):
+class BatchProgram(NamedTuple):
     """A compiled batch.
 
     Attributes:
@@ -97,7 +97,7 @@ def trace(fn: Callable[[PyTree], PyTree], designs: PyTree) -> Traced:
 
 def compile_batch(
     traced: Traced, designs: PyTree, count: int, batch_size: int | None, devices: Sequence[Any]
-) -> Program:
+) -> BatchProgram:
     """A batch of `designs`, of which `count` are to be computed, in batches of nearly equal size.
 
     Without `batch_size` the largest batch is compiled first and, if it takes more memory than is free, once more for
@@ -133,7 +133,7 @@ def compile_batch(
         *values, ok = jax.device_get(found) if alone else multihost_utils.process_allgather(found, tiled=True)
         return [np.asarray(leaf) for leaf in values], np.asarray(ok)
 
-    return Program(run, size, memory(program), seconds)
+    return BatchProgram(run, size, memory(program), seconds)
 
 
 def even(count: int, largest: int, devices: int) -> int:

@@ -20,7 +20,7 @@ from lgsens.model import (
     load_tangents,
 )
 from lgsens.testing._differences import SAFETY
-from lgsens.testing._poses import DIM, Poses, displaced, same, slope, vanishes
+from lgsens.testing._poses import DIM, ScenePoses, displaced, same, slope, vanishes
 from lgsens.testing._report import Check, Report, worst
 from lgsens.testing._sensitivities import check_sensitivities
 
@@ -71,8 +71,8 @@ def check_force(
 
     Returns a `Report`; a row holds the worst of all poses. Raises `ValueError` for a Q of other than 12 entries.
     """
-    scene = Poses(seed, length)
-    (part,) = Poses(seed + 1, length).frames(1)
+    scene = ScenePoses(seed, length)
+    (part,) = ScenePoses(seed + 1, length).frames(1)
     states = jnp.asarray(np.random.default_rng(seed).uniform(0.5, 1.5, 64))
 
     def at_states(load: Any) -> AbstractLoad:

@@ -19,7 +19,7 @@ from lgsens.model import (
     constraint_jacobian,
     constraint_stiffness,
 )
-from lgsens.testing._poses import DIM, Poses, displaced, same, slope, vanishes
+from lgsens.testing._poses import DIM, ScenePoses, displaced, same, slope, vanishes
 from lgsens.testing._report import Check, Report, worst
 from lgsens.testing._sensitivities import check_sensitivities
 
@@ -56,7 +56,7 @@ def check_joint(
 
     Returns a `Report`; a row holds the worst of all poses. Raises `ValueError` for a Φ that has not `num_rows` entries.
     """
-    scene, time = Poses(seed, length), as_float(t, (), "`t`")
+    scene, time = ScenePoses(seed, length), as_float(t, (), "`t`")
     is_joint = isinstance(joint, AbstractJoint)
     names = (joint.a, joint.b) if is_joint else ("a", "b")
     bodies = scene.bodies([name for name in names if name is not None]) if bodies is None else bodies
@@ -77,7 +77,7 @@ def check_joint(
             )
         multipliers.append(jnp.asarray(scene.rng.standard_normal(rows), scene.dtype))
     starts, velocity = [scene.displacement(free) for _ in range(poses)], scene.displacement(free)
-    (part,) = Poses(seed + 1, length).frames(1)
+    (part,) = ScenePoses(seed + 1, length).frames(1)
 
     checks: list[Check] = list(_reference(joint, scene, a, b, time, free)) if is_joint else []
     for label, element, lam in zip(labels, elements, multipliers):
@@ -157,7 +157,7 @@ def _compared(label: str, given: bool, of_positions: bool, found) -> Iterator[Ch
     yield slope(stiffness, found["K by autodiff"], found["force by autodiff"])
 
 
-def _reference(joint: AbstractJoint, scene: Poses, a, b, t, free) -> Iterator[Check]:
+def _reference(joint: AbstractJoint, scene: ScenePoses, a, b, t, free) -> Iterator[Check]:
     """Φ = 0 and full rank of B where the joint was made; moved with the bodies, it is made elsewhere."""
 
     @jax.jit

@@ -29,7 +29,7 @@ def displaced(a: Frame, b: Frame, x) -> tuple[Frame, Frame]:
     return moved(a, x[:6]), moved(b, x[6:])
 
 
-class Poses:
+class ScenePoses:
     """Random poses of a scene of some length [m]."""
 
     def __init__(self, seed: int, length: float):
@@ -39,7 +39,7 @@ class Poses:
         self.dtype = jnp.result_type(float)
 
     def frames(self, count: int = 2) -> list[Frame]:
-        """Poses some lengths apart."""
+        """ScenePoses some lengths apart."""
         frames = []
         for i in range(count):
             position = self.length * (SPREAD * self.rng.standard_normal(3) + np.array([SEPARATION * i, 0.0, 0.0]))
@@ -73,7 +73,7 @@ class Poses:
         around = default_step(self.dtype) * np.asarray(NODES, float)[:, None, None] * axes
         return jnp.asarray(np.concatenate([near, around.reshape(-1, DIM)]), self.dtype)
 
-    def sampled(self, values: Mapping[str, Any], free: np.ndarray) -> dict[str, "Sampled"]:
+    def sampled(self, values: Mapping[str, Any], free: np.ndarray) -> dict[str, "SampledQuantity"]:
         """Quantities from their values at `points`."""
         found = {}
         for key, array in values.items():
@@ -82,11 +82,11 @@ class Poses:
             stencil = array[NOISE_POINTS:].reshape(len(NODES), len(free), *array.shape[1:])
             slope = difference(stencil, default_step(self.dtype), sigma)
             derivative, tolerance = (np.moveaxis(part, 0, -1) / self.sizes[free] for part in slope)
-            found[key] = Sampled(array[0], float(sigma.max(initial=0.0)), derivative, tolerance, free)
+            found[key] = SampledQuantity(array[0], float(sigma.max(initial=0.0)), derivative, tolerance, free)
         return found
 
 
-class Sampled(NamedTuple):
+class SampledQuantity(NamedTuple):
     """A quantity at one point: its value, its round-off, and its derivative along the coordinates `free`."""
 
     value: np.ndarray
@@ -102,7 +102,7 @@ class Sampled(NamedTuple):
         return f"[{place}]: {self.value[index]:.6g}, not {expected[index]:.6g}"
 
 
-def same(name: str, given: Sampled, expected: Sampled, compared: str = "given, autodiff") -> Check:
+def same(name: str, given: SampledQuantity, expected: SampledQuantity, compared: str = "given, autodiff") -> Check:
     """Two ways to one quantity: their entries differ by the round-off of both."""
     error = np.abs(given.value - expected.value)
     largest = float(np.abs(expected.value).max(initial=0.0))
@@ -110,7 +110,7 @@ def same(name: str, given: Sampled, expected: Sampled, compared: str = "given, a
     return Check(name, compared, float(np.max(error)), tolerance, given.entry(expected.value, error))
 
 
-def slope(name: str, derivative: Sampled, quantity: Sampled) -> Check:
+def slope(name: str, derivative: SampledQuantity, quantity: SampledQuantity) -> Check:
     """A derivative, and the differences of what it is the derivative of."""
     tolerance = quantity.slope_tolerance + SAFETY * derivative.sigma
     error = np.abs(derivative.value - quantity.slope)
@@ -120,7 +120,7 @@ def slope(name: str, derivative: Sampled, quantity: Sampled) -> Check:
     return Check(name, "autodiff, differences", float(error[index]), float(tolerance[index]), note)
 
 
-def vanishes(name: str, compared: str, quantity: Sampled, size: float) -> Check:
+def vanishes(name: str, compared: str, quantity: SampledQuantity, size: float) -> Check:
     """A quantity that is zero, but for the round-off of terms of that size."""
     eps = float(np.finfo(quantity.value.dtype).eps)
     return Check(name, compared, float(np.abs(quantity.value).max()), SAFETY * (quantity.sigma + eps * size))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from helpers import EPS
 
-from lgsens.integrate._guess import Past
+from lgsens.integrate._guess import PastValues
 
 STEPS = 8
 AXES = np.array([1.0, -2.0, 0.5])
@@ -19,7 +19,7 @@ CURVES = {
 
 def predictions(values):
     """What is predicted for each value but the first, and for one after the last."""
-    past, found = Past.none(values[0]), []
+    past, found = PastValues.none(values[0]), []
     for value in values:
         found.append(past.predicted(value))
         past = past.after(value)
@@ -37,7 +37,7 @@ def test_exact(curve):
 def test_extrapolates_by_no_more_than_a_cubic():
     """A miss that has doubled is expected to stay as it is."""
     values = jnp.asarray([[2.0**n] for n in range(STEPS)])
-    past = Past.none(values[0])
+    past = PastValues.none(values[0])
     for value in values[:-1]:
         past = past.after(value)
     parabola = 3.0 * (values[-1] - values[-2]) + values[-3]

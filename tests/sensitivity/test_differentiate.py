@@ -9,7 +9,7 @@ from helpers import equations, says
 import lgsens as lg
 from lgsens.examples import spinning_top
 from lgsens.linear import LU
-from lgsens.sensitivity._sweeps import Blocks
+from lgsens.sensitivity._sweeps import StepBlocks
 
 SIDE = lg.Criterion(integrand=lambda s, p: s.body("top").position[0] ** 2)
 SETTINGS = {"t1": 0.2, "num_steps": 40}
@@ -116,7 +116,7 @@ def test_one_factorization_for_all_parameters_and_criteria(method, monkeypatch):
     """Factors in the program: as many for three parameters and criteria as for one of each, and not in a batch,
     except over the steps of a block."""
     made = []
-    block = (Blocks.of(SETTINGS["num_steps"], 81).length, 9, 9)
+    block = (StepBlocks.of(SETTINGS["num_steps"], 81).length, 9, 9)
     original = LU.of.__func__
 
     def counted(cls, matrix):
