@@ -39,6 +39,8 @@ from lgsens.integrate import (
 )
 from lgsens.linear import BlockSparse as BlockSparse, DenseLU as DenseLU
 from lgsens.model import (
+    AbstractForce as AbstractForce,
+    AbstractJoint as AbstractJoint,
     AbstractSignal as AbstractSignal,
     Actuator as Actuator,
     AppliedForce as AppliedForce,

@@ -129,6 +129,12 @@ CONSTRUCTORS = {
         lambda: tyre(free_radius=1.0, preload=2.0),
         ("TyreSpring: give `free_radius` or `preload`, not both", "preload = stiffness"),
     ),
+    "a function for a signal": (
+        lambda: lg.AppliedForce("wheel", force=X, signal=np.sin),
+        ("`signal` must be a signal", "a subclass of AbstractSignal", "sin"),
+    ),
+    "a number for a road": (lambda: tyre(road=0.1), ("`road` must be a signal", "0.1")),
+    "bodies in a list": (lambda: lg.Model([TWO["wheel"]]), ("`bodies` must be a dict", "got list")),
     "force of shape (2,)": (
         lambda: lg.AppliedForce("wheel", force=(1.0, 2.0)),
         ("`force`", "got shape (2,)"),
@@ -241,6 +247,11 @@ def test_constructor(mistake):
     build, parts = CONSTRUCTORS[mistake]
     with pytest.raises(ValueError, match=says(*parts)):
         build()
+
+
+def test_a_trajectory_for_a_state():
+    with pytest.raises(ValueError, match=says("`state0` must be a State", "`trajectory.state(-1)`", "got Model")):
+        lg.simulate(lg.Model(TWO), t1=1.0, num_steps=2, state0=lg.Model(TWO))
 
 
 def test_what_looks_like_a_duplicate_and_is_none():

@@ -22,7 +22,7 @@ from lgsens.model._loads import (
     Weight,
 )
 from lgsens.model._roads import FlatRoad
-from lgsens.model._signals import AbstractSignal, prepared
+from lgsens.model._signals import AbstractSignal, prepared, signal_field
 
 
 class Attached(NamedTuple):
@@ -218,7 +218,7 @@ class TyreSpring(AbstractForce):
     body: str = eqx.field(static=True)
     at: Float[Array, "3"] = point_field("at")
     stiffness: Float[Array, ""] = number_field("stiffness")
-    road: AbstractSignal = eqx.field(kw_only=True, default_factory=FlatRoad)
+    road: AbstractSignal = signal_field("road", default_factory=FlatRoad)
     free_radius: Float[Array, ""] | None = number_field("free_radius", default=None)
     preload: Float[Array, ""] | None = number_field("preload", default=None)
 
@@ -271,7 +271,7 @@ class AppliedForce(AbstractForce):
     at: Float[Array, "3"] | None = point_field("at", default=None)
     force: Float[Array, "3"] = point_field("force", default=(0.0, 0.0, 0.0))
     moment: Float[Array, "3"] = point_field("moment", default=(0.0, 0.0, 0.0))
-    signal: AbstractSignal = eqx.field(kw_only=True, default_factory=_one)
+    signal: AbstractSignal = signal_field("signal", default_factory=_one)
 
     @property
     def bodies(self):

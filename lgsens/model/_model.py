@@ -80,6 +80,13 @@ class Model(eqx.Module):
         if not isinstance(linear_solver, AbstractLinearSolver | None):
             raise ValueError(f"Model: `linear_solver` must be DenseLU(), BlockSparse() or None, got {linear_solver!r}.")
         self.linear_solver = linear_solver
+        for name, of, kind in (
+            ("bodies", bodies, "RigidBody"),
+            ("joints", joints, "joint"),
+            ("forces", forces, "force"),
+        ):
+            if not isinstance(of, Mapping | None):
+                raise ValueError(f"Model: `{name}` must be a dict, each {kind} by its name, got {type(of).__name__}.")
         self.bodies, self.joints, self.forces = dict(bodies), dict(joints or {}), dict(forces or {})
         self.merge_fixed = merge_fixed
         if not isinstance(merge_fixed, bool):

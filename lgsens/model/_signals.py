@@ -214,15 +214,30 @@ def number_of(value: Prescribed) -> Float[Array, ""] | None:
     return None if isinstance(value, AbstractSignal) else value
 
 
+def _no_signal(name: str, what: str, value: Any) -> ValueError:
+    return ValueError(
+        f"`{name}` must be {what} (Harmonic, Polynomial, Ramp, Sampled, or a subclass of AbstractSignal, whose numbers "
+        f"are leaves), got {value!r}."
+    )
+
+
+def signal_field(name: str, **default: Any) -> Any:
+    """A keyword-only signal of an element."""
+
+    def convert(value: Any) -> AbstractSignal:
+        if not isinstance(value, AbstractSignal):
+            raise _no_signal(name, "a signal", value)
+        return value
+
+    return eqx.field(converter=convert, kw_only=True, **default)
+
+
 def prescribed_field(name: str) -> Any:
     """A keyword-only scalar leaf or signal of an element, None by default."""
 
     def convert(value: Any) -> Prescribed | None:
         if callable(value) and not isinstance(value, AbstractSignal):
-            raise ValueError(
-                f"`{name}` must be a number or a signal (Harmonic, Polynomial, Ramp, Sampled, or a subclass of "
-                f"AbstractSignal, whose numbers are leaves), got {value!r}."
-            )
+            raise _no_signal(name, "a number or a signal", value)
         return value if value is None or isinstance(value, AbstractSignal) else as_float(value, (), f"`{name}`")
 
     return eqx.field(converter=convert, kw_only=True, default=None)

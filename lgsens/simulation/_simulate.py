@@ -124,6 +124,11 @@ def simulate(
             f"`sensitivity` = {sensitivity!r} and `save` need steps of the scheme. With `rtol` diffrax takes its own, "
             "and differentiates them in one direction only (`mode`): leave them out, or leave `rtol` out."
         )
+    if not isinstance(state0, State | None):
+        raise ValueError(
+            "`state0` must be a State: one of `equilibrium` or `initial_state`, or `trajectory.state(-1)` to continue, "
+            f"got {type(state0).__name__}."
+        )
     if save is not None and not callable(save):
         raise ValueError(f"`save` must be a function of an Instant, got {save!r}. Leave it out to have the trajectory.")
     t0, t1 = interval(t0, t1)
