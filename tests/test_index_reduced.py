@@ -239,8 +239,8 @@ def test_failures():
     p = jnp.array([2e3, 5e3, 0.4, 2.0])
     with pytest.raises(lg.SimulationError, match=r"did not reach `t1` in 3 steps.*`breaks`.*`max_steps`"):
         integrate(p, max_steps=3)
-    with pytest.raises(Exception, match="did not reach `t1` in 3 steps"):
-        jax.block_until_ready(eqx.filter_jit(lambda p: integrate(p, max_steps=3))(p))
+    inside = eqx.filter_jit(lambda p: integrate(p, max_steps=3))(p)
+    assert np.all(np.isnan(inside.value)) and np.all(np.isnan(inside.gradient))
     with pytest.raises(ValueError, match="constrain the same motion twice"):
         integrate(p, stuck)
 

@@ -89,6 +89,14 @@ class RigidBody(eqx.Module):
                 "RigidBody: `inertia` must be three principal moments, shape (3,), or the matrix about the "
                 f"centre of mass, shape (3, 3), got shape {self.inertia.shape}."
             )
+        if self.inertia is not None:
+            require(
+                _is_physical,
+                f"RigidBody: `inertia` {self.inertia} kg m² is not the inertia of a body: it must be symmetric and "
+                "positive definite, and each principal moment at most the sum of the other two (check units, "
+                "axes and the centre of mass).",
+                self.inertia,
+            )
         require(
             _is_rotation,
             "RigidBody: `orientation` must be a rotation matrix (RᵀR = I, det R = 1); its columns are the "
@@ -102,14 +110,6 @@ class RigidBody(eqx.Module):
             f"RigidBody: `mass` must be positive, got {self.mass} kg.",
             self.mass,
         )
-        if self.inertia is not None:
-            require(
-                _is_physical,
-                f"RigidBody: `inertia` {self.inertia} kg m² is not the inertia of a body: it must be symmetric and "
-                "positive definite, and each principal moment at most the sum of the other two (check units, "
-                "axes and the centre of mass).",
-                self.inertia,
-            )
         if self.inertia is None and {*self.free} & {*ROTATIONS}:
             raise ValueError(
                 f"RigidBody: a point mass (`inertia` = None) has no rotations, got `free` = {self.free!r}; leave them "

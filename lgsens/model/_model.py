@@ -14,7 +14,7 @@ from lgsens.liegroups import nearest_rotation
 from lgsens.linear import AbstractLinearSolver
 from lgsens.model._assemble import assemble, assemble_merged
 from lgsens.model._body import RigidBody
-from lgsens.model._checks import checked, far_from_rotation
+from lgsens.model._checks import checked, far_from_rotation, is_inertia
 from lgsens.model._evaluate_by_kind import stacked
 from lgsens.model._forces import AbstractForce
 from lgsens.model._frames import Frame
@@ -168,6 +168,12 @@ class Model(eqx.Module):
             for what, of in (("Body", self.bodies), ("Joint", self.joints), ("Force", self.forces))
         ]
         for name, body in members[0].items():
+            require(
+                lambda inertia: is_inertia(inertia),
+                f"Body {name!r}: `inertia` {body.inertia} is not that of a body: a principal moment is negative, or "
+                "larger than the sum of the others; bound what an optimizer may change.",
+                body.inertia_matrix,
+            )
             require(
                 lambda orientation: not far_from_rotation(orientation),
                 f"Body {name!r}: `orientation` {body.orientation} is far from a rotation; leave it to the model "

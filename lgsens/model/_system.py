@@ -174,7 +174,9 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         return self.parts.multiplier(joint, self.multiplier_rows, q, v, vdot, lam, t)
 
     def is_valid(self):
-        return finite(self) & are_bodies(self.mass, self.inertia, self.pose.orientation)
+        return finite((self.mass, self.inertia, self.pose, self.velocity, self.constraints, self.loads)) & are_bodies(
+            self.mass, self.inertia, self.pose.orientation
+        )
 
     def reference(self):
         return self.pose, self.velocity
