@@ -143,6 +143,7 @@ def test_energy_and_constraints():
     np.testing.assert_array_equal(states.a, states.vdot)
 
 
+@pytest.mark.slow  # each is taken of the top by the default scheme
 def test_every_transformation():
     """Equal steps: forwards, backwards, twice and in a batch, all the same; differences agree."""
 

@@ -161,6 +161,7 @@ def test_bad_input(change, message):
         work_precision(**arguments)
 
 
+@pytest.mark.slow  # both routes are tried
 def test_a_function_that_never_works_is_said_at_once():
     with pytest.raises(ValueError, match=r"finds no reference.*no_such_body"):
         work_precision(lambda t: t.body("no_such_body").position[-1, 0], build, P, t1=T1, progress=False)

@@ -189,6 +189,7 @@ def test_an_inverse_of_many_numbers_is_rounded_in_any_unit(unit):
     assert isinstance(Factors.of(*single, jnp.ones((), jnp.float32), kind=Inverse).factors, Inverse)
 
 
+@pytest.mark.slow  # inverses of many runs are rounded below
 def test_steps_with_a_rounded_inverse_are_those_of_full_newton():
     """Residuals are in double precision, so the motion is."""
     model = spatial_chain(40)  # of 440 unknowns

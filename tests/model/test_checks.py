@@ -93,6 +93,7 @@ def test_times_in_the_wrong_order():
         lg.raise_if_failed(trajectory)
 
 
+@pytest.mark.slow  # two programs
 def test_equilibrium_and_derivatives_of_bad_numbers():
     state = jax.jit(lambda mass: lg.equilibrium(eqx.tree_at(lambda m: bob(m).mass, scene(), mass)))(-1.0)
     assert np.all(np.isnan(state.v))

@@ -100,6 +100,7 @@ def test_start_of_a_driven_slider_crank(t):
     np.testing.assert_allclose(crank.angular_acceleration[0], [0.0, 0.0, 3.0], rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow  # a driven slider-crank: `test_driven_motion.py`
 def test_kinematics_by_signals_and_by_their_values():
     """t, s(t), ṡ(t) and s̈ = 0: the same motion whether the signal runs or its values and rates are given."""
     model, t = driven(lg.Polynomial((0.0, 3.0))), np.linspace(0.0, 0.5, 6)

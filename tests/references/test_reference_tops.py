@@ -22,6 +22,7 @@ LONG = (  # as others, at other numbers
     "heavy_top_bruls2012.to_1s",
     "heavy_top_bruls2012.to_2s",
     "lagrange_top_analytic.nutating",
+    "lagrange_top_analytic.simo_wong",
 )
 
 
