@@ -77,10 +77,11 @@ def reverse(steps: int = 100_000) -> list[Row]:
     gradient, slopes = np.asarray(backwards(p)), np.asarray(forwards(p))
     growth = lg.sensitivity_growth(spinning_top(p[0]), t1=1e-3 * steps, num_steps=steps)
     grown = np.inf if bool(growth.exponential) else float(growth.factor[-1])
-    extreme, modes = f"{steps} steps in reverse", "16 n ε: each step of either mode adds a round-off"
+    extreme = f"{steps} steps in reverse"
+    modes = "n ε g: each step of either mode adds a round-off, which grows by g to the end as a change of the start does"
     error = largest(gradient - slopes, np.abs(slopes).max())
     return [
-        Row(extreme, "reverse − forward, relative", error, 16 * EPS * steps, modes),
+        Row(extreme, "reverse − forward, relative", error, EPS * steps * grown, modes),
         Row(extreme, "growth of a change of the start, regular", grown, 1.0 / EPS, "the motion has digits left"),
     ]
 
