@@ -78,7 +78,7 @@ def reverse(steps: int = 100_000) -> list[Row]:
     growth = lg.sensitivity_growth(spinning_top(p[0]), t1=1e-3 * steps, num_steps=steps)
     grown = np.inf if bool(growth.exponential) else float(growth.factor[-1])
     extreme = f"{steps} steps in reverse"
-    modes = "n ε g: each step of either mode adds a round-off, which grows by g to the end as a change of the start does"
+    modes = "n ε g: each step of either mode adds a round-off, which grows by g as a change of the start does"
     error = largest(gradient - slopes, np.abs(slopes).max())
     return [
         Row(extreme, "reverse − forward, relative", error, EPS * steps * grown, modes),
