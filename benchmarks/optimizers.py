@@ -11,7 +11,7 @@ which nobody knows before.
 
 Counted are simulations, Jacobians or gradients, and seconds without compilation, of which `evaluating` in simulations;
 `reached` is what it took to an f within 1e-3 of the least that any method found, with g ≤ 1e-3, whatever ends a method.
-Writes optimizers.json (problems that are not run keep their numbers) and prints a table.
+Writes optimizers.json (problems that are not run keep their numbers) and prints a table. Many starts: multi_start.py.
 """
 
 import json
@@ -49,14 +49,14 @@ class Counted:
         if problem.constraints(problem.z0).size:
             self.calls["jacobians"] += (problem.constraints_jac,)
         problem.jac(problem.z0)  # compiled
-        self.f0 = abs(problem.fun(problem.z0))
-        self.restart()
+        self.restart(problem.z0)
 
-    def restart(self) -> None:
+    def restart(self, z0: np.ndarray) -> None:
         self.trace: list[tuple[float, float, int, int]] = []  # f, max g, simulations and Jacobians until then
         self.asked = {"simulations": 0, "jacobians": 0}
         self.last = {"simulations": b"", "jacobians": b""}
         self.evaluating, self.begun = 0.0, time.perf_counter()
+        self.f0 = abs(self.problem.fun(z0))
 
     def ask(self, kind: str, z: np.ndarray) -> tuple[Any, ...]:
         if time.perf_counter() - self.begun > LONGEST:
@@ -80,8 +80,9 @@ def by_minimize(fun: Callable, x0, settings: dict[str, Any], num_steps: int) -> 
     return {kind: len(trace), "seconds": found.run_seconds, "message": found.reason}, found, trace
 
 
-def by_scipy(counted: Counted, method: str, chosen: np.ndarray, kind: str) -> tuple[dict, Any, list]:
-    """A search under the constraints `chosen`."""
+def search(counted: Counted, z0: np.ndarray, method: str, chosen: np.ndarray) -> tuple[np.ndarray | None, str]:
+    """Where a search under the constraints `chosen` ends, and why."""
+    counted.restart(z0)
     given: Any = ()
     fun = lambda z: counted.ask("simulations", z)[0] / counted.f0
     jac = lambda z: counted.ask("jacobians", z)[0] / counted.f0
@@ -94,18 +95,21 @@ def by_scipy(counted: Counted, method: str, chosen: np.ndarray, kind: str) -> tu
         given = scipy.optimize.NonlinearConstraint(g, -np.inf, 0.0, jac=slope, hess=scipy.optimize.BFGS())
         options |= {"gtol": 1e-5, "xtol": 1e-8, "barrier_tol": 1e-6}
     extra = {"hess": scipy.optimize.BFGS()} if method == "trust-constr" else {}
+    try:
+        found = scipy.optimize.minimize(
+            fun, z0, jac=jac, bounds=counted.problem.bounds, constraints=given, method=method, options=options, **extra
+        )
+    except TimeIsUp:
+        return None, f"ended after {LONGEST:.0f} s"
+    return found.x, str(found.message)
+
+
+def by_scipy(counted: Counted, method: str, chosen: np.ndarray, kind: str) -> tuple[dict, Any, list]:
+    """A search under the constraints `chosen`."""
     seconds: list[float] = []
     evaluating: list[float] = []
     while not seconds or (len(seconds) < 5 and sum(seconds) < 10.0):
-        counted.restart()
-        try:
-            found = scipy.optimize.minimize(
-                fun, counted.problem.z0, jac=jac, bounds=counted.problem.bounds, constraints=given, method=method,
-                options=options, **extra,
-            )  # fmt: skip
-            z, message = found.x, str(found.message)
-        except TimeIsUp:
-            z, message = None, f"ended after {LONGEST:.0f} s"
+        z, message = search(counted, counted.problem.z0, method, chosen)
         seconds.append(time.perf_counter() - counted.begun)
         evaluating.append(counted.evaluating)
     row = dict(counted.asked) if kind == "jacobians" else {"simulations": counted.asked["simulations"]}
@@ -148,22 +152,18 @@ def compare(fun: Callable, x0, settings: dict[str, Any], num_steps: int) -> dict
     return {"constraints": int(found.constraints.size), "methods": rows}
 
 
-def suspension(parameters: str, keep: bool, num_steps: int) -> Callable[[], dict]:
-    def run() -> dict:
-        bands = {"travel": 0.05, "camber": np.radians(0.3), "toe": np.radians(0.1)}
-        kept = CurveBounds.around(QuarterCar.load(), **bands) if keep else None
-        design = SuspensionDesign.load(parameters=parameters, keep=kept, t1=1.0, num_steps=STEPS)
-        lower, upper = design.bounds
-        return compare(design, design.start, {"lower": lower, "upper": upper, "log_scale": design.log_scale}, num_steps)
-
-    return run
+def suspension(parameters: str, keep: bool) -> tuple[Callable, dict, dict[str, Any]]:
+    """The arguments of `minimize` but the steps."""
+    bands = {"travel": 0.05, "camber": np.radians(0.3), "toe": np.radians(0.1)}
+    kept = CurveBounds.around(QuarterCar.load(), **bands) if keep else None
+    design = SuspensionDesign.load(parameters=parameters, keep=kept, t1=1.0, num_steps=STEPS)
+    lower, upper = design.bounds
+    return design, design.start, {"lower": lower, "upper": upper, "log_scale": design.log_scale}
 
 
 def comfort() -> dict:
-    design = SuspensionDesign.load(parameters="k,c,hardpoints", t1=1.0, num_steps=STEPS)
-    lower, upper = design.bounds
-    settings = {"lower": lower, "upper": upper, "log_scale": design.log_scale}
-    return compare(lambda x: (design(x)[0], jnp.zeros(0)), design.start, settings, 100)
+    design, start, settings = suspension("k,c,hardpoints", False)
+    return compare(lambda x: (design(x)[0], jnp.zeros(0)), start, settings, 100)
 
 
 def identification() -> dict:
@@ -225,9 +225,9 @@ def identification() -> dict:
 
 
 PROBLEMS = {
-    "k,c": suspension("k,c", False, 100),
-    "bands": suspension("k,c,hardpoints", True, 200),
-    "all": suspension("k,c,hardpoints", False, 200),
+    "k,c": lambda: compare(*suspension("k,c", False), 100),
+    "bands": lambda: compare(*suspension("k,c,hardpoints", True), 200),
+    "all": lambda: compare(*suspension("k,c,hardpoints", False), 200),
     "comfort": comfort,
     "four-bar": identification,
 }

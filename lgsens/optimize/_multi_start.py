@@ -27,6 +27,7 @@ class MultiStartResult(NamedTuple):
         reason: why each ended, as `OptimizationResult.reason`; strings, shape (n,).
         steps: evaluations that each took, shape (n,).
         best: the index of the best of them: the lowest objective of the feasible ones, or else the least violation.
+        compile_seconds, run_seconds: wall time of the compilation and of the searches [s].
     """
 
     starts: PyTree
@@ -37,6 +38,8 @@ class MultiStartResult(NamedTuple):
     reason: np.ndarray
     steps: np.ndarray
     best: int
+    compile_seconds: float
+    run_seconds: float
 
 
 def multi_start(
@@ -110,4 +113,6 @@ def multi_start(
         reason=np.asarray(REASONS)[found["ended"]],
         steps=found["steps"],
         best=int(order[0]),
+        compile_seconds=swept.compile_seconds,
+        run_seconds=swept.run_seconds,
     )
