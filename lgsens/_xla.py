@@ -76,12 +76,12 @@ def compilation_cache(folder: str | os.PathLike | None = None) -> Path:
     """
     config: Any = jax.config  # its settings are declared at run time
     given = folder if folder is not None else config.jax_compilation_cache_dir
-    home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
-    found = home / "lgsens" if given is None else Path(given).expanduser()
+    found = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "lgsens" if given is None else Path(given)
     try:
+        found = found.expanduser()
         found.mkdir(parents=True, exist_ok=True)
         (found / ".writable").touch()
-    except OSError as error:
+    except (OSError, RuntimeError) as error:  # the latter of a user without a home
         raise ValueError(f"`folder` {str(found)!r} cannot be written ({error}); name another one.") from error
     if str(found) != config.jax_compilation_cache_dir:
         config.update("jax_compilation_cache_dir", str(found))
