@@ -18,7 +18,6 @@ import pytest
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 NAMES = sorted(path.stem for path in NOTEBOOKS.glob("*.ipynb"))
-LONG = [name for name in NAMES if name[:2] != "02"]  # half a minute or more each
 
 
 def read(name):
@@ -38,7 +37,8 @@ def run(source, filename, names):
     return None if last is None else eval(compile(ast.Expression(last.value), filename, "eval"), names)
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in NAMES])
+@pytest.mark.slow  # half a minute or more each
+@pytest.mark.parametrize("name", NAMES)
 def test_a_notebook_runs(name, tmp_path, monkeypatch):
     """And shows figures where they are committed."""
     monkeypatch.chdir(tmp_path)  # where a notebook writes
@@ -64,8 +64,8 @@ def imported(tree):
     return names
 
 
-@pytest.mark.parametrize("name", LONG)
-def test_what_a_long_notebook_asks_for_is_there(name):
+@pytest.mark.parametrize("name", NAMES)
+def test_what_a_notebook_asks_for_is_there(name):
     """Every name of a module that its cells use, and every keyword that they give to a function of lgsens."""
     tree = ast.parse("\n".join("".join(cell["source"]) for cell in cells(name, "code")))
     names, asked = imported(tree), 0

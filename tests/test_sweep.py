@@ -167,8 +167,7 @@ PUSHES = np.array([0.0, 100.0, 0.0, -200.0])
     "kind",
     [
         "value",
-        "gradient only",
-        *(pytest.param(k, marks=pytest.mark.slow) for k in ("value and gradient", "forward mode")),
+        *(pytest.param(k, marks=pytest.mark.slow) for k in ("gradient only", "value and gradient", "forward mode")),
     ],
 )
 def test_failed_designs_are_marked_and_the_others_kept(kind):

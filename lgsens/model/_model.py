@@ -169,10 +169,10 @@ class Model(eqx.Module):
         ]
         for name, body in members[0].items():
             require(
-                lambda inertia: is_inertia(inertia),
+                lambda inertia: is_inertia(np.diag(inertia) if inertia.ndim == 1 else inertia),
                 f"Body {name!r}: `inertia` {body.inertia} is not that of a body: a principal moment is negative, or "
                 "larger than the sum of the others; bound what an optimizer may change.",
-                body.inertia_matrix,
+                np.zeros(3) if body.inertia is None else body.inertia,
             )
             require(
                 lambda orientation: not far_from_rotation(orientation),

@@ -174,9 +174,8 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         return self.parts.multiplier(joint, self.multiplier_rows, q, v, vdot, lam, t)
 
     def is_valid(self):
-        return finite((self.mass, self.inertia, self.pose, self.velocity, self.constraints, self.loads)) & are_bodies(
-            self.mass, self.inertia, self.pose.orientation
-        )
+        known = finite(self.pose, self.velocity, self.constraints, self.loads)
+        return known & are_bodies(self.mass, self.inertia, self.pose.orientation)
 
     def reference(self):
         return self.pose, self.velocity
@@ -206,8 +205,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         return [stack for stack in self.loads if stack.carriers]
 
     def settled(self, q, v, t):
-        stacks = self._dynamic
-        for stack, ends in zip(stacks, at_ends(stacks, self._placed(q), self.twists(v))):
+        for stack, ends in zip(self._dynamic, at_ends(self._dynamic, self._placed(q), self.twists(v))):
             begun = stack.map(lambda load, *args: load.initial(*args), ends, (t,))
             v = v.at[state_coordinates(stack, self.index)].set(begun)
         return v

@@ -36,6 +36,7 @@ def test_an_iteration_has_neither_scatter_nor_factorization(scene):
     assert not iterations[0] & {"scatter-add", "triangular_solve", "cholesky"}
 
 
+@pytest.mark.slow  # two processes that compile a gradient
 def test_a_program_in_which_loops_are_functions():
     found = []
     for option in ("", OPTION):

@@ -116,12 +116,13 @@ def _sides(p, integrator):
     return run.t, run.body("top").position[:, 0] ** 2 + 1e-5 * run.multiplier("pivot")[:, 2]
 
 
+@pytest.mark.slow  # four programs
 @pytest.mark.parametrize(
     ("integrator", "method"),
     [
-        pytest.param(MIDPOINT, lg.DirectDifferentiation(), marks=pytest.mark.slow),
-        pytest.param(MIDPOINT, lg.AdjointVariable(checkpoints=2), marks=pytest.mark.slow),
-        pytest.param(GIVEN, lg.DirectDifferentiation(), marks=pytest.mark.slow),
+        (MIDPOINT, lg.DirectDifferentiation()),
+        (MIDPOINT, lg.AdjointVariable(checkpoints=2)),
+        (GIVEN, lg.DirectDifferentiation()),
         (GIVEN, lg.AdjointVariable(checkpoints=2)),
     ],
 )

@@ -75,6 +75,7 @@ def test_motion_of_the_spinning_top(case):
     check_invariants(name, energy_of_top(PROBLEMS[name].parameters), {"energy": float(states[0]["energy"])})
 
 
+@pytest.mark.slow  # its published position is below
 def test_motion_of_the_heavy_top():
     name = "heavy_top_bruls2012.to_2s"
     check_states(name, HEAVY["states"], observe_top, expect_top)
