@@ -115,10 +115,8 @@ def minimize(
 
     SLSQP through `scipy_problem` takes 8 simulations and 7 Jacobians in place of 13 Jacobians for stiffness and
     damping, 50 and 42 in place of 104 with hardpoints and bands, 43 and 42 in place of 74 without bands, where it ends
-    7.6e-4 above this (`benchmarks/results/optimizers.json`). From 16 random designs one after the other it takes 54 s
-    for stiffness and damping, this 69 s, and in the batches of `multi_start` 88 s, on one thread
-    (`benchmarks/results/multi_start.json`). It cannot be continued from a file, and knows no points that cannot be
-    simulated.
+    7.6e-4 above this (`benchmarks/results/optimizers.json`). It cannot be traced or continued from a file, and knows no
+    points that cannot be simulated.
 
     A step into a region where f, g or the gradient is not finite is halved until they are. Raises
     `ValueError` for bounds of another shape than x0, lower ≥ upper, x0 outside them, a logarithmic scale over
