@@ -231,18 +231,22 @@ def test_an_interrupted_command_writes_what_there_is_and_goes_on(tmp_path):
         arguments = [sys.executable, "-m", "lgsens", "optimize", "quarter-car", "--out", str(tmp_path / out), *QUICK]
         return subprocess.Popen([*arguments, *more], stderr=subprocess.PIPE, text=True, env=environment)
 
+    def ended(process):
+        said = process.communicate()[1]  # which closes the pipe
+        return process.returncode, said
+
     optimum = lambda out: json.loads((tmp_path / out / "result.json").read_text(encoding="utf-8"))
-    assert command("whole").wait() in (0, 1)
+    assert ended(command("whole"))[0] in (0, 1)
     stopped = command("stopped")
     while not (tmp_path / "stopped" / "search.npz").exists():
         assert stopped.poll() is None
         time.sleep(0.01)
     stopped.send_signal(signal.SIGINT)
-    said = stopped.communicate()[1]
-    assert stopped.returncode == 130 and "--resume goes on" in said and "Traceback" not in said
+    status, said = ended(stopped)
+    assert status == 130 and "--resume goes on" in said and "Traceback" not in said
     assert optimum("stopped")["history"]["ended"] == "interrupted"
     assert {"response.png", "search.npz"} <= {path.name for path in (tmp_path / "stopped").iterdir()}
-    assert command("stopped", "--resume").wait() in (0, 1)
+    assert ended(command("stopped", "--resume"))[0] in (0, 1)
     assert not (tmp_path / "stopped" / "search.npz").exists()
     for name in ("design", "objective", "history"):
         assert optimum("stopped")[name] == optimum("whole")[name]
