@@ -18,9 +18,7 @@ Inside, L is minimized to a stationarity of min(ω, θ ρ σ), the latter a frac
 ∇L; then μ ← μ⁺, ω falls, and ρ grows unless σ fell. μ converges linearly, the faster the larger ρ (Nocedal & Wright
 2006, §17.4; Birgin & Martínez 2014, Practical Augmented Lagrangian Methods, §4).
 
-Inside there are two methods, each a step that evaluates f, g and derivatives once, accepted or not: `_reverse_steps`
-with one gradient in reverse mode, whatever the number of constraints; and for few variables `_forward_steps` with the
-Jacobian of all constraints.
+Inside, `_reverse_steps` takes one gradient in reverse mode for each evaluation, whatever the number of constraints.
 """
 
 from functools import partial
@@ -39,6 +37,7 @@ INNER_FALL = 0.3  # of ω from one μ to the next
 INNER_STEPS = 20  # μ follows after so many at the latest
 HOPELESS = 0.9  # of σ, with the largest ρ: constraints that contradict each other
 NOT_YET, CONVERGED, STALLED, INFEASIBLE = 0, 1, 2, 3  # whether and why a search ended
+REASONS = ("steps", "converged", "stalled", "infeasible")
 
 DECREASE = 1e-4  # of L, as a fraction of what a step promises
 LARGEST_MOVE = 0.2  # of the box; where a model of L has been wrong, simulations fail
@@ -78,7 +77,7 @@ class Trial(NamedTuple):
 
 
 class Search(NamedTuple):
-    """What both methods hand from one evaluation to the next."""
+    """What one evaluation hands to the next."""
 
     multipliers: Float[Array, " m"]  # μ
     penalty: Float[Array, ""]  # ρ
@@ -118,13 +117,12 @@ def round_off(value: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def advance(
-    search: Search, trial: Trial, accepted: Bool[Array, ""], tolerances: tuple[float, float], least: int
+    search: Search, trial: Trial, accepted: Bool[Array, ""], tolerances: tuple[float, float]
 ) -> tuple[Search, Bool[Array, ""], Row]:
     """The state after a trial, whether μ has changed in it, and the row of the trial.
 
     Arguments:
         tolerances: of the conditions above, and of g.
-        least: μ stays until after so many accepted points.
     """
     tolerance, constraint_tolerance = tolerances
     penalty, count = search.penalty, jnp.ones_like(search.inner)
@@ -135,7 +133,7 @@ def advance(
     converged = accepted & (worst <= constraint_tolerance) & (sigma <= tolerance) & (norm <= tolerance)
     accuracy = jnp.maximum(tolerance, jnp.minimum(search.accuracy, INNER_ACCURACY * penalty * sigma))
     solved = (norm <= accuracy) | (search.inner >= INNER_STEPS)
-    follow = accepted & solved & (sigma > 0) & (search.inner >= least)
+    follow = accepted & solved & (sigma > 0) & (search.inner >= 1)  # the first point since a change of μ is z itself
     stiffer = follow & (norm <= accuracy) & (sigma > FALL * search.violation)
     contradiction = follow & (penalty >= LARGEST_PENALTY) & (sigma > HOPELESS * search.violation)
     contradiction &= (worst > constraint_tolerance) & (norm <= jnp.maximum(tolerance, 1e-4))

@@ -1,9 +1,9 @@
-"""Bounded minimization under path constraints by an augmented Lagrangian, evaluation by evaluation."""
+"""Bounded minimization under path constraints, evaluation by evaluation."""
 
 import os
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +13,13 @@ from jaxtyping import Array, Float, PyTree
 from lgsens._progress import progress_bar
 from lgsens._validate import as_count
 from lgsens.linear import tuned
-from lgsens.optimize import _forward_steps, _reverse_steps
+from lgsens.optimize import _reverse_steps, _slsqp
 from lgsens.optimize._augmented_lagrangian import Row
 from lgsens.optimize._box import Box, checked_box
-from lgsens.optimize._checkpoint import Checkpoint, columns
+from lgsens.optimize._checkpoint import Checkpoint
+from lgsens.optimize._course import Course
 
 Problem = Callable[[PyTree], tuple[Float[Array, ""], Array]]
-Carry = _forward_steps.Carry | _reverse_steps.Carry
-REASONS = ("steps", "converged", "stalled", "infeasible")
 
 
 class History(NamedTuple):
@@ -30,7 +29,8 @@ class History(NamedTuple):
         objective: f, shape (n,).
         worst_constraint: max g, shape (n,); −∞ without constraints.
         gradient_norm: |clip(z − ∇L) − z|, a projected gradient step in the scaled variables z, shape (n,).
-        complementarity: σ = max |max(g, −μ/ρ)|, 0 where g and μ are those of an optimum, shape (n,).
+        complementarity: σ = max |max(g, −μ/ρ)|, 0 where g and μ are those of an optimum, shape (n,); in forward mode ρ
+            is 1 and μ what makes ∇L least.
         design: x, its leaves with a leading axis n.
     """
 
@@ -89,9 +89,9 @@ def minimize(
 ) -> OptimizationResult:
     """min f(x) subject to g(x) ≤ 0 and lower ≤ x ≤ upper.
 
-    By an augmented Lagrangian with a multiplier for each constraint. Of few variables it takes the Jacobian of all
-    constraints (a stabilized SQP method, in forward mode); of many one gradient for each evaluation, whatever the
-    number of constraints (L-BFGS in the box, in reverse mode).
+    Of few variables by SciPy's SLSQP with the Jacobian of all constraints, in forward mode; of many by an augmented
+    Lagrangian and L-BFGS in the box with one gradient for each evaluation, in reverse mode, whatever the number of
+    constraints.
 
     Arguments:
         fun: x ↦ (f, g): the objective, shape (), and the constraints, an array of any shape, each scaled so
@@ -113,88 +113,81 @@ def minimize(
             interrupted; with more `num_steps` a finished one goes on. To recognize another `fun`, x0 is evaluated
             again.
 
-    SLSQP through `scipy_problem` takes 8 simulations and 7 Jacobians in place of 13 Jacobians for stiffness and
-    damping, 50 and 42 in place of 104 with hardpoints and bands, 43 and 42 in place of 74 without bands, where it ends
-    7.6e-4 above this (`benchmarks/results/optimizers.json`). It cannot be traced or continued from a file, and knows no
-    points that cannot be simulated.
-
     A step into a region where f, g or the gradient is not finite is halved until they are. Raises
     `ValueError` for bounds of another shape than x0, lower ≥ upper, x0 outside them, a logarithmic scale over
     0, `num_steps` < 1, a tolerance that is out of range, an f or g that is not finite at x0, and a checkpoint of
-    another problem. Derivation and sources: `lgsens/optimize/_augmented_lagrangian.py` and the two files of steps.
+    another problem. Derivations and sources: `lgsens/optimize/_slsqp.py` and `_augmented_lagrangian.py`.
     """
     num_steps = as_count(num_steps, "num_steps")
     x, unravel, box = checked_box(x0, lower, upper, log_scale)
+    tolerances = checked_tolerances(tolerance, constraint_tolerance)
     started = time.perf_counter()
-    begin, step, shape = prepared(fun, x, unravel, box, (tolerance, constraint_tolerance), forward)
-    carry = begin(x)
-    step = jax.jit(step).lower(carry).compile()
+    method, shape = prepared(fun, x, unravel, box, tolerances, forward)
+    method.compile(x)
     compiled = time.perf_counter()
 
-    after, first = step(carry)
+    start = method.begin(x)
+    first = start[1]
     if not (np.isfinite(first.objective) and np.isfinite(first.gradient_norm) and not np.isnan(first.worst)):
         raise ValueError(
             f"The objective, a constraint or the gradient is not finite at `x0` (objective {float(first.objective)}); "
             "start from a design that can be simulated."
         )
-    rows, store, interrupted = [], None, False
-    if checkpoint is not None:
-        store = Checkpoint(checkpoint, box, x, (tolerance, constraint_tolerance))
-        carry, rows = store.load(carry, first)
-    found = carry, rows  # one value: an interrupt sees both or neither
-    with progress_bar(num_steps, "step", progress, initial=len(rows)) as bar:
+    store = None if checkpoint is None else Checkpoint(checkpoint, box, x, tolerances)
+    course, reason = Course(start, num_steps, store), "interrupted"
+    with progress_bar(num_steps, "step", progress, initial=len(course.rows)) as bar:
+
+        def shown(step: int, f: float, worst: float) -> None:
+            bar.set_postfix({"objective": f"{f:.4g}", "worst constraint": f"{worst:+.1e}"}, refresh=False)
+            bar.update()
+            if callback is not None:
+                callback(step, f, worst)
+
+        course.shown = shown
         try:
-            while len(found[1]) < num_steps and not int(found[0].search.ended):
-                carry, row = step(found[0]) if found[1] else (after, first)
-                found = carry, [*found[1], jax.tree.map(np.asarray, row)]
-                if store is not None:
-                    store.save(*found)
-                f, worst = float(row.objective), float(row.worst)
-                bar.set_postfix({"objective": f"{f:.4g}", "worst constraint": f"{worst:+.1e}"}, refresh=False)
-                bar.update()
-                if callback is not None:
-                    callback(len(found[1]) - 1, f, worst)
+            if not course.rows:
+                course.add(*start)
+            reason = method.go_on(course)
         except KeyboardInterrupt:
-            if not found[1]:
+            if not course.rows:
                 raise
-            interrupted = True
-            if store is not None:
-                store.save(*found)
+            course.keep()
     finished = time.perf_counter()
 
-    carry, rows = found
-    x, *numbers = columns(rows).values()
+    found = method.found(course)
+    x, *numbers = (np.stack([getattr(row, name) for row in course.rows]) for name in Row._fields)
     history = History(*numbers, design=jax.tree.map(np.asarray, jax.vmap(unravel)(jnp.asarray(x))))
-    search = carry.search
-    best, step = search.best, int(search.best.step)
     return OptimizationResult(
-        x=unravel(jnp.asarray(x[step])),
-        objective=float(history.objective[step]),
-        constraints=np.asarray(best.constraints).reshape(shape),
-        feasible=bool(best.worst <= constraint_tolerance),
-        reason="interrupted" if interrupted else REASONS[int(search.ended)],
-        step=step,
+        x=unravel(jnp.asarray(x[found.step])),
+        objective=float(history.objective[found.step]),
+        constraints=found.constraints.reshape(shape),
+        feasible=bool(history.worst_constraint[found.step] <= constraint_tolerance),
+        reason=reason,
+        step=found.step,
         history=history,
-        multipliers=np.asarray(search.multipliers).reshape(shape),
+        multipliers=found.multipliers.reshape(shape),
         compile_seconds=compiled - started,
         run_seconds=finished - compiled,
     )
 
 
-def prepared(
-    fun: Problem, x: Array, unravel: Callable, box: Box, tolerances: tuple[float, float], forward: bool | None
-) -> tuple[Callable[[Array], Carry], Callable[[Carry], tuple[Carry, Row]], tuple[int, ...]]:
-    """x₀ ↦ the first carry, the step of a problem, and the shape of its constraints."""
-    tolerance, constraint_tolerance = tolerances
+def checked_tolerances(tolerance: float, constraint_tolerance: float) -> tuple[float, float]:
+    """Both, in a pair. Raises `ValueError`."""
     if not tolerance >= 0:
         raise ValueError(f"`tolerance` must not be negative, got {tolerance}.")
     if not constraint_tolerance > 0:
         raise ValueError(f"`constraint_tolerance` must be positive, got {constraint_tolerance}.")
+    return tolerance, constraint_tolerance
+
+
+def prepared(
+    fun: Problem, x: Array, unravel: Callable, box: Box, tolerances: tuple[float, float], forward: bool | None
+) -> tuple[_slsqp.Method | _reverse_steps.Method, tuple[int, ...]]:
+    """The method for a problem, and the shape of its constraints."""
     flat_fun, constraints = flattened(fun, unravel, x)
     few = constraints.size > 0 and x.size <= tuned.FORWARD_VARIABLES
-    method: Any = _forward_steps if (few if forward is None else forward) else _reverse_steps
-    step = method.make_step(flat_fun, box, tolerances)
-    return lambda x: method.start(box.scaled(x), constraints.size), step, constraints.shape
+    method = _slsqp.Method if (few if forward is None else forward) else _reverse_steps.Method
+    return method(flat_fun, box, tolerances, constraints.size), constraints.shape
 
 
 def flattened(fun: Problem, unravel: Callable, x: Array) -> tuple[Callable, jax.ShapeDtypeStruct]:

@@ -1,18 +1,24 @@
-"""One search from many starts, compiled once, in batches over all devices."""
+"""One search from many starts, compiled once."""
 
 import os
+import time
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
+from lgsens._progress import progress_bar
 from lgsens._validate import as_count
-from lgsens.optimize._augmented_lagrangian import NOT_YET
+from lgsens.optimize import _reverse_steps, _slsqp
+from lgsens.optimize._augmented_lagrangian import NOT_YET, REASONS
 from lgsens.optimize._box import checked_box
-from lgsens.optimize._minimize import REASONS, Problem, prepared
+from lgsens.optimize._checkpoint import Checkpoint
+from lgsens.optimize._course import Course
+from lgsens.optimize._minimize import Problem, checked_tolerances, prepared
 from lgsens.sweeps import as_designs, sweep
 
 
@@ -66,54 +72,89 @@ def multi_start(
         starts: a number of random ones, uniform between the bounds (in the logarithm, where `log_scale`), or designs as
             `sweep` takes them.
         seed: of the random ones.
-        progress, batch_size, folder: as of `lgsens.sweep`, which runs the searches: compiled once, in batches over all
-            devices, and with a folder not lost when the process dies. The searches of a batch last as long as its
-            longest: on one thread 16 of stiffness and damping took 88 s, one after another 69 s, SLSQP 54 s
-            (`benchmarks/results/multi_start.json`). Not measured on a GPU.
+        progress: show a bar, if tqdm is installed.
+        batch_size: as of `lgsens.sweep`, which runs the searches in reverse mode in batches over all devices, that last
+            as long as their longest; in forward mode one search follows another.
+        folder: keeps the searches, so that they go on when the process has died.
 
     A start where f, g or the gradient is not finite ends as "stalled", with objective NaN, and leaves the others
     alone. Raises `ValueError` as `minimize` and `sweep`.
     """
     num_steps = as_count(num_steps, "num_steps")
     if isinstance(starts, int):
-        count = as_count(starts, "starts")
         # Any point will do to learn shapes and bounds.
         x, unravel, box = checked_box(lower, lower, upper, log_scale)
-        z = jax.random.uniform(jax.random.key(seed), (count, x.size), x.dtype)
+        z = jax.random.uniform(jax.random.key(seed), (as_count(starts, "starts"), x.size), x.dtype)
         starts = jax.vmap(lambda z: unravel(box.value(z)))(z)
+    starts, count = as_designs(starts)
+    xs = []
+    for i in range(count):
+        x, unravel, box = checked_box(jax.tree.map(lambda leaf, i=i: leaf[i], starts), lower, upper, log_scale)
+        xs.append(x)
+    method, _ = prepared(fun, xs[0], unravel, box, checked_tolerances(tolerance, constraint_tolerance), forward)
+    if isinstance(method, _slsqp.Method):
+        found, *seconds = _one_by_one(method, xs, num_steps, progress, folder)
     else:
-        starts, count = as_designs(starts)
-        for i in range(count):
-            x, unravel, box = checked_box(jax.tree.map(lambda leaf, i=i: leaf[i], starts), lower, upper, log_scale)
-    begin, step, _ = prepared(fun, x, unravel, box, (tolerance, constraint_tolerance), forward)
-
-    def search(x0: PyTree) -> dict[str, Any]:
-        running = lambda carry: (carry.search.ended == NOT_YET) & (carry.search.step < num_steps)
-        ended = jax.lax.while_loop(running, lambda carry: step(carry)[0], begin(ravel_pytree(x0)[0])).search
-        best = ended.best
-        return {
-            "x": unravel(box.value(best.z)),
-            "objective": jnp.where(jnp.isfinite(best.objective), best.objective, jnp.nan),
-            "worst": best.worst,
-            "ended": ended.ended,
-            "steps": ended.step,
-        }
-
-    swept = sweep(search, starts, batch_size=batch_size, folder=folder, progress=progress)
-    found = swept.values
+        search = lambda x0: _searched(method, ravel_pytree(x0)[0], num_steps)
+        swept = sweep(search, starts, batch_size=batch_size, folder=folder, progress=progress)
+        found, *seconds = swept.values, swept.compile_seconds, swept.run_seconds
     feasible = np.asarray(found["worst"] <= constraint_tolerance)
     order = np.lexsort(
         (np.where(feasible, found["objective"], found["worst"]), ~feasible, np.isnan(found["objective"]))
     )
     return MultiStartResult(
-        starts=swept.designs,
-        x=found["x"],
+        starts=starts,
+        x=jax.tree.map(np.asarray, jax.vmap(unravel)(jnp.asarray(found["x"]))),
         objective=found["objective"],
         worst_constraint=found["worst"],
         feasible=feasible,
         reason=np.asarray(REASONS)[found["ended"]],
         steps=found["steps"],
         best=int(order[0]),
-        compile_seconds=swept.compile_seconds,
-        run_seconds=swept.run_seconds,
+        compile_seconds=seconds[0],
+        run_seconds=seconds[1],
+    )
+
+
+def _searched(method: _reverse_steps.Method, x: Array, num_steps: int) -> dict[str, Any]:
+    """One search in a program."""
+    running = lambda carry: (carry.search.ended == NOT_YET) & (carry.search.step < num_steps)
+    ended = jax.lax.while_loop(running, lambda carry: method.one_step(carry)[0], method.start(x)).search
+    best = ended.best
+    return {
+        "x": method.box.value(best.z),
+        "objective": jnp.where(jnp.isfinite(best.objective), best.objective, jnp.nan),
+        "worst": best.worst,
+        "ended": ended.ended,
+        "steps": ended.step,
+    }
+
+
+def _one_by_one(
+    method: _slsqp.Method, xs: list[Array], num_steps: int, progress: bool, folder: str | os.PathLike | None
+) -> tuple[dict[str, np.ndarray], float, float]:
+    """What `_searched` would find from each x, and the seconds of compilation and of the searches."""
+    started, found = time.perf_counter(), []
+    method.compile(xs[0])
+    compiled = time.perf_counter()
+    with progress_bar(len(xs), "start", progress) as bar:
+        for i, x in enumerate(xs):
+            start = method.begin(x)
+            path = None if folder is None else Path(folder) / f"start_{i}.npz"
+            course = Course(start, num_steps, path and Checkpoint(path, method.box, x, method.tolerances))
+            if not course.rows:
+                course.add(*start)
+            reason = method.go_on(course)
+            best = course.rows[method.found(course).step]
+            objective, worst = (best.objective, best.worst) if best.finite else (np.nan, np.inf)
+            ended = REASONS.index(reason)
+            found.append(
+                {"x": best.x, "objective": objective, "worst": worst, "ended": ended, "steps": len(course.rows)}
+            )
+            bar.update()
+    finished = time.perf_counter()
+    return (
+        {name: np.asarray([each[name] for each in found]) for name in found[0]},
+        compiled - started,
+        finished - compiled,
     )

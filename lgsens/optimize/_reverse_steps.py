@@ -11,11 +11,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.optimize import _augmented_lagrangian as outer
 from lgsens.optimize._box import Box
+from lgsens.optimize._course import Course, Found
 
 Memory = Any  # optax.ScaleByLBFGSState; its members are declared as any pytree, here they are arrays
 LBFGS: Any = optax.scale_by_lbfgs(memory_size=10)
@@ -33,6 +35,34 @@ class Carry(NamedTuple):
     reach: Float[Array, ""]  # the most that an entry of it may be
     rejected: Int[Array, ""]  # trials from z
     fresh: Bool[Array, ""]  # z is to be evaluated anew: L is another one
+
+
+class Method:
+    """The search for one problem, from any start."""
+
+    def __init__(self, fun: Callable, box: Box, tolerances: tuple[float, float], num_constraints: int):
+        self.box, self.start = box, lambda x: start(box.scaled(x), num_constraints)
+        self.one_step = make_step(fun, box, tolerances)  # to be traced
+        self.step: Callable = jax.jit(self.one_step)
+
+    def compile(self, x: Array) -> None:
+        """Compile the step, for any x of its kind."""
+        self.step = self.step.lower(self.start(x)).compile()
+
+    def begin(self, x: Array) -> tuple[Carry, outer.Row]:
+        """What follows from the evaluation at x₀."""
+        return self.step(self.start(x))
+
+    def go_on(self, course: Course) -> str:
+        """Steps from the last evaluation on; why they ended."""
+        while not int(course.carry.search.ended) and not course.full:
+            course.add(*self.step(course.carry))
+        return outer.REASONS[int(course.carry.search.ended)]
+
+    def found(self, course: Course) -> Found:
+        """The best so far."""
+        search: outer.Search = course.carry.search
+        return Found(int(search.best.step), np.asarray(search.best.constraints), np.asarray(search.multipliers))
 
 
 def start(z: Float[Array, " n"], num_constraints: int) -> Carry:
@@ -70,9 +100,8 @@ def make_step(fun: Callable, box: Box, tolerances: tuple[float, float]) -> Calla
         promised = jnp.vdot(carry.gradient, move)
         enough = value <= carry.value + outer.DECREASE * promised + outer.round_off(carry.value)
         accepted = finite & (carry.fresh | enough)
-        # Since a change of μ its first point is z itself, another one has to follow.
         trial = outer.Trial(z, x, f, g, gradient, estimate, finite)
-        search, follow, row = outer.advance(search, trial, accepted, tolerances, least=1)
+        search, follow, row = outer.advance(search, trial, accepted, tolerances)
 
         zero, one = jnp.zeros_like(carry.rejected), jnp.ones_like(carry.rejected)
         moved = carry._replace(

@@ -153,14 +153,14 @@ def test_the_whole_loop_is_traced_once():
         {"a": -1.0, "b": 0.0},
         {"a": -2.0, "b": -2.0},
         {"a": 2.0, "b": 2.0},
-        num_steps=23,
+        num_steps=9,
         tolerance=0.0,
         callback=lambda *args: steps.append(args),
     )
     assert len(traces) == 1
-    assert [step for step, _, _ in steps] == list(range(23))
+    assert [step for step, _, _ in steps] == list(range(9))
     assert [f for _, f, _ in steps] == list(result.history.objective)
-    assert result.history.design["a"].shape == (23,)
+    assert result.history.design["a"].shape == (9,)
 
 
 def test_a_step_out_of_the_domain_is_halved():

@@ -26,7 +26,7 @@ def problem():
 
 @pytest.fixture(scope="module")
 def expected():
-    return minimize(fun, X0, **BOUNDS, num_steps=100, tolerance=1e-8, progress=False)
+    return minimize(fun, X0, **BOUNDS, num_steps=100, tolerance=1e-8, progress=False, forward=False)
 
 
 def test_values_and_derivatives_against_differences(problem):
