@@ -28,6 +28,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from lgsens.optimize._box import Box
+
 PENALTY = 10.0  # ρ at first: f and g are both scaled to about 1
 PENALTY_GROWTH = 10.0
 LARGEST_PENALTY = 1e4  # the condition of ∇²L grows with ρ; μ does the rest
@@ -117,7 +119,7 @@ def round_off(value: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def advance(
-    search: Search, trial: Trial, accepted: Bool[Array, ""], tolerances: tuple[float, float]
+    search: Search, trial: Trial, accepted: Bool[Array, ""], tolerances: tuple[float, float], box: Box
 ) -> tuple[Search, Bool[Array, ""], Row]:
     """The state after a trial, whether μ has changed in it, and the row of the trial.
 
@@ -127,7 +129,7 @@ def advance(
     tolerance, constraint_tolerance = tolerances
     penalty, count = search.penalty, jnp.ones_like(search.inner)
     worst = jnp.max(trial.constraints, initial=-jnp.inf)
-    norm = jnp.linalg.norm(jnp.clip(trial.z - trial.gradient, 0.0, 1.0) - trial.z)
+    norm = jnp.linalg.norm(box.clip(trial.z - trial.gradient) - trial.z)
     sigma = jnp.max(jnp.abs(trial.estimate - search.multipliers), initial=0.0) / penalty
 
     converged = accepted & (worst <= constraint_tolerance) & (sigma <= tolerance) & (norm <= tolerance)

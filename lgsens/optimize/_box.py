@@ -1,5 +1,6 @@
-"""The box that a design lies in, scaled to [0, 1]."""
+"""The box that a design lies in, scaled to [0, 1]; where it is open, by the size of the design."""
 
+import contextlib
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -10,26 +11,44 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lgsens._validate import as_float, leaf_name
+from lgsens.optimize._parametrization import magnitude
 
 
 class Box(NamedTuple):
-    """The map between x and z in [0, 1], linear or logarithmic entry by entry."""
+    """The map between x and z, linear or logarithmic entry by entry.
+
+    z is 0 at the lower bound and 1 at the upper one. Where one of them is infinite, a unit of z is the largest entry of
+    the leaf at x₀, or the factor e on a logarithmic scale; where both are, z is 0 at x₀.
+    """
 
     lower: Float[Array, " n"]
     upper: Float[Array, " n"]
     log: Bool[Array, " n"]
+    zero: Float[Array, " n"]  # x at z = 0 and at z = 1, on its scale
+    one: Float[Array, " n"]
 
-    def _on_scale(self, x):
-        return jnp.where(self.log, jnp.log(jnp.where(self.log, x, 1.0)), x)
+    @property
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """The bounds of z."""
+        lower, upper = np.asarray(self.lower), np.asarray(self.upper)
+        open_below = np.isneginf(lower) | (np.asarray(self.log) & (lower == 0))
+        return np.where(open_below, -np.inf, 0.0), np.where(np.isinf(upper), np.inf, 1.0)
+
+    def clip(self, z: Array) -> Array:
+        """The projection of z on the box."""
+        return jnp.clip(z, *(end.astype(z.dtype) for end in self.ends))
 
     def scaled(self, x):
-        lower, upper = self._on_scale(self.lower), self._on_scale(self.upper)
-        return (self._on_scale(x) - lower) / (upper - lower)
+        return (_on_scale(x, self.log) - self.zero) / (self.one - self.zero)
 
     def value(self, z):
-        y = (1.0 - z) * self._on_scale(self.lower) + z * self._on_scale(self.upper)  # exact at both ends
+        y = (1.0 - z) * self.zero + z * self.one  # exact at both ends
         # The clip keeps round-off of the logarithm from leaving the bounds.
         return jnp.clip(jnp.where(self.log, jnp.exp(jnp.where(self.log, y, 0.0)), y), self.lower, self.upper)
+
+
+def _on_scale(x, log):
+    return jnp.where(log, jnp.log(jnp.where(log, x, 1.0)), x)
 
 
 def checked_box(x0, lower, upper, log_scale) -> tuple[Array, Callable[[Array], PyTree], Box]:
@@ -40,7 +59,10 @@ def checked_box(x0, lower, upper, log_scale) -> tuple[Array, Callable[[Array], P
     if isinstance(log_scale, bool):
         log_scale = jax.tree.map(lambda _: log_scale, x0)
 
-    def vector(tree, what: str) -> Array:
+    def vector(tree, what: str, missing: float) -> Array:
+        everywhere = lambda bound, part: jax.tree.map(lambda _: missing, part) if bound is None else bound
+        with contextlib.suppress(ValueError):  # told below
+            tree = jax.tree.map(everywhere, tree, x0, is_leaf=lambda bound: bound is None)
         if jax.tree.structure(tree) != jax.tree.structure(x0):
             raise ValueError(
                 f"`{what}` must be a pytree like `x0`, {jax.tree.structure(x0)}, got {jax.tree.structure(tree)}."
@@ -56,15 +78,27 @@ def checked_box(x0, lower, upper, log_scale) -> tuple[Array, Callable[[Array], P
         return ravel_pytree(jax.tree_util.tree_map_with_path(leaf, x0, tree))[0]
 
     x, unravel = ravel_pytree(x0)
-    box = Box(vector(lower, "lower"), vector(upper, "upper"), vector(log_scale, "log_scale"))
-    for name, low, high, log, value in zip(entry_names(x0), *map(np.asarray, (*box, x))):
-        if not low < high:
-            raise ValueError(f"`lower` must be below `upper`, got {low} and {high} for {name}.")
-        if not low <= value <= high:
-            raise ValueError(f"`x0` must lie within the bounds: {name} = {value} is outside [{low}, {high}].")
-        if log and not low > 0:
-            raise ValueError(f"A logarithmic scale needs positive bounds, got {low} for {name}.")
-    return x, unravel, box
+    low, high, log = (
+        vector(*bound)
+        for bound in ((lower, "lower", -np.inf), (upper, "upper", np.inf), (log_scale, "log_scale", False))
+    )
+    for name, a, b, logarithmic, value in zip(entry_names(x0), *map(np.asarray, (low, high, log, x))):
+        if not np.isfinite(value):
+            raise ValueError(f"`x0` must be finite, got {value} for {name}.")
+        if not a < b:
+            raise ValueError(f"`lower` must be below `upper`, got {a} and {b} for {name}.")
+        if not a <= value <= b:
+            raise ValueError(f"`x0` must lie within the bounds: {name} = {value} is outside [{a}, {b}].")
+        if logarithmic and not (a > 0 or (np.isneginf(a) and value > 0)):
+            what = f"`x0`, got {value}" if np.isneginf(a) else f"bounds, got {a}"
+            raise ValueError(f"A logarithmic scale needs positive {what} for {name}.")
+    low = jnp.where(log & jnp.isneginf(low), 0.0, low)
+    first, last, here = (_on_scale(end, log) for end in (low, high, x))
+    size = ravel_pytree(jax.tree.map(lambda leaf: jnp.full(leaf.shape, magnitude(leaf), leaf.dtype), x0))[0]
+    size = jnp.where(log, 1.0, size)
+    zero = jnp.where(jnp.isfinite(first), first, jnp.where(jnp.isfinite(last), last - size, here))
+    one = jnp.where(jnp.isfinite(last), last, zero + size)
+    return x, unravel, Box(low, high, log, zero, one)
 
 
 def entry_names(tree) -> list[str]:

@@ -9,10 +9,11 @@ from jaxtyping import Array, Float, PyTree
 
 from lgsens._validate import as_float
 from lgsens.criteria import soft_maximum
+from lgsens.optimize._problem import as_pair
 
 
 def load_cases(
-    fun: Callable[[PyTree, Any], tuple[Float[Array, ""], Array]],
+    fun: Callable[[PyTree, Any], Float[Array, ""] | tuple[Float[Array, ""], Array]],
     cases: Any,
     *,
     weights: Any = None,
@@ -24,7 +25,7 @@ def load_cases(
         g = the constraints of all cases in a row
 
     Arguments:
-        fun: (x, case) ↦ (f_c, g_c), as `minimize` wants them for one case.
+        fun: (x, case) ↦ (f_c, g_c) or f_c, as `minimize` wants them for one case.
         cases: a pytree whose arrays have a leading axis over C cases, evaluated at once under `jax.vmap`; or a list of
             C cases that are anything (scenes of other bodies, say), evaluated one after another.
         weights: w [1/unit of f_c], shape (C,); None: 1/C each for the sum, 1 each for the worst case.
@@ -48,10 +49,10 @@ def load_cases(
 
     def combined(x):
         if listed:
-            found = [fun(x, case) for case in cases]
+            found = [as_pair(fun(x, case)) for case in cases]
             f, g = jnp.stack([f for f, _ in found]), jnp.concatenate([g.ravel() for _, g in found])
         else:
-            f, g = jax.vmap(fun, in_axes=(None, 0))(x, cases)
+            f, g = jax.vmap(lambda x, case: as_pair(fun(x, case)), in_axes=(None, 0))(x, cases)
         weighted = weights * f
         return (jnp.sum(weighted) if sharpness is None else soft_maximum(weighted, sharpness)), g.ravel()
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, PyTree
 
 from lgsens._progress import progress_bar
 from lgsens._validate import as_count
@@ -18,8 +18,7 @@ from lgsens.optimize._augmented_lagrangian import Row
 from lgsens.optimize._box import Box, checked_box
 from lgsens.optimize._checkpoint import Checkpoint
 from lgsens.optimize._course import Course
-
-Problem = Callable[[PyTree], tuple[Float[Array, ""], Array]]
+from lgsens.optimize._problem import Problem, flattened
 
 
 class History(NamedTuple):
@@ -76,8 +75,8 @@ def minimize(
     fun: Problem,
     x0: PyTree,
     *,
-    lower: PyTree,
-    upper: PyTree,
+    lower: PyTree = None,
+    upper: PyTree = None,
     num_steps: int,
     log_scale: PyTree = False,
     tolerance: float = 1e-5,
@@ -95,14 +94,15 @@ def minimize(
 
     Arguments:
         fun: x ↦ (f, g): the objective, shape (), and the constraints, an array of any shape, each scaled so
-            that 1 is a large violation; an empty array for none. Traced once.
+            that 1 is a large violation; or x ↦ f without constraints. Traced once.
         x0: where to start, a pytree of arrays within the bounds. It need not satisfy g ≤ 0.
-        lower, upper: the bounds, pytrees as x0; a leaf of shape () bounds every entry.
+        lower, upper: the bounds, pytrees as x0; a leaf of shape () bounds every entry, an infinite one and None do not.
         num_steps: the most evaluations of f, g and derivatives; the first is at x0.
         log_scale: whether to search by the logarithm, a bool or a pytree of bools as x0; for positive rates
             whose bounds are a decade apart.
         tolerance: the search ends where the projected gradient of the Lagrangian, in variables scaled to [0, 1] and
-            for f/|f(x₀)|, and σ of `History` are not above it; 0: never.
+            for f/|f(x₀)|, and σ of `History` are not above it; 0: never. The scale of a variable that lacks a bound is
+            the largest entry of its array in x0, or the factor e.
         constraint_tolerance: the g up to which a design satisfies its constraints.
         forward: whether to differentiate in forward mode, static; None: where there are constraints and at most 40
             variables.
@@ -188,20 +188,3 @@ def prepared(
     few = constraints.size > 0 and x.size <= tuned.FORWARD_VARIABLES
     method = _slsqp.Method if (few if forward is None else forward) else _reverse_steps.Method
     return method(flat_fun, box, tolerances, constraints.size), constraints.shape
-
-
-def flattened(fun: Problem, unravel: Callable, x: Array) -> tuple[Callable, jax.ShapeDtypeStruct]:
-    """x ↦ (f, g) of vectors, which keeps its trace, and the shape of g as `fun` gives it.
-
-    Raises `ValueError` for a `fun` that returns something else.
-    """
-    traced = jax.jit(lambda x: fun(unravel(x)))
-    shape = jax.eval_shape(traced, x)
-    if not (isinstance(shape, tuple) and len(shape) == 2 and shape[0].shape == ()):
-        raise ValueError(f"`fun` must return (objective of shape (), array of constraints), got {shape}.")
-
-    def flat_fun(x):
-        f, g = traced(x)
-        return f, g.ravel()
-
-    return flat_fun, shape[1]

@@ -18,7 +18,8 @@ from lgsens.optimize._augmented_lagrangian import NOT_YET, REASONS
 from lgsens.optimize._box import checked_box
 from lgsens.optimize._checkpoint import Checkpoint
 from lgsens.optimize._course import Course
-from lgsens.optimize._minimize import Problem, checked_tolerances, prepared
+from lgsens.optimize._minimize import checked_tolerances, prepared
+from lgsens.optimize._problem import Problem
 from lgsens.sweeps import as_designs, sweep
 
 
@@ -52,8 +53,8 @@ def multi_start(
     fun: Problem,
     starts: int | PyTree,
     *,
-    lower: PyTree,
-    upper: PyTree,
+    lower: PyTree = None,
+    upper: PyTree = None,
     num_steps: int,
     log_scale: PyTree = False,
     tolerance: float = 1e-5,
@@ -67,8 +68,8 @@ def multi_start(
     """`minimize` from many starts: where f has several minima, the best of those that are found.
 
     Arguments:
-        fun, lower, upper, num_steps, log_scale, tolerance, constraint_tolerance, forward: as of `minimize`; the bounds
-            have the shapes of x, unless `starts` shows them.
+        fun, lower, upper, num_steps, log_scale, tolerance, constraint_tolerance, forward: as of `minimize`; random
+            `starts` need finite bounds of the shapes of x.
         starts: a number of random ones, uniform between the bounds (in the logarithm, where `log_scale`), or designs as
             `sweep` takes them.
         seed: of the random ones.
@@ -82,16 +83,20 @@ def multi_start(
     """
     num_steps = as_count(num_steps, "num_steps")
     if isinstance(starts, int):
-        # Any point will do to learn shapes and bounds.
-        x, unravel, box = checked_box(lower, lower, upper, log_scale)
-        z = jax.random.uniform(jax.random.key(seed), (as_count(starts, "starts"), x.size), x.dtype)
+        count = as_count(starts, "starts")
+        ends = jax.tree.leaves((lower, upper), is_leaf=lambda end: end is None)
+        if not all(end is not None and np.all(np.isfinite(end)) for end in ends):
+            raise ValueError(
+                f"`starts`: {count} random designs need finite `lower` and `upper`; give them, or the designs."
+            )
+        x, unravel, box = checked_box(lower, lower, upper, log_scale)  # any point will do to learn shapes and bounds
+        z = jax.random.uniform(jax.random.key(seed), (count, x.size), x.dtype)
         starts = jax.vmap(lambda z: unravel(box.value(z)))(z)
     starts, count = as_designs(starts)
-    xs = []
-    for i in range(count):
-        x, unravel, box = checked_box(jax.tree.map(lambda leaf, i=i: leaf[i], starts), lower, upper, log_scale)
-        xs.append(x)
-    method, _ = prepared(fun, xs[0], unravel, box, checked_tolerances(tolerance, constraint_tolerance), forward)
+    design = lambda i: jax.tree.map(lambda leaf: leaf[i], starts)
+    x, unravel, box = checked_box(design(0), lower, upper, log_scale)
+    xs = [x, *(checked_box(design(i), lower, upper, log_scale)[0] for i in range(1, count))]
+    method, _ = prepared(fun, x, unravel, box, checked_tolerances(tolerance, constraint_tolerance), forward)
     if isinstance(method, _slsqp.Method):
         found, *seconds = _one_by_one(method, xs, num_steps, progress, folder)
     else:

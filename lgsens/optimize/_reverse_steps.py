@@ -82,10 +82,12 @@ def start(z: Float[Array, " n"], num_constraints: int) -> Carry:
 
 def make_step(fun: Callable, box: Box, tolerances: tuple[float, float]) -> Callable[[Carry], tuple[Carry, outer.Row]]:
     """carry ↦ (carry, row): one evaluation of f, g and ∇L, and what follows from it."""
+    # Without a box a move may be as long as it has to.
+    longest = outer.LARGEST_MOVE if np.all(np.isfinite(box.ends)) else np.inf
 
     def step(carry: Carry) -> tuple[Carry, outer.Row]:
         search = carry.search
-        z = jnp.where(carry.fresh, carry.z, jnp.clip(carry.z + carry.direction, 0.0, 1.0))
+        z = jnp.where(carry.fresh, carry.z, box.clip(carry.z + carry.direction))
 
         def lagrangian(z):
             x = box.value(z)
@@ -101,7 +103,7 @@ def make_step(fun: Callable, box: Box, tolerances: tuple[float, float]) -> Calla
         enough = value <= carry.value + outer.DECREASE * promised + outer.round_off(carry.value)
         accepted = finite & (carry.fresh | enough)
         trial = outer.Trial(z, x, f, g, gradient, estimate, finite)
-        search, follow, row = outer.advance(search, trial, accepted, tolerances)
+        search, follow, row = outer.advance(search, trial, accepted, tolerances, box)
 
         zero, one = jnp.zeros_like(carry.rejected), jnp.ones_like(carry.rejected)
         moved = carry._replace(
@@ -112,7 +114,7 @@ def make_step(fun: Callable, box: Box, tolerances: tuple[float, float]) -> Calla
             reach=jnp.where(
                 carry.fresh,
                 carry.reach,
-                jnp.minimum(2 * jnp.where(carry.rejected > 0, jnp.max(jnp.abs(move)), carry.reach), outer.LARGEST_MOVE),
+                jnp.minimum(2 * jnp.where(carry.rejected > 0, jnp.max(jnp.abs(move)), carry.reach), longest),
             ),
             rejected=zero,
             fresh=follow,
@@ -127,7 +129,7 @@ def make_step(fun: Callable, box: Box, tolerances: tuple[float, float]) -> Calla
         )
         stalled = ~accepted & given_up & (carry.memory.count == 0)
         after = outer.select(accepted, moved, stayed)
-        after = outer.select(accepted | given_up, after._replace(direction=_direction(after)), after)
+        after = outer.select(accepted | given_up, after._replace(direction=_direction(after, box)), after)
         ended = jnp.where(stalled, outer.STALLED, search.ended)
         return after._replace(search=search._replace(ended=ended)), row
 
@@ -148,10 +150,11 @@ def _next_memory(carry: Carry, trial, gradient) -> Memory:
     return outer.select(~carry.fresh & (jnp.vdot(move, change) > small), usual, shifted)
 
 
-def _direction(carry: Carry) -> Float[Array, " n"]:
+def _direction(carry: Carry, box: Box) -> Float[Array, " n"]:
     """−H ∇L on the face in which z may move, with the pairs of the memory projected on it, no farther than reach."""
     z, gradient, memory = carry.z, carry.gradient, carry.memory
-    free = jnp.where(((z <= 0) & (gradient > 0)) | ((z >= 1) & (gradient < 0)), 0.0, 1.0)
+    lower, upper = box.ends
+    free = jnp.where(((z <= lower) & (gradient > 0)) | ((z >= upper) & (gradient < 0)), 0.0, 1.0)
     moves, changes = (free[None] * pairs for pairs in (memory.diff_params_memory, memory.diff_updates_memory))
     curvature = jnp.sum(moves * changes, axis=1)
     on_face = memory._replace(

@@ -10,15 +10,15 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
 from lgsens.optimize._box import checked_box
-from lgsens.optimize._minimize import Problem, flattened
+from lgsens.optimize._problem import Problem, flattened
 
 
 class ScipyProblem(NamedTuple):
-    """A problem in variables z scaled to [0, 1] between the bounds; NumPy arrays of 64-bit floats.
+    """A problem in variables z, scaled to [0, 1] between the bounds as in `minimize`; NumPy arrays of 64-bit floats.
 
     Attributes:
         z0: the start, shape (n,).
-        bounds: (0, 1) for each variable, as `scipy.optimize.minimize` takes them.
+        bounds: (0, 1) for each variable, infinite where it has none, as `scipy.optimize.minimize` takes them.
         fun, jac, hessp: f(z), its gradient (n,), and its Hessian times a vector, (z, p) ↦ (n,).
         constraints, constraints_jac: g(z), shape (m,), and its Jacobian (m, n); g ≤ 0 is wanted.
         x: z ↦ the design, a pytree.
@@ -35,7 +35,13 @@ class ScipyProblem(NamedTuple):
 
 
 def scipy_problem(
-    fun: Problem, x0: PyTree, *, lower: PyTree, upper: PyTree, log_scale: PyTree = False, forward: bool | None = None
+    fun: Problem,
+    x0: PyTree,
+    *,
+    lower: PyTree = None,
+    upper: PyTree = None,
+    log_scale: PyTree = False,
+    forward: bool | None = None,
 ) -> ScipyProblem:
     """A problem of `minimize` for `scipy.optimize.minimize`, with value, gradient and Hessian-vector product.
 
@@ -67,7 +73,7 @@ def scipy_problem(
     as_array = lambda z: np.asarray(z, z0.dtype)
     return ScipyProblem(
         z0=np.asarray(z0, np.float64),
-        bounds=[(0.0, 1.0)] * z0.size,
+        bounds=list(zip(*map(np.ndarray.tolist, box.ends))),
         fun=lambda z: float(values(z)[0]),
         jac=lambda z: jacobians(z)[0] if forward else gradient(z),
         hessp=lambda z, p: np.asarray(product(as_array(z), as_array(p)), np.float64),
@@ -95,7 +101,12 @@ class ScipyLeastSquares(NamedTuple):
 
 
 def scipy_least_squares(
-    residual: Callable[[PyTree], PyTree], x0: PyTree, *, lower: PyTree, upper: PyTree, log_scale: PyTree = False
+    residual: Callable[[PyTree], PyTree],
+    x0: PyTree,
+    *,
+    lower: PyTree = None,
+    upper: PyTree = None,
+    log_scale: PyTree = False,
 ) -> ScipyLeastSquares:
     """Residuals as of `least_squares` for `scipy.optimize.least_squares`, which keeps parameters within bounds.
 
@@ -107,7 +118,7 @@ def scipy_least_squares(
     z0 = box.scaled(x)
     return ScipyLeastSquares(
         z0=np.asarray(z0, np.float64),
-        bounds=(np.zeros(z0.size), np.ones(z0.size)),
+        bounds=box.ends,
         fun=_remembered(scaled),
         jac=_remembered(jax.jacfwd(scaled)),
         x=lambda z: unravel(box.value(np.asarray(z, z0.dtype))),

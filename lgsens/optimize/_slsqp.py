@@ -93,10 +93,11 @@ class Method:
         multipliers, near = np.zeros_like(g), np.flatnonzero(g >= -tolerance)
         if near.size and np.all(np.isfinite(slope)) and np.all(np.isfinite(jacobian)):
             unit = np.eye(z.size)
-            cone = np.concatenate([jacobian[near], -unit[z <= tolerance], unit[z >= 1.0 - tolerance]])
+            lower, upper = self.box.ends
+            cone = np.concatenate([jacobian[near], -unit[z <= lower + tolerance], unit[z >= upper - tolerance]])
             with contextlib.suppress(RuntimeError):  # out of its iterations: this point is no optimum then
                 multipliers[near] = scipy.optimize.nnls(cone.T, -slope)[0][: near.size]
-        norm = np.linalg.norm(np.clip(z - (slope + multipliers @ jacobian), 0.0, 1.0) - z)
+        norm = np.linalg.norm(np.clip(z - (slope + multipliers @ jacobian), *self.box.ends) - z)
         sigma = np.max(np.abs(np.maximum(g, -multipliers)), initial=0.0)
         worst, norm, sigma = (np.asarray(number, f.dtype) for number in (np.max(g, initial=-np.inf), norm, sigma))
         return Evaluation(x, f, worst, norm, sigma, z, g, slope, jacobian, multipliers)
@@ -152,7 +153,7 @@ class _Search:
         fun = lambda z: float(self.values(z).objective) / (self.scale * size)
         jac = lambda z: self.slopes(z).slope.astype(np.float64) / size
         constraints = (self.constraints, self.normals) if self.first.constraints.size else None
-        box = [(0.0, 1.0)] * self.first.z.size
+        box = list(zip(*map(np.ndarray.tolist, self.method.box.ends)))
         allowed = self.method.tolerances[1]
         try:
             for _ in range(RESTARTS):

@@ -175,6 +175,43 @@ def test_a_step_out_of_the_domain_is_halved():
     assert result.objective == -float(result.x)
 
 
+def rosenbrock(x):
+    return jnp.sum(100 * (x["b"] - x["a"] ** 2) ** 2 + (1 - x["a"]) ** 2)
+
+
+@pytest.mark.parametrize("forward", [None, True])
+def test_a_function_without_bounds_or_constraints(forward):
+    result = quiet(rosenbrock, {"a": -1.2, "b": 1.0}, None, None, tolerance=1e-8, forward=forward)
+    assert result.reason == "converged" and result.constraints.shape == (0,)
+    # ∇ of f/24.2 is 1e-8: over its least curvature, 0.4, 6e-7.
+    np.testing.assert_allclose([result.x["a"], result.x["b"]], [1.0, 1.0], rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("forward", [None, True])
+def test_bounds_on_one_side_and_optima_far_from_the_start(forward):
+    """x0 says nothing of where the optimum is: 1e3, e¹⁰, the lower bound, the upper one."""
+
+    def fun(x):
+        far, rate, low, high = x["far"], x["rate"], x["low"], x["high"]
+        return (far / 1e3 - 1) ** 2 + (jnp.log(rate) - 10) ** 2 + low + (high - 9.0) ** 2
+
+    x0 = {"far": 0.1, "rate": 1.0, "low": 3.0, "high": -7.0}
+    lower = {"far": None, "rate": None, "low": 2.0, "high": -np.inf}
+    upper = {"far": np.inf, "rate": None, "low": np.inf, "high": 4.0}
+    log_scale = {"far": False, "rate": True, "low": False, "high": False}
+    result = quiet(fun, x0, lower, upper, tolerance=1e-9, log_scale=log_scale, forward=forward)
+    assert result.reason == "converged"
+    assert float(result.x["low"]) == 2.0 and float(result.x["high"]) == 4.0  # projected, so no round-off
+    # A unit of z is 0.1 for "far", where f/361 is as flat as 2e-8/361.
+    assert float(result.x["rate"]) == pytest.approx(np.exp(10.0), rel=1e-6)
+
+
+def test_constraints_without_bounds():
+    result = quiet(disc, {"a": -1.0, "b": 0.0}, None, None)
+    assert result.reason == "converged"
+    np.testing.assert_allclose([result.x["a"], result.x["b"]], np.array([2, 1]) / np.sqrt(5), rtol=0, atol=3e-5)
+
+
 @pytest.mark.parametrize("missing", [True, False])
 def test_the_bar_is_optional(missing, monkeypatch, capsys):
     if missing:
@@ -198,7 +235,16 @@ def test_the_bar_is_optional(missing, monkeypatch, capsys):
         ({"log_scale": True}, r"A logarithmic scale needs positive bounds, got -1.0 for x"),
         ({"fun": lambda x: (jnp.log(x - 1.0), NO_CONSTRAINTS)}, r"not finite at `x0`"),
         ({"fun": lambda x: (x, jnp.stack([x * jnp.nan]))}, r"not finite at `x0`"),
-        ({"fun": lambda x: x**2}, r"`fun` must return \(objective of shape \(\), array of constraints\)"),
+        (
+            {"fun": lambda x: jnp.stack([x, x])},
+            r"`fun` must return its objective, shape \(\), or a pair \(obj.*shape=\(2,\)",
+        ),
+        ({"fun": lambda x: (x, x, x)}, r"`fun` must return its objective, shape \(\), or a pair"),
+        ({"fun": lambda x: (x, [x])}, r"`fun` must return its objective, shape \(\), or a pair"),
+        ({"lower": np.inf, "upper": np.inf}, r"`lower` must be below `upper`, got inf and inf for x"),
+        ({"lower": np.nan}, r"`lower` must be below `upper`, got nan and 1.0 for x"),
+        ({"x0": np.inf, "upper": None}, r"`x0` must be finite, got inf for x"),
+        ({"x0": -0.5, "lower": None, "log_scale": True}, r"A logarithmic scale needs positive `x0`, got -0.5 for x"),
         ({"x0": {}, "lower": {}, "upper": {}}, r"`x0` has no arrays"),
     ],
 )

@@ -58,3 +58,12 @@ def test_bad_starts():
         multi_start(two_valleys, 0, **BOUNDS, num_steps=3)
     with pytest.raises(ValueError, match=r"a = 3.0 is outside \[-2.0, 2.0\]"):
         multi_start(two_valleys, {"a": jnp.asarray([0.0, 3.0]), "b": jnp.zeros(2)}, **BOUNDS, num_steps=3)
+    with pytest.raises(ValueError, match="`starts`: 3 random designs need finite `lower` and `upper`; give them, or"):
+        multi_start(two_valleys, 3, lower={"a": -2.0, "b": None}, upper=BOUNDS["upper"], num_steps=3)
+
+
+@pytest.mark.parametrize("forward", [True, False])
+def test_designs_without_bounds(forward):
+    starts = {"a": jnp.asarray([1.5, -0.5]), "b": jnp.asarray([0.3, -1.0])}
+    found = multi_start(lambda x: two_valleys(x)[0], starts, num_steps=60, forward=forward, progress=False)
+    assert list(found.reason) == ["converged"] * 2 and found.best == 1

@@ -85,6 +85,13 @@ def test_methods_without_constraints(method):
     assert found.fun == pytest.approx(own.objective, abs=1e-8)  # SciPy's gradient is below 1e-5 or so: its square
 
 
+def test_a_problem_without_bounds():
+    problem = scipy_problem(lambda x: fun(x)[0], X0, log_scale=BOUNDS["log_scale"])
+    assert problem.bounds == [(-np.inf, np.inf)] * 3
+    found = scipy.optimize.minimize(problem.fun, problem.z0, jac=problem.jac, bounds=problem.bounds)
+    assert found.success and np.linalg.norm(jax.grad(lambda x: fun(x)[0])(problem.x(found.x))["p"]) < 1e-4
+
+
 def test_a_design_is_simulated_once_for_value_and_constraints():
     calls = []
 
@@ -114,6 +121,6 @@ def test_least_squares_within_bounds():
 
 def test_bad_problems():
     with pytest.raises(ValueError, match=r"`fun` must return"):
-        scipy_problem(lambda x: x["rate"], X0, **BOUNDS)
+        scipy_problem(lambda x: x["p"], X0, **BOUNDS)
     with pytest.raises(ValueError, match=r"must lie within the bounds: rate = 30\.0"):
         scipy_problem(fun, X0, lower=BOUNDS["lower"], upper={"rate": 20.0, "p": 1.0})
