@@ -1,6 +1,23 @@
-"""A progress bar, where tqdm is installed."""
+"""Signs of life: what is compiled and how long it took, and a progress bar where tqdm is installed."""
 
+import contextlib
+import sys
+import time
+from collections.abc import Iterator
 from typing import Any
+
+
+@contextlib.contextmanager
+def compiling(what: str, progress: bool = True) -> Iterator[None]:
+    """Say on stderr that something is compiled, and at the end how long it took."""
+    started = time.perf_counter()
+    if progress:
+        print(f"compiling {what} …", end="", file=sys.stderr, flush=True)
+    try:
+        yield
+    finally:
+        if progress:
+            print(f" {time.perf_counter() - started:.1f} s", file=sys.stderr, flush=True)
 
 
 class _Silent:

@@ -103,13 +103,37 @@ def test_figures_and_table_of_any_study(coarse, tmp_path, capsys, monkeypatch):
             assert curve["slopes_between"] == pytest.approx([2.0] * len(curve["slopes_between"]), abs=1e-6)
             assert curve["slope"] == pytest.approx(2.0, abs=1e-6)
     assert set(panels["fig4b"]["methods"]) - set(panels["fig4a"]["methods"]) == set(_paper.TREATMENTS)
-    assert "24/24" in captured.err  # six methods, four steps
+    assert "26/26" in captured.err  # two references; six methods, four steps
     assert captured.out.count("relative error, h [s] =") == 3
     # The end of the bump is a node of every grid.
     for key, t1 in (("fig4a", 0.3), ("fig4b", 2.0)):
         for h in panels[key]["methods"]["DDM of the scheme"]["h"]:
             assert 0.25 / h == pytest.approx(round(0.25 / h), rel=1e-12)
             assert t1 / h == pytest.approx(round(t1 / h), rel=1e-12)
+
+
+def test_an_interrupt_keeps_the_curves_that_are_finished(tmp_path, capsys, monkeypatch):
+    """In the second of four curves; before the first one nothing is left behind."""
+    calls = []
+
+    def gradient(study, panel, method, num_steps):
+        calls.append(method)
+        if len(calls) > stop:
+            raise KeyboardInterrupt
+        reference = isinstance(method, _paper.IndexReduced)
+        return panel.published * (1.0 if reference else 1.0 + (panel.t1 / num_steps) ** 2)
+
+    monkeypatch.setattr(_paper, "_gradient", gradient)
+    command, stop = ["--only", "fig2", "--coarse", "--out", tmp_path / "out"], 4
+    status, _, err = run(capsys, *command)
+    assert status == 130 and "interrupted before anything was found" in err and not (tmp_path / "out").exists()
+    calls.clear()
+    stop = 1 + 2 * (1 + _paper.CALLS) + 3
+    status, out, err = run(capsys, *command)
+    assert status == 130 and "1 curves written; the same command with --overwrite begins anew" in err
+    panel = json.loads((tmp_path / "out" / "paper.json").read_text(encoding="utf-8"))["panels"]["fig2"]
+    assert list(panel["methods"]) == ["DDM of the scheme"] and "DDM of the scheme" in out
+    assert (tmp_path / "out" / "fig2.png").read_bytes().startswith(PNG)
 
 
 def run(capsys, *arguments):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lgsens import plotting
 from lgsens.cli._main import main
 from lgsens.cli._report import kept_curves
 from lgsens.examples import CurveBounds, QuarterCar, SuspensionDesign
@@ -95,7 +96,7 @@ def test_bad_bounds(car, arguments, message):
         CurveBounds.around(car, **arguments)
 
 
-def test_the_command_draws_lists_and_animates(tmp_path, capsys, car):
+def test_the_command_draws_lists_and_animates(tmp_path, capsys, car, monkeypatch):
     out = tmp_path / "out"
     arguments = ["curves", "quarter-car", "--out", str(out), "--travel", "0.06", "--points", "5", "--axle", "front"]
     assert main(arguments) == 0
@@ -109,12 +110,22 @@ def test_the_command_draws_lists_and_animates(tmp_path, capsys, car):
     assert "camber [deg]" in printed and f"{np.degrees(float(expected.toe[0])):.4f}" in printed
     assert main(arguments) == 2 and "exists already" in capsys.readouterr().err
 
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(plotting, "animate", stop)
+    (out / "curves.csv").unlink()
+    assert main([*arguments, "--overwrite"]) == 130
+    assert sorted(path.name for path in out.iterdir()) == ["curves.csv", "curves.png"]
+    said = capsys.readouterr().err
+    assert "interrupted: curves.csv and curves.png written; the same command with --overwrite begins anew" in said
+
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["curves", "quarter-car", "--points", "1"], "--points: must be at least 2, got 1"),
-        (["curves", "quarter-car", "--travel", "0.5"], "No position satisfies the joints"),
+        (["curves", "quarter-car", "--travel", "0.5", "--quiet"], "No position satisfies the joints"),
         (["optimize", "quarter-car", "--keep-toe", "0.1"], "--keep-toe is about hardpoints, which --parameters k,c"),
     ],
 )

@@ -54,7 +54,7 @@ def work_precision(
             builder's default options.
         rounds: times are medians of so many calls, at least 5, after one that warms up; settings take turns, eight at
             a time.
-        progress: show a bar, where tqdm is installed.
+        progress: show a bar that says what is compiled, where tqdm is installed.
         known: a table of the same scene that was not finished: its rows and its reference are not measured again.
         keep: called with the table so far after each eight settings.
 
@@ -79,6 +79,7 @@ def work_precision(
             jax.clear_caches()
 
         if reference is None:
+            bar.set_postfix({"compiling": "the reference"})
             reference = converge(study, min(setting.num_steps for setting in settings), done)
         rows = {} if known is None else {(row.setting.label, row.setting.num_steps): row for row in known}
         of = lambda setting: (setting.label, setting.num_steps)
@@ -88,21 +89,20 @@ def work_precision(
         missing = [setting for setting in settings if of(setting) not in rows]
         for i in range(0, len(missing), tuned.PROGRAMS_TOGETHER):
             some = missing[i : i + tuned.PROGRAMS_TOGETHER]
-            rows |= {of(row.setting): row for row in _measured(study, some, reference, rounds, bar.update)}
+            rows |= {of(row.setting): row for row in _measured(study, some, reference, rounds, bar)}
             jax.clear_caches()
             if keep is not None:
                 keep(found())
     return found()
 
 
-def _measured(
-    study: Study, settings: Sequence[Setting], reference: Reference, rounds: int, done: Callable[[], Any]
-) -> list[Row]:
+def _measured(study: Study, settings: Sequence[Setting], reference: Reference, rounds: int, bar: Any) -> list[Row]:
     """The rows of a few settings, that take turns."""
     found = []
     for setting in settings:
+        bar.set_postfix({"compiling": f"{setting.label}, {setting.num_steps} steps"})
         found.append(_evaluated(study, setting, reference))
-        done()
+        bar.update()
     rows = [row for row, _ in found]
     times = {i: [] for i, row in enumerate(rows) if not row.failure}
     for _ in range(rounds):

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from lgsens import plotting
-from lgsens.cli._report import output_folder, written
+from lgsens._progress import compiling
+from lgsens.cli._report import ANEW, interrupted, output_folder, written
 from lgsens.examples import QuarterCar, SuspensionCurves
 
 # Heading, member of SuspensionCurves, factor to the unit shown, decimals.
@@ -32,10 +33,23 @@ def run(arguments: argparse.Namespace) -> int:
         plotting.figure()  # asks for matplotlib now
         car = QuarterCar.load(arguments.hardpoints)
         travel = np.linspace(-arguments.travel, arguments.travel, arguments.points)
-        curves = car.curves(travel, axle=arguments.axle)
-        write_table(curves, out / "curves.csv")
-        plotting.save(plotting.suspension_curves({car.name: curves}, title=car.name), out / "curves.png")
-        plotting.animate(car.travel(travel, links="bodies"), out / "travel.html", title=car.name)
+        with compiling("the positions of the wheel", not arguments.quiet):
+            curves = car.curves(travel, axle=arguments.axle)
+        files = {
+            "curves.csv": lambda path: write_table(curves, path),
+            "curves.png": lambda path: plotting.save(
+                plotting.suspension_curves({car.name: curves}, title=car.name), path
+            ),
+            "travel.html": lambda path: plotting.animate(car.travel(travel, links="bodies"), path, title=car.name),
+        }
+        for i, (name, write) in enumerate(files.items()):
+            try:
+                write(out / name)
+            except KeyboardInterrupt:
+                (out / name).unlink(missing_ok=True)
+                if not i:
+                    raise
+                return interrupted("curves", f"{' and '.join(list(files)[:i])} written", ANEW)
         if not arguments.quiet:
             print(table(curves), written(out), sep="\n")
     return 0

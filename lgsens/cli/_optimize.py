@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from lgsens import plotting
+from lgsens._progress import compiling
 from lgsens.cli._report import document, interrupted, output_folder, table, unfinished, write_json, written
 from lgsens.dynamics import RESULTS
 from lgsens.examples import CurveBounds, QuarterCar, Response, SuspensionCurves, SuspensionDesign
@@ -84,7 +85,8 @@ def _optimize(design: SuspensionDesign, steps: int, search: Path, progress: bool
         return response.objective, (response, trajectory.result)
 
     started = time.perf_counter()
-    evaluate = jax.jit(jax.value_and_grad(criteria, has_aux=True)).lower(design.start).compile()
+    with compiling("the gradient", progress):
+        evaluate = jax.jit(jax.value_and_grad(criteria, has_aux=True)).lower(design.start).compile()
     compiled = time.perf_counter()
     # A move of one box or one magnitude is a large change of the design.
     scale = {name: abs(value) for name, value in design.start.items() if name != "hardpoints"}

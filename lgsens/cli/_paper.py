@@ -1,6 +1,7 @@
 """`lgsens paper`: figures 2 and 4 of the paper, errors of sensitivities against the step size by all its methods."""
 
 import argparse
+import contextlib
 import itertools
 import os
 import statistics
@@ -13,7 +14,7 @@ import numpy as np
 
 from lgsens import plotting
 from lgsens._progress import progress_bar
-from lgsens.cli._report import output_folder, versions, write_json
+from lgsens.cli._report import ANEW, interrupted, output_folder, versions, write_json
 from lgsens.cli._top import REFERENCE
 from lgsens.criteria import Criterion, IndexReduced, Method, differentiate
 from lgsens.examples import PROBLEMS, Problem
@@ -141,9 +142,14 @@ def run(arguments: argparse.Namespace) -> int:
     names = [arguments.only] if arguments.only else list(STUDIES)
     with output_folder(arguments.out, arguments.overwrite) as out:
         panels: dict[str, Any] = {}
+        whole, drawn_files = True, []
         for name in names:
             study = STUDIES[name]()
-            found = measure(study, arguments.coarse, progress=not arguments.quiet)
+            found, whole = measure(study, arguments.coarse, progress=not arguments.quiet)
+            if not (found or panels):
+                raise KeyboardInterrupt
+            if not found:
+                break
             if not arguments.quiet:
                 print("\n\n".join(table(panel) for panel in found.values()), end="\n\n")
             drawn = []
@@ -151,7 +157,10 @@ def run(arguments: argparse.Namespace) -> int:
                 series = {method: (curve["h"], curve["relative_error"]) for method, curve in panel["methods"].items()}
                 drawn.append(plotting.ErrorPanel(study.panels[key].title, "relative error [–]", series))
             plotting.save(plotting.errors(drawn), out / f"{name}.png")
+            drawn_files.append(f"{name}.png")
             panels |= found
+            if not whole:
+                break
         document = {
             "source": "Sonneville & Bruls (2014), Fig. 2 and Fig. 4",
             "settings": {"only": arguments.only, "coarse": arguments.coarse},
@@ -164,37 +173,32 @@ def run(arguments: argparse.Namespace) -> int:
         }
         write_json(document, out / "paper.json", indent=2)
     if not arguments.quiet:
-        print(f"written to {out}: paper.json, {', '.join(f'{name}.png' for name in names)}")
+        print(f"written to {out}: paper.json, {', '.join(drawn_files)}")
+    if not whole:
+        return interrupted("paper", f"{sum(len(panel['methods']) for panel in panels.values())} curves written", ANEW)
     return 0
 
 
-def measure(study: PaperStudy, coarse: bool, progress: bool) -> dict[str, dict[str, Any]]:
-    """Everything about the panels of a study by their names, as for JSON."""
-    found = {}
-    for key, panel in study.panels.items():
-        method = IndexReduced(rtol=RTOL, breaks=study.breaks)
-        value = _gradient(study, panel, method, 1)  # the tolerances decide, not the number of steps
-        found[key] = {
-            "scene": study.scene,
-            "derivative": panel.label,
-            "unit": panel.unit,
-            "parameters": study.parameters,
-            "t1": panel.t1,
-            "rho_inf": RHO_INF,
-            "reference": {
-                "value": value,
-                "route": f"IndexReduced(rtol={RTOL:g}): diffrax on the index-reduced equations",
-                "published": panel.published,
-                "source": panel.source,
-                "relative_difference": abs(value / panel.published - 1),
-            },
-            "methods": {name: {} for name in panel.methods},
-        }
+def measure(study: PaperStudy, coarse: bool, progress: bool) -> tuple[dict[str, dict[str, Any]], bool]:
+    """Everything about the panels of a study by their names, as for JSON; and whether that is all.
+
+    After an interrupt it is the curves with all their steps.
+    """
     methods = {name: method for panel in study.panels.values() for name, method in panel.methods.items()}
     num_steps = study.coarse if coarse else study.num_steps
     runs = list(itertools.product(methods, num_steps))
-    with progress_bar(len(runs), "run", progress) as bar:
+    found: dict[str, dict[str, Any]] = {}
+    whole = False
+    with (
+        progress_bar(len(study.panels) + len(runs), "run", progress) as bar,
+        contextlib.suppress(KeyboardInterrupt),
+    ):
+        for key, panel in study.panels.items():
+            bar.set_postfix({"": f"reference of {key}"})
+            found[key] = _referred(study, panel)
+            bar.update()
         for name, count in runs:
+            bar.set_postfix({"": f"{name}, {count} steps"})
             for key, panel in study.panels.items():
                 if name in panel.methods:
                     row = _timed(study, panel, methods[name], count, found[key]["reference"]["value"])
@@ -203,11 +207,37 @@ def measure(study: PaperStudy, coarse: bool, progress: bool) -> dict[str, dict[s
             if count == num_steps[-1]:
                 jax.clear_caches()  # a program of the quarter-car takes 6,000 of the 65,530 memory maps of Linux
             bar.update()
-    for curve in (curve for panel in found.values() for curve in panel["methods"].values()):
-        h, error = np.log(curve["h"]), np.log(curve["relative_error"])
-        curve["slopes_between"] = (np.diff(error) / np.diff(h)).tolist()
-        curve["slope"] = float(np.polyfit(h[-SLOPE_STEPS:], error[-SLOPE_STEPS:], 1)[0])
-    return found
+        whole = True
+    for panel in found.values():
+        complete = lambda curve: curve and all(len(column) == len(num_steps) for column in curve.values())
+        panel["methods"] = {name: curve for name, curve in panel["methods"].items() if complete(curve)}
+        for curve in panel["methods"].values():
+            h, error = np.log(curve["h"]), np.log(curve["relative_error"])
+            curve["slopes_between"] = (np.diff(error) / np.diff(h)).tolist()
+            curve["slope"] = float(np.polyfit(h[-SLOPE_STEPS:], error[-SLOPE_STEPS:], 1)[0])
+    return {key: panel for key, panel in found.items() if panel["methods"]}, whole
+
+
+def _referred(study: PaperStudy, panel: Curves) -> dict[str, Any]:
+    """A panel without its curves: what it is, and its reference."""
+    method = IndexReduced(rtol=RTOL, breaks=study.breaks)
+    value = _gradient(study, panel, method, 1)  # the tolerances decide, not the number of steps
+    return {
+        "scene": study.scene,
+        "derivative": panel.label,
+        "unit": panel.unit,
+        "parameters": study.parameters,
+        "t1": panel.t1,
+        "rho_inf": RHO_INF,
+        "reference": {
+            "value": value,
+            "route": f"IndexReduced(rtol={RTOL:g}): diffrax on the index-reduced equations",
+            "published": panel.published,
+            "source": panel.source,
+            "relative_difference": abs(value / panel.published - 1),
+        },
+        "methods": {name: {} for name in panel.methods},
+    }
 
 
 def _gradient(study: PaperStudy, panel: Curves, method: Method, num_steps: int) -> float:

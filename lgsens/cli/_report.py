@@ -18,6 +18,7 @@ CONSTRAINTS = (
     ("minimum spring length", "spring_length", "minimum_spring_length", "m"),
     ("maximum spring length", "spring_length", "maximum_spring_length", "m"),
 )
+ANEW = "the same command with --overwrite begins anew"
 UNFINISHED = "search.npz", "tradeoff.json"  # from which --resume goes on
 UNITS = {"stiffness": "N/m", "damping": "N s/m", "hardpoints": "m"}
 
@@ -51,9 +52,9 @@ def unfinished(out: Path, name: str, resume: bool) -> Path:
     return path
 
 
-def interrupted(command: str, found: str | None) -> int:
+def interrupted(command: str, found: str | None, remedy: str = "the same command with --resume goes on") -> int:
     """Say so, what there is and how to go on; the exit status that shells have for it."""
-    more = f": {found}; the same command with --resume goes on" if found else " before anything was found"
+    more = f": {found}; {remedy}" if found else " before anything was found"
     print(f"\nlgsens {command}: interrupted{more}", file=sys.stderr)
     return 130
 

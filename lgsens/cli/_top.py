@@ -7,6 +7,7 @@ import time
 import jax
 import jax.numpy as jnp
 
+from lgsens._progress import compiling
 from lgsens.criteria import time_integral
 from lgsens.examples import spinning_top
 from lgsens.sensitivity import AbstractSensitivity, AdjointVariable, DirectDifferentiation
@@ -44,10 +45,13 @@ def run(arguments: argparse.Namespace) -> int:
         "finite differences": differences,
     }
     print(f"Spinning top, l = 1 m, alpha_0 = pi/4, t = 0..1 s, h = {1 / num_steps:g} s, rho_inf = 0.9")
-    print(f"Psi = {float(value_and_grad(alpha0)[0]):.16f}\n")
+    with compiling("value and gradient"):
+        psi_there = float(value_and_grad(alpha0)[0])
+    print(f"Psi = {psi_there:.16f}\n")
     print(f"{'dPsi/dalpha_0':<28}{'value':>22}{'relative error':>17}{'time [ms]':>12}")
     for name, derivative in methods.items():
-        jax.block_until_ready(derivative(alpha0))  # compiles
+        with compiling(name):
+            jax.block_until_ready(derivative(alpha0))
         started = time.perf_counter()
         value = float(derivative(alpha0))
         milliseconds = 1e3 * (time.perf_counter() - started)

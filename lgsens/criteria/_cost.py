@@ -9,6 +9,7 @@ import jax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
+from lgsens._progress import progress_bar
 from lgsens._validate import as_count
 from lgsens.criteria._advice import TYPICAL, Costs
 from lgsens.criteria._criterion import Criterion
@@ -17,26 +18,36 @@ from lgsens.sensitivity import AdjointVariable, DirectDifferentiation
 from lgsens.simulation import simulate
 
 
-def median_seconds(*functions: Callable[[], Any], repeats: int = 5) -> list[float]:
+def median_seconds(*functions: Callable[[], Any], repeats: int = 5, progress: bool = False) -> list[float]:
     """The wall time of each call, the median of several rounds in which they take turns, after one that compiles."""
     taken: list[list[float]] = [[] for _ in functions]
-    for turn in range(1 + repeats):
-        for function, times in zip(functions, taken):
-            started = time.perf_counter()
-            jax.block_until_ready(function())
-            if turn:
-                times.append(time.perf_counter() - started)
+    with progress_bar((1 + repeats) * len(functions), "call", progress) as bar:
+        for turn in range(1 + repeats):
+            bar.set_postfix({"": "timing" if turn else "compiling"})
+            for function, times in zip(functions, taken):
+                started = time.perf_counter()
+                jax.block_until_ready(function())
+                if turn:
+                    times.append(time.perf_counter() - started)
+                bar.update()
     return [statistics.median(times) for times in taken]
 
 
 def measure_costs(
-    criteria: PyTree, build: Callable[[Any], Any], p: PyTree, *, repeats: int = 5, **settings: Any
+    criteria: PyTree,
+    build: Callable[[Any], Any],
+    p: PyTree,
+    *,
+    repeats: int = 5,
+    progress: bool = True,
+    **settings: Any,
 ) -> Costs:
     """The costs of the direct and of the adjoint variable method on a scene, for `direct_or_adjoint`.
 
     Arguments:
         criteria, build, p: as in `differentiate`.
         repeats: timed calls of each kind, after one that compiles; the median counts.
+        progress: show a bar, where tqdm is installed.
         settings: t0, t1, num_steps, integrator, as in `differentiate`.
 
     Each method runs with all parameters and criteria and with one; the difference is the cost of each further one.
@@ -61,6 +72,7 @@ def measure_costs(
         gradient(adjoint, criteria, build, p),
         gradient(adjoint, leaves[0], build, p),
         repeats=repeats,
+        progress=progress,
     )
     direct_all, direct_one, adjoint_all, adjoint_one = (seconds / unit for seconds in times)
 

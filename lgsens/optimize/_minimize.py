@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from lgsens._progress import progress_bar
+from lgsens._progress import compiling, progress_bar
 from lgsens._validate import as_count
 from lgsens.linear import tuned
 from lgsens.optimize import _reverse_steps, _slsqp
@@ -106,7 +106,7 @@ def minimize(
         constraint_tolerance: the g up to which a design satisfies its constraints.
         forward: whether to differentiate in forward mode, static; None: where there are constraints and at most 40
             variables.
-        progress: show a bar, if tqdm is installed (`pip install "lgsens[plot]"`).
+        progress: say what is compiled, and show a bar, if tqdm is installed (`pip install "lgsens[plot]"`).
         callback: called after each evaluation with (step, f, max g).
         checkpoint: a file (.npz) that keeps the search, written after every evaluation. If it is there already, of
             the same problem, the search goes on from it to the same numbers, bit by bit, as if it had never been
@@ -123,7 +123,8 @@ def minimize(
     tolerances = checked_tolerances(tolerance, constraint_tolerance)
     started = time.perf_counter()
     method, shape = prepared(fun, x, unravel, box, tolerances, forward)
-    method.compile(x)
+    with compiling("objective, constraints and their derivatives", progress):
+        method.compile(x)
     compiled = time.perf_counter()
 
     start = method.begin(x)

@@ -11,7 +11,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from lgsens._progress import progress_bar
+from lgsens._progress import compiling, progress_bar
 from lgsens._validate import as_count
 from lgsens.optimize import _reverse_steps, _slsqp
 from lgsens.optimize._augmented_lagrangian import NOT_YET, REASONS
@@ -73,7 +73,7 @@ def multi_start(
         starts: a number of random ones, uniform between the bounds (in the logarithm, where `log_scale`), or designs as
             `sweep` takes them.
         seed: of the random ones.
-        progress: show a bar, if tqdm is installed.
+        progress: say what is compiled, and show a bar, if tqdm is installed.
         batch_size: as of `lgsens.sweep`, which runs the searches in reverse mode in batches over all devices, that last
             as long as their longest; in forward mode one search follows another.
         folder: keeps the searches, so that they go on when the process has died.
@@ -140,7 +140,8 @@ def _one_by_one(
 ) -> tuple[dict[str, np.ndarray], float, float]:
     """What `_searched` would find from each x, and the seconds of compilation and of the searches."""
     started, found = time.perf_counter(), []
-    method.compile(xs[0])
+    with compiling("objective, constraints and their Jacobian", progress):
+        method.compile(xs[0])
     compiled = time.perf_counter()
     with progress_bar(len(xs), "start", progress) as bar:
         for i, x in enumerate(xs):

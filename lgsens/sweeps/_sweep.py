@@ -12,7 +12,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jaxtyping import PyTree
 
-from lgsens._progress import progress_bar
+from lgsens._progress import compiling, progress_bar
 from lgsens._validate import as_count, leaf_name
 from lgsens.sweeps._batches import compile_batch, trace
 from lgsens.sweeps._folder import Store, in_folder, in_memory
@@ -100,7 +100,7 @@ def sweep(
         devices: what to compute on. None: all devices, of all processes under `jax.distributed`; every process calls
             `sweep` with the same designs and gets all results, the first one writes the folder. A CPU is one device:
             `jax.config.update("jax_num_cpu_devices", n)` before any computation gives it n.
-        progress: show a bar, if tqdm is installed (`pip install "lgsens[plot]"`).
+        progress: say what is compiled, and show a bar, if tqdm is installed (`pip install "lgsens[plot]"`).
 
     Every batch has the same size (the last one is filled up), so there is one compilation; it takes a second one
     only where memory asks for smaller batches. A design that fails, one with a value that is not finite, is marked in
@@ -124,7 +124,8 @@ def sweep(
     done = np.flatnonzero(store.done)
     again = done[np.argsort(~store.ok[done], kind="stable")][:1]  # a design that succeeded, if one did
     rows = np.concatenate([again, np.flatnonzero(~store.done)])
-    program = compile_batch(traced, designs, len(rows), batch_size, devices)
+    with compiling("a batch of designs", progress and first):
+        program = compile_batch(traced, designs, len(rows), batch_size, devices)
     started = time.perf_counter()
     with progress_bar(count, "design", progress and first, initial=len(done)) as bar:
         for start in range(0, len(rows), program.size):
