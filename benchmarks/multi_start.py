@@ -1,12 +1,12 @@
-"""Designs from many starts: `multi_start` in batches beside SLSQP, one search after another.
+"""Designs from many starts: `multi_start` in both modes, and SLSQP by itself.
 
     python benchmarks/multi_start.py [--problems k,c bands all] [--out benchmarks/results]
 
 The suspensions of optimizers.py from 16 random designs, the same for all methods, in one run on one thread:
 
-- multi_start: all searches of a batch in one program, which lasts as long as the longest of them;
-- the same steps, one search after another, their program compiled once;
-- SLSQP, one after another through one `scipy_problem`.
+- multi_start: SLSQP with value and Jacobian in one program, ended by the conditions of an optimum, one after another;
+- multi_start in reverse mode: all searches of a batch in one program, which lasts as long as the longest of them;
+- SLSQP, one after another through one `scipy_problem`, ended by itself.
 
 Counted are evaluations and seconds without compilation. A search is feasible with g ≤ 1e-3, and close with an f within
 1e-3 of the least that any of them found. Writes multi_start.json, problem by problem, and prints a table.
@@ -22,12 +22,9 @@ import benchmark
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from optimizers import CLOSE, Counted, search, suspension
 
 from lgsens.optimize import multi_start, scipy_problem
-from lgsens.optimize._box import checked_box
-from lgsens.optimize._minimize import REASONS, prepared
 
 STARTS = 16
 PROBLEMS = {
@@ -38,30 +35,15 @@ PROBLEMS = {
 Found = tuple[list, dict[str, Any]]  # the designs, None where a search has none, and figures
 
 
-def in_batches(fun: Callable, starts: list, settings: dict[str, Any], num_steps: int) -> Found:
-    found = multi_start(fun, starts, **settings, num_steps=num_steps, progress=False)
+def by_multi_start(fun: Callable, starts: list, settings: dict[str, Any], num_steps: int, forward: bool) -> Found:
+    found = multi_start(fun, starts, **settings, num_steps=num_steps, forward=forward, progress=False)
     return [jax.tree.map(lambda leaf, i=i: jnp.asarray(leaf[i]), found.x) for i in range(STARTS)], {
-        "jacobians": int(np.sum(found.steps)),
+        "jacobians" if forward else "gradients": int(np.sum(found.steps)),
         "longest": int(np.max(found.steps)),
         "seconds": found.run_seconds,
         "compile_seconds": found.compile_seconds,
         "reasons": found.reason.tolist(),
     }
-
-
-def one_by_one(fun: Callable, starts: list, settings: dict[str, Any], num_steps: int) -> Found:
-    x, unravel, box = checked_box(starts[0], settings["lower"], settings["upper"], settings["log_scale"])
-    begin, step, _ = prepared(fun, x, unravel, box, (1e-5, CLOSE), None)
-    step = jax.jit(step).lower(begin(x)).compile()
-    ends, reasons, count, begun = [], [], 0, time.perf_counter()
-    for start in starts:
-        carry = begin(ravel_pytree(start)[0])
-        while not int(carry.search.ended) and int(carry.search.step) < num_steps:
-            carry, _ = step(carry)
-        count += int(carry.search.step)
-        ends.append(unravel(box.value(carry.search.best.z)))
-        reasons.append(REASONS[int(carry.search.ended)])
-    return ends, {"jacobians": count, "seconds": time.perf_counter() - begun, "reasons": reasons}
 
 
 def slsqp(problem, zs: np.ndarray) -> Found:
@@ -86,8 +68,8 @@ def compare(fun: Callable, x0, settings: dict[str, Any], num_steps: int) -> dict
     starts = [problem.x(z) for z in zs]
     evaluate, rows = jax.jit(lambda x: fun(x)), {}
     for name, method in {
-        "multi_start": lambda: in_batches(fun, starts, settings, num_steps),
-        "one by one": lambda: one_by_one(fun, starts, settings, num_steps),
+        "multi_start": lambda: by_multi_start(fun, starts, settings, num_steps, True),
+        "multi_start in reverse mode": lambda: by_multi_start(fun, starts, settings, num_steps, False),
         "SLSQP": lambda: slsqp(problem, zs),
     }.items():
         ends, figures = method()
@@ -111,7 +93,9 @@ def table(problems: dict[str, dict]) -> str:
             found = feasible[name]
             cells = [f"{min(found, default=np.nan):.6g}", f"{len(found)} of {record['starts']}"]
             cells += [str(sum(f <= (1 + CLOSE) * least for f in found))]
-            cells += [", ".join(f"{row[kind]} {kind}" for kind in ("simulations", "jacobians") if kind in row)]
+            cells += [
+                ", ".join(f"{row[kind]} {kind}" for kind in ("simulations", "jacobians", "gradients") if kind in row)
+            ]
             lines.append(f"| {problem} | {name} | {' | '.join(cells)} | {row['seconds']:.3g} |")
     notes = [f"{name}: {benchmark.circumstances(record['environment'])}" for name, record in problems.items()]
     return "\n".join([*lines, "", *notes])
