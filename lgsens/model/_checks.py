@@ -20,6 +20,16 @@ from jaxtyping import Array, Float
 from lgsens._validate import as_float, is_concrete, leaf_name
 
 
+def strong(element: Any) -> Any:
+    """An element of one's own with arrays of one type in place of Python's numbers and weakly typed arrays.
+
+    An optimizer sees the former as no number of the model, and the latter are strongly typed after its first step: a
+    loop would be traced again.
+    """
+    weak = lambda leaf: isinstance(leaf, float | int) or getattr(leaf, "weak_type", False)
+    return jax.tree.map(lambda leaf: as_float(leaf, None, "a number") if weak(leaf) else leaf, element)
+
+
 def checked(what: str, element: Any) -> Any:
     """A body, joint or force with strongly typed float arrays as numbers.
 
@@ -82,9 +92,13 @@ def is_inertia(inertia, slack: float = 0.1) -> Any:
 
 def are_bodies(mass: Float[Array, " n"], inertia: Float[Array, "n 3 3"], orientation: Float[Array, "n 3 3"]):
     """Whether bodies have such numbers; without derivative."""
-    mass, inertia, orientation = lax.stop_gradient((mass, inertia, orientation))
+    positive, of_bodies, rotations = _sound(*lax.stop_gradient((mass, inertia, orientation)))
+    return jnp.all(positive & of_bodies & rotations)
+
+
+def _sound(mass, inertia, orientation):
     tilted = far_from_rotation(orientation, float(jnp.finfo(orientation.dtype).eps ** 0.5))
-    return jnp.all((mass > 0.0) & is_inertia(inertia) & ~tilted)
+    return mass > 0.0, is_inertia(inertia), ~tilted
 
 
 def invalid_numbers(system: Any) -> list[str]:
@@ -98,8 +112,10 @@ def invalid_numbers(system: Any) -> list[str]:
             "pose": tuple(leaf[own] for leaf in system.pose),
         }
         wrong = [part for part, numbers in parts.items() if not _finite(numbers)]
-        if not wrong and not are_bodies(system.mass[own], system.inertia[own], system.pose.orientation[own]):
-            wrong = [f"mass {float(system.mass[i]):.6g} kg, inertia or orientation"]
+        if not wrong:
+            sound = _sound(system.mass[own], system.inertia[own], system.pose.orientation[own])
+            parts = (f"mass {float(system.mass[i]):.6g} kg", "inertia", "orientation, far from a rotation")
+            wrong = [part for part, right in zip(parts, sound) if not right[0]]
         found += [f"body {name!r}: {part}" for part in wrong]
     for stack in (*system.constraints, *system.loads):
         for path, leaf in jax.tree_util.tree_leaves_with_path(stack.elements):

@@ -14,7 +14,7 @@ from lgsens.liegroups import nearest_rotation
 from lgsens.linear import AbstractLinearSolver
 from lgsens.model._assemble import assemble, assemble_merged
 from lgsens.model._body import RigidBody
-from lgsens.model._checks import checked, far_from_rotation, is_inertia
+from lgsens.model._checks import checked, far_from_rotation, is_inertia, strong
 from lgsens.model._evaluate_by_kind import stacked
 from lgsens.model._forces import AbstractForce
 from lgsens.model._frames import Frame
@@ -87,7 +87,10 @@ class Model(eqx.Module):
         ):
             if not isinstance(of, Mapping | None):
                 raise ValueError(f"Model: `{name}` must be a dict, each {kind} by its name, got {type(of).__name__}.")
-        self.bodies, self.joints, self.forces = dict(bodies), dict(joints or {}), dict(forces or {})
+        self.bodies, self.joints, self.forces = (
+            {name: strong(member) if isinstance(member, eqx.Module) else member for name, member in (of or {}).items()}
+            for of in (bodies, joints, forces)
+        )
         self.merge_fixed = merge_fixed
         if not isinstance(merge_fixed, bool):
             raise ValueError(f"Model: `merge_fixed` must be True or False, got {merge_fixed!r}.")

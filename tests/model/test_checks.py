@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from helpers import says
 
@@ -47,10 +48,20 @@ BAD = {
         lambda m: bob(m).inertia,
         jnp.array([1.0, 1.0, 3.0]),
         "Body 'bob': `inertia`.*is not that of a body",
-        "bob",
+        "'bob': inertia",
     ),
-    "scaled": (lambda m: bob(m).orientation, 1.5 * jnp.eye(3), "Body 'bob': `orientation`.*far from a rotation", "bob"),
-    "reflected": (lambda m: bob(m).orientation, -jnp.eye(3), "Body 'bob': `orientation`.*far from a rotation", "bob"),
+    "scaled": (
+        lambda m: bob(m).orientation,
+        1.5 * jnp.eye(3),
+        "Body 'bob': `orientation`.*far from a rotation; leave it to the model",
+        "'bob': orientation, far from a rotation",
+    ),
+    "reflected": (
+        lambda m: bob(m).orientation,
+        -jnp.eye(3),
+        "Body 'bob': `orientation`.*far from a rotation",
+        "'bob': orientation, far from a rotation",
+    ),
     "NaN axis": (lambda m: m.joints["hinge"].axis, jnp.full(3, NAN), "Joint 'hinge': `axis` must be finite", "hinge"),
     "length": (lambda m: m.joints["rod"].length, jnp.asarray(-1.0), "Joint 'rod'.*`length` must be positive", None),
     "NaN stiffness": (lambda m: m.forces["spring"].stiffness, NAN, "Force 'spring': `stiffness`.*finite", "spring"),
@@ -106,6 +117,45 @@ def test_equilibrium_and_derivatives_of_bad_numbers():
 def test_an_optimizer_may_leave_the_rotations_a_little():
     turned = eqx.tree_at(lambda m: bob(m).orientation, scene(), jnp.eye(3) + 0.02)
     assert run(turned).result == lg.RESULTS.successful
+
+
+class Weight(lg.AbstractForce):
+    """A force of one's own, whose numbers are as they are given."""
+
+    acceleration: jax.Array
+    share: float
+
+    @property
+    def bodies(self):
+        return ()
+
+    def loads(self, bodies):
+        return lg.Gravity(self.share * self.acceleration).loads(bodies)
+
+
+def test_a_loop_over_a_whole_model_is_traced_once():
+    """Numbers that Model was given as weakly typed arrays or Python floats are neither left out nor traced again."""
+    own = Weight(jnp.asarray(-9.81), 1.0)
+    assert own.acceleration.weak_type
+    model = lg.Model({"bob": bob(scene())}, {}, {"own": own})
+    numbers, rest = eqx.partition(model, eqx.is_inexact_array)
+    assert not jax.tree.leaves(rest)
+    optimizer, traces = optax.adamw(1e-2, weight_decay=0.1), []
+
+    @jax.jit
+    def step(numbers, state):
+        traces.append(0)
+        slope = jax.grad(lambda m: sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(m)))(numbers)
+        with jax.numpy_dtype_promotion("standard"):  # optax is less strict
+            updates, state = optimizer.update(slope, state, numbers)
+        return optax.apply_updates(numbers, updates), state
+
+    state = optimizer.init(numbers)
+    for _ in range(4):
+        numbers, state = step(numbers, state)
+    assert len(traces) == 1
+    found = eqx.combine(numbers, rest).forces["own"]
+    assert float(found.share) < 0.97 and not found.acceleration.weak_type  # four steps of 1e-2
 
 
 def test_inertias_are_those_of_bodies():
