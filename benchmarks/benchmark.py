@@ -37,8 +37,13 @@ SINGLE_THREAD = {
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
 }
-# the same, and loops whose turns read less than 10 MB become functions (README, "Small scenes on a CPU")
-ONE_FUNCTION = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000"
+# the same, and what lgsens asks of jaxlib 0.10 besides, for every rival in JAX: loops whose turns read less than 10 MB
+# become functions, and kernels are emitted without an MLIR compiler for each (`lgsens._xla`)
+ONE_FUNCTION = (
+    "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters=true,"
+    "xla_cpu_small_while_loop_byte_threshold=10000000"
+)
+AS_JAX_COMES = "--xla_backend_extra_options=none"  # a choice that lgsens leaves alone
 WHOLE_LOOPS = SINGLE_THREAD | {"XLA_FLAGS": f"{SINGLE_THREAD['XLA_FLAGS']} {ONE_FUNCTION}"}
 
 

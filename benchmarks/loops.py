@@ -1,10 +1,10 @@
-"""What is gained where XLA has one thread and makes functions of loops, README's "Small scenes on a CPU".
+"""What is gained by the options that lgsens gives XLA (loops as functions), and where XLA has one thread.
 
     python benchmarks/loops.py [--scenes top four_bar …] [--out benchmarks/results]
     python benchmarks/loops.py --readme       # the table of loops.json, into benchmarks/README.md; measures nothing
 
-Each program runs in three processes, one after the other: as JAX comes, with one thread, and with small loops as
-functions, too. 100 steps, from an initial state that is computed with them; medians of 20 runs after a warm-up, wall
+Each program runs in three processes, one after the other: as JAX comes, with the options of `lgsens._xla`, and with one
+thread, too. 100 steps, from an initial state that is computed with them; medians of 20 runs after a warm-up, wall
 time, compilation apart. JAX 0.12 makes functions of small loops unasked. Writes loops.json.
 """
 
@@ -14,7 +14,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from benchmark import SINGLE_THREAD, WHOLE_LOOPS, circumstances, environment, options, write
+from benchmark import AS_JAX_COMES, SINGLE_THREAD, circumstances, environment, options, write
 from compile_time import PROGRAMS, STEPS
 
 SCENES = ("top", "four_bar", "reduced_car", "quarter_car", "chain_8")
@@ -30,7 +30,7 @@ def markdown(document: dict) -> str:
     lines = [
         circumstances(document["environment"]),
         "",
-        "| scene | program | µs per step | one thread | ratio | loops as functions too | ratio | compile [s] |",
+        "| scene | program | µs per step | lgsens's options | ratio | one thread too | ratio | compile [s] |",
         "|---" * 8 + "|",
     ]
     for scene, programs in document["scenes"].items():
@@ -53,7 +53,7 @@ def main() -> None:
     document = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"scenes": {}}
     if not arguments.readme:
         for scene in arguments.scenes:
-            settings = ({}, SINGLE_THREAD, WHOLE_LOOPS)
+            settings = ({"XLA_FLAGS": AS_JAX_COMES}, {"XLA_FLAGS": ""}, SINGLE_THREAD)
             document["scenes"][scene] = {name: [run(scene, name, own) for own in settings] for name in PROGRAMS}
             document["environment"] = environment({})
             write(path, document)

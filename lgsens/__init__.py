@@ -8,7 +8,7 @@ group, Multibody System Dynamics, 2014). SI units; `jax.config.update("jax_enabl
 
 import importlib
 
-from lgsens._xla import compilation_cache as compilation_cache, without_wrong_sums
+from lgsens._xla import compilation_cache as compilation_cache, set_options
 from lgsens.analysis import (
     ConstraintRank as ConstraintRank,
     Growth as Growth,
@@ -105,7 +105,7 @@ _NAMESPACES = (
     "testing",
 )  # imported when first used: optax and matplotlib take their time
 
-without_wrong_sums()
+set_options()
 
 
 def __getattr__(name: str):
