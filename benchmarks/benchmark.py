@@ -43,7 +43,7 @@ ONE_FUNCTION = (
     "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters=true,"
     "xla_cpu_small_while_loop_byte_threshold=10000000"
 )
-AS_JAX_COMES = "--xla_backend_extra_options=none"  # a choice that lgsens leaves alone
+AS_JAX_COMES = "--xla_backend_extra_options=xla_lgsens=off"  # a choice that lgsens leaves alone
 WHOLE_LOOPS = SINGLE_THREAD | {"XLA_FLAGS": f"{SINGLE_THREAD['XLA_FLAGS']} {ONE_FUNCTION}"}
 
 

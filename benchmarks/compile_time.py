@@ -94,7 +94,7 @@ def measure(scene: str) -> dict:
             runs.append(run({"XLA_FLAGS": f"{SINGLE_THREAD['XLA_FLAGS']} {AS_JAX_COMES}"}))
         first, again, *other = (json.loads(text.splitlines()[-1]) for text in runs)
         found[program] = {"first": first, "again": again, "cache_bytes": size}
-        found[program] |= {"as_jax_comes": one for one in other}
+        found[program] |= dict(zip(("as_jax_comes",), other))
         print(f"{scene}, {program}: {first['seconds']:.1f} s, again {again['seconds']:.1f} s", flush=True)
     return found
 

@@ -52,12 +52,19 @@ def test_sums_are_right():
     assert found.returncode == 0, found.stderr[-2000:]
 
 
-@pytest.mark.parametrize("flags", ["", "--xla_cpu_multi_thread_eigen=false", f"{OPTION}=reduce", f"{EXTRA}=none"])
+@pytest.mark.parametrize("flags", ["", "--xla_cpu_multi_thread_eigen=false", f"{OPTION}=reduce", f"{EXTRA}=xla_lgsens=off"])
 def test_other_flags_stay_and_so_does_a_choice_of_ones_own(flags):
     found = run("import lgsens, os\n" + FLAGS, flags)
     added = {OPTION: f"{OPTION}=-reduce", EXTRA: SMALL_PROGRAMS}
     expected = [flags, *(value for option, value in added.items() if option not in flags)]
     assert found.stdout.split() == " ".join(expected).split(), found.stderr
+
+
+@pytest.mark.parametrize("flags", ["", f"{EXTRA}=xla_lgsens=off"])
+def test_xla_takes_the_options(flags):
+    """It ends the process at one that it cannot read."""
+    found = run("import lgsens, jax\nassert jax.jit(lambda x: x + 1)(1) == 2", flags)
+    assert found.returncode == 0, found.stderr
 
 
 @pytest.mark.parametrize("version", [(0, 10, 0), (0, 10, 1), (0, 12, 0), (0, 13, 0)])

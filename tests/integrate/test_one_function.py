@@ -12,7 +12,7 @@ import pytest
 import lgsens as lg
 from lgsens.examples import QuarterCar, spinning_top
 
-AS_JAX_COMES = "--xla_backend_extra_options=none"  # a choice that lgsens leaves alone
+AS_JAX_COMES = "--xla_backend_extra_options=xla_lgsens=off"  # a choice that lgsens leaves alone
 
 
 def psi(angle):
