@@ -32,8 +32,11 @@ them unasked. Of the quarter-car, relative to jaxlib 0.10.2 as it comes, one cor
 no slower). Both are keys of `--xla_backend_extra_options`, of which XLA ignores those that it does not know.
 """
 
+import contextlib
+import gc
 import os
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +53,7 @@ _OPTIONS = (
     (_SUMS, "-reduce", (0, 10, 2), (0, 13)),
     (_EXTRA, _SMALL_PROGRAMS, (0, 10), (0, 11)),
 )
+_COLLECTED = 100_000  # how many objects are made before Python looks for those that are no longer used
 
 
 def set_options() -> None:
@@ -76,6 +80,25 @@ def set_options() -> None:
             RuntimeWarning,
             stacklevel=3,
         )
+
+
+@contextlib.contextmanager
+def tracing() -> Iterator[None]:
+    """While a simulation and its derivatives are traced, of which it takes a half: 3.5 s instead of 6.3 s for the
+    quarter-car's gradient.
+
+    JAX keeps what it has traced by the mesh of its context, None outside of `jit` and an empty one where it evaluates a
+    custom rule: named as it is, it is the same in both, and nothing is traced for each of them. And a trace is millions
+    of small objects that live until it ends: Python looks through them a hundred times as seldom.
+    """
+    before = gc.get_threshold()
+    if 0 < before[0] < _COLLECTED:
+        gc.set_threshold(_COLLECTED, *before[1:])
+    try:
+        with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
+            yield
+    finally:
+        gc.set_threshold(*before)
 
 
 def compilation_cache(folder: str | os.PathLike | None = None) -> Path:

@@ -1,11 +1,14 @@
 """What lgsens asks of XLA when it is imported."""
 
+import gc
 import os
 import subprocess
 import sys
 
 import pytest
 from jaxlib.version import __version_info__ as VERSION
+
+from lgsens._xla import tracing
 
 OPTION = "--xla_cpu_experimental_ynn_fusion_type"
 EXTRA = "--xla_backend_extra_options"
@@ -52,7 +55,9 @@ def test_sums_are_right():
     assert found.returncode == 0, found.stderr[-2000:]
 
 
-@pytest.mark.parametrize("flags", ["", "--xla_cpu_multi_thread_eigen=false", f"{OPTION}=reduce", f"{EXTRA}=xla_lgsens=off"])
+@pytest.mark.parametrize(
+    "flags", ["", "--xla_cpu_multi_thread_eigen=false", f"{OPTION}=reduce", f"{EXTRA}=xla_lgsens=off"]
+)
 def test_other_flags_stay_and_so_does_a_choice_of_ones_own(flags):
     found = run("import lgsens, os\n" + FLAGS, flags)
     added = {OPTION: f"{OPTION}=-reduce", EXTRA: SMALL_PROGRAMS}
@@ -79,3 +84,11 @@ def test_an_import_after_jax_has_started_warns(flags):
     found = run("import jax.numpy as jnp\njnp.zeros(1)\nimport lgsens", flags)
     assert found.returncode == 0
     assert ("Import lgsens first" in found.stderr) == (not flags)
+
+
+def test_what_is_traced_sets_the_collector_back():
+    before = gc.get_threshold()
+    with pytest.raises(ValueError, match="of the user's"), tracing():
+        assert gc.get_threshold()[0] > before[0] or before[0] >= 100_000
+        raise ValueError("of the user's")
+    assert gc.get_threshold() == before

@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
 from lgsens._validate import as_count, as_float
+from lgsens._xla import tracing
 from lgsens.criteria._advice import direct_or_adjoint
 from lgsens.criteria._criterion import Criterion
 from lgsens.criteria._criterion_use import Use, checked_for
@@ -118,7 +119,8 @@ def differentiate(
         value, gradient = _index_reduced(task, p, method)
         result = jnp.zeros((), jnp.int32)
     else:
-        value, gradient, result, details, labels, note = _differentiate_jit(task, p, names, method)
+        with tracing():
+            value, gradient, result, details, labels, note = _differentiate_jit(task, p, names, method)
     values, gradients = (jax.tree.unflatten(structure, leaves) for leaves in (value, gradient))
     if throw and details is not None:
         values, gradients = throw_if_failed((values, gradients), result, details, labels, note)

@@ -50,9 +50,11 @@ and the loads −μ.a, −μ.lam/(βh²), Tᵀ μ.w and μ.v. Nothing of the pap
 accelerations and multipliers are unknowns here like the others.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -104,6 +106,7 @@ class Index3Step(AbstractStep):
         violation = system.constraint(motion.q, t) / (self.shared.scheme.beta * h**2)
         return residual, violation if softness is None else violation - softness * lam
 
+    @partial(jax.jit, static_argnames="kind", inline=True)  # traced once for the shape of the factors and for them
     def factors(self, motion, lam, kind=LU):
         shared, (_, t, h) = self.shared, self.node
         at_state = tangents(shared.system, motion.q, motion.v, motion.vdot, lam, t)
@@ -219,6 +222,7 @@ class Index3(AbstractEquations):
     def step(self, previous, node):
         return Index3Step(self, previous, node)
 
+    @partial(jax.jit, inline=True)  # traced once for both sweeps
     def linearized(self, node, previous, state):
         system, h = self.system, node.h
         x = increment(self.scheme, previous, state.a, h)

@@ -199,8 +199,13 @@ def _linear_scheme(scheme: AbstractScheme) -> GeneralizedAlpha:
 # derivative (`jnp.all`) with a tangent, and JAX refuses.
 
 
+@partial(jax.jit, static_argnums=0, inline=True)  # traced once for the trajectory and its rule
+def _marched(scheme, state0, parameters):
+    return states_of(scheme, parameters.system, parameters.grid, state0)
+
+
 def _run(scheme, state0, parameters, found=None):
-    states, stats = states_of(scheme, parameters.system, parameters.grid, state0) if found is None else found
+    states, stats = _marched(scheme, state0, parameters) if found is None else found
     return states, encoded(stats, states.v.dtype)
 
 

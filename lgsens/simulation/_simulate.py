@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from lgsens._validate import as_count, as_float, require
+from lgsens._xla import tracing
 from lgsens.dynamics import RESULTS, AbstractSystem, State, unsteady_rate
 from lgsens.integrate import (
     AbstractIntegrator,
@@ -132,7 +133,8 @@ def simulate(
     if save is not None and not callable(save):
         raise ValueError(f"`save` must be a function of an Instant, got {save!r}. Leave it out to have the trajectory.")
     t0, t1 = interval(t0, t1)
-    found, details = _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, save)
+    with tracing():
+        found, details = _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, save)
     if throw:
         fields = ("states", "error", "stages") if save is None else ("values", "final")  # the others say what happened
         motion = {name: getattr(found, name) for name in fields}
