@@ -128,6 +128,7 @@ def test_one_factorization_for_all_parameters_and_criteria(method, monkeypatch):
 
     def factorizations(criteria, build, p):
         made.clear()
+        jax.clear_caches()  # what has been traced before makes none
         jaxpr = jax.make_jaxpr(lambda p: lg.differentiate(criteria, build, p, method=method, **SETTINGS).gradient)(p)
         batched = [s for s in _lu_shapes(jaxpr.jaxpr) if s not in ((9, 9), block)]
         return len(made), batched
