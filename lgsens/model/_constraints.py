@@ -245,9 +245,10 @@ class InPlane(AbstractClosedFormConstraint):
 
 
 class Distance(AbstractClosedFormConstraint):
-    """Two body-fixed points keep their distance: Φ = |d| − L(t); λ is the tension of the rod [N].
+    """Two body-fixed points keep their distance: Φ = (d·d/L − L)/2; λ is the tension of the rod [N].
 
-    With n = d/|d|: B = nᵀD and D_q(Bᵀλ) = λ (Dᵀ (I − n nᵀ)/|d| D + D_q(Dᵀn)|_n).
+    Where Φ = 0 it has the derivatives of |d| − L, and no root: the start differentiates Φ four times, which for |d| is
+    a third of what a gradient with one rod compiles. With n = d/L: B = nᵀD and D_q(Bᵀλ) = λ (DᵀD/L + D_q(Dᵀn)|_n).
     """
 
     point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
@@ -269,21 +270,18 @@ class Distance(AbstractClosedFormConstraint):
         return number_of(self.length)
 
     def value(self, a, b, t):
-        d = b.point(self.point_b) - a.point(self.point_a)
-        return (jnp.linalg.norm(d) - at_time(self.length, t))[None]
+        d, length = b.point(self.point_b) - a.point(self.point_a), at_time(self.length, t)
+        return (0.5 * (jnp.sum(d * d) / length - length))[None]
 
     def jacobian(self, a, b, t):
         d, gradient = separation(a, b, self.point_a, self.point_b)
-        return (d / jnp.linalg.norm(d) @ gradient)[None, :]
+        return ((d / at_time(self.length, t)) @ gradient)[None, :]
 
     def force(self, a, b, lam, t):
         d = b.point(self.point_b) - a.point(self.point_a)
-        return separation_force(a, b, self.point_a, self.point_b, d / jnp.linalg.norm(d) * lam[0])
+        return separation_force(a, b, self.point_a, self.point_b, d * (lam[0] / at_time(self.length, t)))
 
     def geometric_stiffness(self, a, b, lam, t):
         d, gradient = separation(a, b, self.point_a, self.point_b)
-        length = jnp.linalg.norm(d)
-        n = d / length
-        along = n @ gradient
-        stiffness = (gradient.T @ gradient - jnp.outer(along, along)) / length
-        return (stiffness + separation_stiffness(a, b, self.point_a, self.point_b, n)) * lam[0]
+        tension = lam[0] / at_time(self.length, t)
+        return tension * (gradient.T @ gradient) + separation_stiffness(a, b, self.point_a, self.point_b, tension * d)

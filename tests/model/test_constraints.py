@@ -119,7 +119,7 @@ class UserDistance(AbstractConstraint):
     def value(self, a, b, t):
         first = a.position + a.orientation @ self.point_a
         second = b.position + b.orientation @ self.point_b
-        return jnp.sqrt(jnp.sum((second - first) ** 2, keepdims=True)) - self.length[None]
+        return 0.5 * (jnp.sum((second - first) ** 2, keepdims=True) / self.length[None] - self.length[None])
 
 
 class UserJoint(AbstractJoint):

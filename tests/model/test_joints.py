@@ -274,11 +274,11 @@ def test_only_the_orthogonal_part_of_the_second_arm_counts():
 
 
 def test_length_of_a_rod():
-    """Φ = |d| − L: a rod 0.2 m longer than the reference distance is violated by −0.2 m there."""
+    """Φ = (d·d/L − L)/2: a rod e = 0.2 m longer than the distance |d| = L − e is violated by −e + e²/(2L) there."""
     rng = np.random.default_rng(7)
     distance = np.linalg.norm(AT_B - AT)
     joint = lg.DistanceJoint(None, "b", at_a=AT, at_b=AT_B, length=distance + 0.2)
     model = lg.Model({"b": random_body(rng)}, {"rod": joint})
     assert not model.system().assembled
     value, _ = evaluate(model, model.system().pose)
-    assert abs(float(value[0]) + 0.2) < 100 * EPS
+    assert abs(float(value[0]) + 0.2 - 0.2**2 / (2.0 * (distance + 0.2))) < 100 * EPS
