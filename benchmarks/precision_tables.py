@@ -62,7 +62,7 @@ def markdown(document: dict[str, Any]) -> str:
                     f"{circumstances(found['environment'])}",
                     *(f"\nDid not finish: {name}." for name in found.get("failed", ())),
                     "",
-                    f"![error against time](results/work_precision_{name}.png)",
+                    f"![error against time](../../benchmarks/results/work_precision_{name}.png)",
                     "",
                     "| " + " | ".join(COLUMNS) + " |",
                     "|---" * len(COLUMNS) + "|",

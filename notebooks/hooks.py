@@ -1,0 +1,160 @@
+"""What the site is made of: README, the pages and notebooks beside this file, pictures, a page for each public name.
+
+Files keep their places in the repository, so that their links hold there and on the site. Pages of names are made of
+docstrings: `api/lgsens.simulate.md` says `::: lgsens.simulate`. A name that several namespaces have, as one object, has
+one page, and each namespace lists it. Names in code spans of the other pages lead there.
+"""
+
+import ast
+import enum
+import functools
+import html
+import importlib
+import inspect
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import griffe
+import latex2mathml.converter
+from mkdocs.plugins import event_priority
+from mkdocs.structure.files import File
+
+ROOT = Path(__file__).parents[1]
+SHOWN = (
+    *("README.md", "notebooks/**/*.md", "notebooks/*.ipynb", "benchmarks/README.md", "benchmarks/results/*.png"),
+    "tests/data/README.md",
+)
+NAMESPACES = (
+    *("lgsens", "lgsens.model", "lgsens.integrate", "lgsens.liegroups", "lgsens.analysis", "lgsens.accuracy"),
+    *("lgsens.optimize", "lgsens.sweeps", "lgsens.testing", "lgsens.plotting", "lgsens.examples"),
+)
+
+
+@functools.cache
+def public() -> dict[str, dict[str, str]]:
+    """By namespace, its names (what its `__init__` re-exports as `X as X`) and where each has its page."""
+    home: dict[tuple[str, int], str] = {}
+    found = {}
+    for namespace in NAMESPACES:
+        module = importlib.import_module(namespace)
+        imports = [node for node in ast.parse(inspect.getsource(module)).body if isinstance(node, ast.ImportFrom)]
+        names = {alias.name for node in imports for alias in node.names if alias.asname == alias.name}
+        found[namespace] = {
+            name: f"{home.setdefault((name, id(getattr(module, name))), namespace)}.{name}"
+            for name in sorted(names, key=lambda name: (name.lower(), name))
+        }
+    return found
+
+
+def pages() -> Iterator[tuple[str, str]]:
+    """Path and text of the pages of all namespaces and their names."""
+    for namespace, names in public().items():
+        module = importlib.import_module(namespace)
+        rows = [f"| [`{name}`]({page}.md) | {_sentence(getattr(module, name))} |" for name, page in names.items()]
+        about = inspect.getdoc(module) or ""
+        yield f"api/{namespace}.md", "\n".join([f"# {namespace}", "", about, "", "| | |", "|---|---|", *rows, ""])
+        for page in names.values():
+            if page.rpartition(".")[0] == namespace:
+                yield f"api/{page}.md", f"::: {page}\n"
+
+
+def _sentence(found: Any) -> str:
+    """The first sentence of a docstring, in a cell of a table; of a value, what it is."""
+    if not (inspect.isroutine(found) or inspect.isclass(found)):
+        return f"a {type(found).__name__}"
+    paragraph = (inspect.getdoc(found) or "").partition("\n\n")[0].replace("\n", " ").replace("|", "\\|")
+    return re.split(r"(?<=[.:])\s+(?=[A-Z])|:$", paragraph)[0]
+
+
+def on_config(config):
+    """Pages of names in the navigation, behind those that the configuration lists."""
+    listed = [
+        {
+            namespace: [
+                f"api/{namespace}.md",
+                *({name: f"api/{page}.md"} for name, page in names.items() if page == f"{namespace}.{name}"),
+            ]
+        }
+        for namespace, names in public().items()
+    ]
+    config.nav.append({"Names": listed})
+    return config
+
+
+@event_priority(100)  # before the plugin that looks for notebooks
+def on_files(files, config):
+    """Files from where they lie, and the pages of names."""
+    for path in (path for pattern in SHOWN for path in sorted(ROOT.glob(pattern))):
+        where = path.relative_to(ROOT).as_posix()
+        files.append(File(where, str(ROOT), config.site_dir, config.use_directory_urls))
+    for where, text in pages():
+        files.append(File.generated(config, where, content=text))
+    return files
+
+
+def on_page_markdown(markdown, page, **_):
+    """Code spans that are public names lead to their pages: `lg.sweep`, `GeneralizedAlpha(0.9)`, `lg.model.Frame`."""
+    where = page.file.src_uri
+    if where.startswith("api/") or where.endswith(".ipynb"):
+        return markdown
+    up = os.path.relpath("api", os.path.dirname(where) or ".")
+
+    def linked(span: re.Match) -> str:
+        path = re.sub(r"^lg\.", "lgsens.", span[2])
+        namespace, _, name = path.rpartition(".")
+        found = public().get(namespace or "lgsens", {}).get(name) or (path if path in public() else None)
+        return f"[{span[1]}]({up}/{found}.md)" if found else span[0]
+
+    parts = re.split(r"(^```.*?^```|^#.*?$|\[[^]]*\]\([^)]*\))", markdown, flags=re.DOTALL | re.MULTILINE)
+    span = r"(`([A-Za-z][\w.]*)(?:\([^`]*\))?`)"
+    return "".join(part if i % 2 else re.sub(span, linked, part) for i, part in enumerate(parts))
+
+
+def on_page_content(content, page, **_):
+    """Formulas of notebooks as MathML, which browsers show by themselves; nbconvert would have them load MathJax."""
+    if not page.file.src_uri.endswith(".ipynb"):
+        return content
+    content = re.sub(r"<!-- Load mathjax -->.*?<!-- End of mathjax configuration -->", "", content, flags=re.DOTALL)
+    parts = re.split(r"(<(pre|style|script)\b.*?</\2>)", content, flags=re.DOTALL)
+    return "".join(
+        re.sub(r"\$\$(.+?)\$\$|\$(.+?)\$", _mathml, part, flags=re.DOTALL) if i % 3 == 0 else part
+        for i, part in enumerate(parts)
+        if i % 3 < 2
+    )
+
+
+def _mathml(found: re.Match) -> str:
+    block, inline = found.groups()
+    return latex2mathml.converter.convert(html.unescape(block or inline), display="block" if block else "inline")
+
+
+class Constructors(griffe.Extension):
+    """Constructors of classes that have none of their own, from their fields: Equinox modules and named tuples."""
+
+    def on_package(self, *, pkg: griffe.Module, **_) -> None:
+        for module in _modules(pkg):
+            for cls in module.classes.values():
+                if not cls.is_alias and "__init__" not in cls.members and not cls.name.startswith(("_", "Abstract")):
+                    _construct(cls, getattr(importlib.import_module(module.path), cls.name))
+
+
+def _construct(cls: griffe.Class, found: Any) -> None:
+    if issubclass(found, enum.Enum) or not (hasattr(found, "__dataclass_fields__") or hasattr(found, "_fields")):
+        return
+    parameters = griffe.Parameters()
+    for name, parameter in inspect.signature(found).parameters.items():
+        annotation = getattr(cls.all_members.get(name), "annotation", None)
+        default = None if parameter.default is parameter.empty else repr(parameter.default)
+        kind = griffe.ParameterKind[parameter.kind.name.lower()]
+        parameters.add(griffe.Parameter(name, annotation=annotation, kind=kind, default=default))
+    cls.set_member("__init__", griffe.Function("__init__", parameters=parameters, parent=cls))
+
+
+def _modules(module: griffe.Module) -> Iterator[griffe.Module]:
+    yield module
+    for inner in module.modules.values():
+        if not inner.is_alias:
+            yield from _modules(inner)
