@@ -31,6 +31,7 @@ NAMESPACES = (
     *("lgsens", "lgsens.model", "lgsens.integrate", "lgsens.liegroups", "lgsens.analysis", "lgsens.accuracy"),
     *("lgsens.optimize", "lgsens.sweeps", "lgsens.testing", "lgsens.plotting", "lgsens.examples"),
 )
+FORMULA = r"\$\$(.+?)\$\$|\\\[(.+?)\\\]|\$(.+?)\$|\\\((.+?)\\\)"  # newer mkdocs-jupyter writes \[…\] and \(…\)
 
 
 @functools.cache
@@ -120,14 +121,20 @@ def on_page_content(content, page, **_):
     content = re.sub(r"<!-- Load mathjax -->.*?<!-- End of mathjax configuration -->", "", content, flags=re.DOTALL)
     parts = re.split(r"(<(pre|style|script)\b.*?</\2>)", content, flags=re.DOTALL)
     return "".join(
-        re.sub(r"\$\$(.+?)\$\$|\$(.+?)\$", _mathml, part, flags=re.DOTALL) if i % 3 == 0 else part
+        re.sub(FORMULA, _mathml, part, flags=re.DOTALL) if i % 3 == 0 else part
         for i, part in enumerate(parts)
         if i % 3 < 2
     )
 
 
+@event_priority(-100)  # after the plugin of notebooks
+def on_post_page(output, **_):
+    """Newer mkdocs-jupyter has every page load MathJax itself."""
+    return re.sub(r"<script data-mkdocs-jupyter-mathjax=.*?</script>\s*", "", output, flags=re.DOTALL)
+
+
 def _mathml(found: re.Match) -> str:
-    block, inline = found.groups()
+    block, inline = found[1] or found[2], found[3] or found[4]
     return latex2mathml.converter.convert(html.unescape(block or inline), display="block" if block else "inline")
 
 
