@@ -2,7 +2,7 @@
 
 Files keep their places in the repository, so that their links hold there and on the site. Pages of names are made of
 docstrings: `api/lgsens.simulate.md` says `::: lgsens.simulate`. A name that several namespaces have, as one object, has
-one page, and each namespace lists it. Names in code spans of the other pages lead there.
+one page, and each namespace lists it. Names in code spans of all pages lead there.
 """
 
 import ast
@@ -57,9 +57,17 @@ def pages() -> Iterator[tuple[str, str]]:
         rows = [f"| [`{name}`]({page}.md) | {_sentence(getattr(module, name))} |" for name, page in names.items()]
         about = inspect.getdoc(module) or ""
         yield f"api/{namespace}.md", "\n".join([f"# {namespace}", "", about, "", "| | |", "|---|---|", *rows, ""])
-        for page in names.values():
+        for name, page in names.items():
             if page.rpartition(".")[0] == namespace:
-                yield f"api/{page}.md", f"::: {page}\n"
+                yield f"api/{page}.md", f"::: {page}\n{_members(getattr(module, name))}"
+
+
+def _members(found: Any) -> str:
+    """Those of an enumeration, which have no docstrings."""
+    if not isinstance(found, enum.EnumMeta):
+        return ""
+    rows = (f"| `{member.name}` | {getattr(member, 'message', member.value)} |" for member in found)
+    return "\n".join(["", "| | |", "|---|---|", *rows, ""])
 
 
 def _sentence(found: Any) -> str:
@@ -96,35 +104,26 @@ def on_files(files, config):
     return files
 
 
-def on_page_markdown(markdown, page, **_):
-    """Code spans that are public names lead to their pages: `lg.sweep`, `GeneralizedAlpha(0.9)`, `lg.model.Frame`."""
-    where = page.file.src_uri
-    if where.startswith("api/") or where.endswith(".ipynb"):
-        return markdown
-    up = os.path.relpath("api", os.path.dirname(where) or ".")
+def on_page_content(content, page, **_):
+    """Code spans that are public names lead to their pages: `lg.sweep`, `GeneralizedAlpha(0.9)`, `lg.model.Frame`.
+
+    And formulas of notebooks are MathML, which browsers show by themselves; nbconvert would have them load MathJax.
+    """
+    own, up = page.file.src_uri, os.path.relpath("api", os.path.dirname(page.url) or ".")
 
     def linked(span: re.Match) -> str:
-        path = re.sub(r"^lg\.", "lgsens.", span[2])
+        path = re.sub(r"^lg\.", "lgsens.", span[1])
         namespace, _, name = path.rpartition(".")
         found = public().get(namespace or "lgsens", {}).get(name) or (path if path in public() else None)
-        return f"[{span[1]}]({up}/{found}.md)" if found else span[0]
+        return f'<a href="{up}/{found}.html">{span[0]}</a>' if found and own != f"api/{found}.md" else span[0]
 
-    parts = re.split(r"(^```.*?^```|^#.*?$|\[[^]]*\]\([^)]*\))", markdown, flags=re.DOTALL | re.MULTILINE)
-    span = r"(`([A-Za-z][\w.]*)(?:\([^`]*\))?`)"
-    return "".join(part if i % 2 else re.sub(span, linked, part) for i, part in enumerate(parts))
-
-
-def on_page_content(content, page, **_):
-    """Formulas of notebooks as MathML, which browsers show by themselves; nbconvert would have them load MathJax."""
-    if not page.file.src_uri.endswith(".ipynb"):
-        return content
     content = re.sub(r"<!-- Load mathjax -->.*?<!-- End of mathjax configuration -->", "", content, flags=re.DOTALL)
-    parts = re.split(r"(<(pre|style|script)\b.*?</\2>)", content, flags=re.DOTALL)
-    return "".join(
-        re.sub(FORMULA, _mathml, part, flags=re.DOTALL) if i % 3 == 0 else part
-        for i, part in enumerate(parts)
-        if i % 3 < 2
-    )
+    parts = re.split(r"(<(pre|style|script|a|h\d|b|strong)\b.*?</\2>)", content, flags=re.DOTALL)
+    for i in range(0, len(parts), 3):  # between those tags
+        parts[i] = re.sub(r"<code>([A-Za-z][\w.]*)(?:\([^<]*\))?</code>", linked, parts[i])
+        if own.endswith(".ipynb"):
+            parts[i] = re.sub(FORMULA, _mathml, parts[i], flags=re.DOTALL)
+    return "".join(part for i, part in enumerate(parts) if i % 3 < 2)
 
 
 @event_priority(-100)  # after the plugin of notebooks
