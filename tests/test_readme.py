@@ -4,6 +4,7 @@ The blocks marked `python` run, those of a page after those of README, as a read
 """
 
 import re
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,12 @@ def test_readme(readme):
     assert abs(gradient - printed) < 1e-8  # printed with eight decimals, cut
     assert readme["g"].joints["pivot"].at.shape == (3,)
     assert float(np.abs(readme["g"].bodies["top"].inertia).min()) > 0
+
+
+def test_length_and_citation():
     assert len(README.splitlines()) <= 150
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    assert f"\nversion: {version}\n" in README
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
