@@ -68,6 +68,28 @@ def methods(found: dict) -> str:
     return importlib.import_module("methods").markdown(found["scenes"])
 
 
+def choice(found: dict) -> str:
+    """Which derivative, by what it costs and loses on the four-bar at the finer step."""
+    scene, exact = found["scenes"]["four_bar"], "the numerical solution"
+    spread = lambda key: "{:.0e} … {:.0e}".format(
+        *sorted(scene["methods"][key]["errors"][-1])[:: len(scene["criteria"]) - 1]
+    )
+    same = lambda key: f"the same to {max(scene['difference_from_DDM'][key]):.0e}"
+    cost = lambda key: f"{scene['methods'][key]['cost']:.1f}"
+    direct, adjoint = "continuous DDM", "continuous AVM, state"
+    few = "few parameters, many criteria or active constraints; nothing is stored"
+    other = "to compare with the paper, §7; its other treatments of accelerations fall to order 1"
+    rows = (
+        ("`DirectDifferentiation()`", exact, spread("DDM"), 2, cost("DDM"), few),
+        ("`AdjointVariable()`", exact, same("AVM"), 2, cost("AVM"), "many parameters, few criteria; keeps the states"),
+        ("`ContinuousDirect()`", "the motion", spread(direct), 2, cost(direct), "to compare with the paper, §6.1"),
+        ('`ContinuousAdjoint("state")`', "the motion", spread(adjoint), 2, cost(adjoint), other),
+        ("`FiniteDifferences()`", exact, same("differences"), 2, "6 runs per parameter", "to check"),
+        ("`IndexReduced()`", "the motion", "tolerance", 8, "–", "as a reference, by diffrax"),
+    )
+    return grid("`method=` | derivative of | error: terminal, ∫q, ∫v, ∫v̇, ∫λ | order | cost | choose it", rows)
+
+
 def variable_steps(found: dict) -> str:
     keys = ("label", "steps", "rejected", "iterations")
     rows = (
@@ -122,6 +144,7 @@ TABLES: dict[str, tuple[str, tuple[str, ...], Callable[..., str]]] = {
         ("tradeoff_top", "tradeoff_quarter_car", "tradeoff_stiff_quarter_car"),
         recommendations,
     ),
+    "choice": ("choosing", ("methods",), choice),
     "variable steps": ("choosing", ("variable_steps",), variable_steps),
     "reference problems": ("verification", ("references",), references),
     "published": ("verification", ("references",), published),
