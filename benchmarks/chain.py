@@ -1,7 +1,6 @@
 """How a step, its gradient, compilation and memory grow with the length of a chain.
 
     python benchmarks/chain.py [--links 8 64 512] [--solvers auto dense] [--out benchmarks/results]
-    python benchmarks/chain.py --readme   # the table of chain.json, into benchmarks/README.md; measures nothing
 
 The spatial chain of hinged links, 6 N coordinates and 5 N constraints, h = 1 ms, its end no faster than 8 m/s. Time per
 step is the difference of runs of 20 and 100 steps over the 80 between them, so that the initial state does not count:
@@ -18,10 +17,8 @@ import math
 import os
 import statistics
 import time
-from pathlib import Path
 
 from benchmark import SINGLE_THREAD, circumstances, environment, interleaved, options, write
-from rival_tables import put_into
 
 STEPS = (20, 100)
 H = 1e-3
@@ -114,24 +111,19 @@ def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--links", nargs="+", type=int, default=[8, 64, 512])
     parser.add_argument("--solvers", nargs="+", choices=("auto", "dense"), default=["auto"])
-    parser.add_argument("--readme", action="store_true", help="put the table of chain.json into benchmarks/README.md")
     arguments = parser.parse_args()
     path = arguments.out / "chain.json"
-    if not arguments.readme:
-        os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
-        import jax
+    os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
+    import jax
 
-        jax.config.update("jax_enable_x64", True)
-        found, rows = environment(SINGLE_THREAD), []
-        for solver in arguments.solvers:
-            for links in arguments.links:
-                rows.append(measure(links, solver, arguments.repeats))
-                print(rows[-1], flush=True)
-        write(path, {"environment": found, "rows": rows, "slopes": slopes(rows)})
-    text = table(json.loads(path.read_text(encoding="utf-8")))
-    if arguments.readme:
-        put_into(Path(__file__).parent / "README.md", text, "chains")
-    print(text)
+    jax.config.update("jax_enable_x64", True)
+    found, rows = environment(SINGLE_THREAD), []
+    for solver in arguments.solvers:
+        for links in arguments.links:
+            rows.append(measure(links, solver, arguments.repeats))
+            print(rows[-1], flush=True)
+    write(path, {"environment": found, "rows": rows, "slopes": slopes(rows)})
+    print(table(json.loads(path.read_text(encoding="utf-8"))))
 
 
 if __name__ == "__main__":

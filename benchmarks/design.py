@@ -1,6 +1,6 @@
 """The optimum of the quarter-car's design by `minimize`, by SciPy's methods and by a grid that zooms in.
 
-`python benchmarks/design.py` writes benchmarks/results/design.json and prints the table of benchmarks/README.md.
+`python benchmarks/design.py` writes benchmarks/results/design.json and prints its table.
 Stiffness and damping are free, Ψ₀ is least under bounds on tyre force and spring length at every time step. SLSQP has
 all of these constraints; trust-constr, whose slack variables are as many, those samples that come near their limit in
 a design of the first grid that is nearly feasible. All are judged by all of them. The grid shares nothing with the

@@ -1,7 +1,6 @@
 """What is gained by the options that lgsens gives XLA (loops as functions), and where XLA has one thread.
 
     python benchmarks/loops.py [--scenes top four_bar …] [--out benchmarks/results]
-    python benchmarks/loops.py --readme       # the table of loops.json, into benchmarks/README.md; measures nothing
 
 Each program runs in three processes, one after the other: as JAX comes, with the options of `lgsens._xla`, and with one
 thread, too. 100 steps, from an initial state that is computed with them; medians of 20 runs after a warm-up, wall
@@ -17,6 +16,11 @@ from pathlib import Path
 from benchmark import AS_JAX_COMES, SINGLE_THREAD, circumstances, environment, options, write
 from compile_time import PROGRAMS, STEPS
 
+SETTINGS = {
+    "as JAX comes": {"XLA_FLAGS": AS_JAX_COMES},
+    "lgsens's options": {"XLA_FLAGS": ""},
+    "one thread too": SINGLE_THREAD,
+}
 SCENES = ("top", "four_bar", "reduced_car", "quarter_car", "chain_8")
 
 
@@ -27,10 +31,11 @@ def run(scene: str, program: str, settings: dict[str, str]) -> dict:
 
 
 def markdown(document: dict) -> str:
+    first, *others = document["settings"]
     lines = [
         circumstances(document["environment"]),
         "",
-        "| scene | program | µs per step | lgsens's options | ratio | one thread too | ratio | compile [s] |",
+        f"| scene | program | {first} [µs/step] | {' | ratio | '.join(others)} | ratio | compile [s] |",
         "|---" * 8 + "|",
     ]
     for scene, programs in document["scenes"].items():
@@ -47,23 +52,17 @@ def markdown(document: dict) -> str:
 def main() -> None:
     parser = options(__doc__, repeats=False)
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
-    parser.add_argument("--readme", action="store_true", help="put the table of loops.json into benchmarks/README.md")
     arguments = parser.parse_args()
     path = arguments.out / "loops.json"
-    document = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"scenes": {}}
-    if not arguments.readme:
-        for scene in arguments.scenes:
-            settings = ({"XLA_FLAGS": AS_JAX_COMES}, {"XLA_FLAGS": ""}, SINGLE_THREAD)
-            document["scenes"][scene] = {name: [run(scene, name, own) for own in settings] for name in PROGRAMS}
-            document["environment"] = environment({})
-            write(path, document)
-            print(scene, flush=True)
-    text = markdown(document)
-    if arguments.readme:
-        from rival_tables import put_into
-
-        put_into(Path(__file__).parent / "README.md", text, "loops")
-    print(text)
+    document = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    if document.get("settings") != list(SETTINGS):
+        document = {"settings": list(SETTINGS), "scenes": {}}
+    for scene in arguments.scenes:
+        document["scenes"][scene] = {name: [run(scene, name, own) for own in SETTINGS.values()] for name in PROGRAMS}
+        document["environment"] = environment({})
+        write(path, document)
+        print(scene, flush=True)
+    print(markdown(document))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """What a gradient in reverse mode keeps over a long run of the top, with and without checkpoints.
 
     python benchmarks/memory.py [--steps 1000 10000 100000] [--out benchmarks/results]
-    python benchmarks/memory.py --readme   # the table of memory.json, into benchmarks/README.md; measures nothing
 
 The gradient of the mean of x² with respect to the initial angle, h = 1 ms, through `simulate(…, save=…)`. Memory is
 what the compiled program says of its temporaries; times are medians of `--repeats` calls after one that compiles, the
@@ -11,10 +10,8 @@ programs of a length in turns, in simulations of the same length. Writes memory.
 import json
 import os
 import statistics
-from pathlib import Path
 
 from benchmark import SINGLE_THREAD, circumstances, environment, interleaved, options, write
-from rival_tables import put_into
 
 
 def measure(steps: int, repeats: int) -> list[dict]:
@@ -70,21 +67,16 @@ def table(document: dict) -> str:
 def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--steps", nargs="+", type=int, default=[1_000, 10_000, 100_000])
-    parser.add_argument("--readme", action="store_true", help="put the table of memory.json into benchmarks/README.md")
     arguments = parser.parse_args()
     path = arguments.out / "memory.json"
-    if not arguments.readme:
-        os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
-        import jax
+    os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
+    import jax
 
-        jax.config.update("jax_enable_x64", True)
-        found = environment(SINGLE_THREAD)
-        rows = [row for steps in arguments.steps for row in measure(steps, arguments.repeats)]
-        write(path, {"environment": found, "rows": rows})
-    text = table(json.loads(path.read_text(encoding="utf-8")))
-    if arguments.readme:
-        put_into(Path(__file__).parent / "README.md", text, "memory")
-    print(text)
+    jax.config.update("jax_enable_x64", True)
+    found = environment(SINGLE_THREAD)
+    rows = [row for steps in arguments.steps for row in measure(steps, arguments.repeats)]
+    write(path, {"environment": found, "rows": rows})
+    print(table(json.loads(path.read_text(encoding="utf-8"))))
 
 
 if __name__ == "__main__":

@@ -129,28 +129,27 @@ def cost(scene: Scene, method, num_steps: int, integrator, unit: float) -> float
     return median_seconds(lambda: scene.run(method, num_steps, integrator).gradient)[0] / unit
 
 
-def report(name: str, record: dict) -> None:
-    """The tables of one scene, in Markdown."""
-    criteria = record["criteria"]
-    print(
-        f"\n### {name}: {len(record['parameters'])} parameters, {len(criteria)} criteria, h = "
-        f"{record['t1'] / record['num_steps'][0]:g} s\n"
-    )
-    print("| discrete methods, difference from DDM | " + " | ".join(criteria) + " | cost |")
-    print("|---" * (len(criteria) + 2) + "|")
-    for label, differences in record["difference_from_DDM"].items():
-        seconds = record["methods"].get(label, {}).get("cost")
-        cells = [f"{value:.1e}" for value in differences] + ["–" if seconds is None else f"{seconds:.1f}"]
-        print(f"| {label} | " + " | ".join(cells) + " |")
-    finest = record["t1"] / record["num_steps"][-1]
-    print(f"\n| error at h = {finest:g} s (slope) | " + " | ".join(criteria) + " | cost |")
-    print("|---" * (len(criteria) + 2) + "|")
-    for label, found in record["methods"].items():
-        if "errors" not in found:
-            continue
-        cells = [f"{e:.1e} ({s:.2f})" for e, s in zip(found["errors"][-1], found["slopes"][-1])]
-        print(f"| {label} | " + " | ".join(cells) + f" | {found['cost']:.1f} |")
-    print("\ncosts in simulations: " + ", ".join(f"{key} {value:.2f}" for key, value in record["costs"].items()))
+def markdown(scenes: dict) -> str:
+    """The tables of all scenes."""
+    lines = []
+    for name, record in scenes.items():
+        criteria, finest = record["criteria"], record["t1"] / record["num_steps"][-1]
+        lines += [f"## {name}: {len(record['parameters'])} parameters, {len(criteria)} criteria", ""]
+        lines += ["| discrete methods, difference from DDM | " + " | ".join(criteria) + " | cost |"]
+        lines += ["|---" * (len(criteria) + 2) + "|"]
+        for label, differences in record["difference_from_DDM"].items():
+            seconds = record["methods"].get(label, {}).get("cost")
+            cells = [f"{value:.1e}" for value in differences] + ["–" if seconds is None else f"{seconds:.1f}"]
+            lines.append(f"| {label} | " + " | ".join(cells) + " |")
+        lines += ["", f"| error at h = {finest:g} s (slope) | " + " | ".join(criteria) + " | cost |"]
+        lines += ["|---" * (len(criteria) + 2) + "|"]
+        for label, found in record["methods"].items():
+            if "errors" in found:
+                cells = [f"{e:.1e} ({s:.2f})" for e, s in zip(found["errors"][-1], found["slopes"][-1])]
+                lines.append(f"| {label} | " + " | ".join(cells) + f" | {found['cost']:.1f} |")
+        costs = ", ".join(f"{key} {value:.2f}" for key, value in record["costs"].items())
+        lines += ["", f"costs in simulations: {costs}", ""]
+    return "\n".join(lines)
 
 
 def main() -> None:
@@ -173,8 +172,7 @@ def main() -> None:
             progress.set_description(name)
             document["scenes"][name] = compare(name, progress)
             path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    for name in arguments.scenes:
-        report(name, document["scenes"][name])
+    print(markdown({name: document["scenes"][name] for name in arguments.scenes}))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """What precision costs and what it loses: mixed precision beside double, and single precision over the step.
 
     python benchmarks/precision.py [--parts kernels mixed single] [--cache FOLDER] [--out benchmarks/results]
-    python benchmarks/precision.py --readme   # the table of precision.json, into benchmarks/README.md; measures nothing
 
 kernels: what a step does with its matrix, of 9 unknowns (the top), 35 and 94 (the quarter-car, reduced and whole) and
 208, random ones of condition 5e2: factors and one solution, one more solution, 32 columns, and the product with the
@@ -32,7 +31,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from benchmark import SINGLE_THREAD, circumstances, environment, interleaved, options, write
-from rival_tables import put_into
 
 PARTS = ("kernels", "mixed", "single")
 LOOPS = 50
@@ -250,33 +248,28 @@ def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--cache", help="folder for compiled programs (default: none)")
-    parser.add_argument("--readme", action="store_true", help="put the table into benchmarks/README.md")
     arguments = parser.parse_args()
     path = arguments.out / "precision.json"
     document = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    if not arguments.readme:
-        os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
-        import jax
+    os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
+    import jax
 
-        jax.config.update("jax_enable_x64", True)
-        if arguments.cache:
-            jax.config.update("jax_compilation_cache_dir", arguments.cache)
-            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-        for part in arguments.parts:
-            document[part] = {"environment": environment(SINGLE_THREAD), "rows": []}
-            for row in measure(part, arguments.repeats):
-                print(row, flush=True)
-                document[part]["rows"].append(row)
-                write(path, document)
+    jax.config.update("jax_enable_x64", True)
+    if arguments.cache:
+        jax.config.update("jax_compilation_cache_dir", arguments.cache)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    for part in arguments.parts:
+        document[part] = {"environment": environment(SINGLE_THREAD), "rows": []}
+        for row in measure(part, arguments.repeats):
+            print(row, flush=True)
+            document[part]["rows"].append(row)
+            write(path, document)
     if "single" in document:
         for row in document["single"]["rows"]:
             row |= fit(row["step"], row["error"])
         write(path, document)
         plot(document["single"]["rows"], arguments.out / "precision.png")
-    text = table(document)
-    if arguments.readme:
-        put_into(Path(__file__).parent / "README.md", text, "precision")
-    print(text)
+    print(table(document))
 
 
 if __name__ == "__main__":

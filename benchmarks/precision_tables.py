@@ -62,7 +62,7 @@ def markdown(document: dict[str, Any]) -> str:
                     f"{circumstances(found['environment'])}",
                     *(f"\nDid not finish: {name}." for name in found.get("failed", ())),
                     "",
-                    f"![error against time](results/work_precision_{name}.png)",
+                    f"![error against time](../../benchmarks/results/work_precision_{name}.png)",
                     "",
                     "| " + " | ".join(COLUMNS) + " |",
                     "|---" * len(COLUMNS) + "|",
@@ -75,12 +75,10 @@ def markdown(document: dict[str, Any]) -> str:
 
 def plot(found: dict[str, Any], path: Path) -> None:
     """Error of the gradient against time, both logarithmic, a line for each family."""
-    import matplotlib
+    from lgsens import plotting
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(7, 5), layout="constrained")
+    figure = plotting.figure(8.4, 5.0)
+    axes = figure.add_subplot()
     for i, family in enumerate(dict.fromkeys(r["rival"] for r in found["programs"])):
         points = sorted((r["gradient_error"], 1e3 * r["seconds"]) for r in found["programs"] if r["rival"] == family)
         # the front: no other program of the family is both faster and more accurate
@@ -93,6 +91,5 @@ def plot(found: dict[str, Any], path: Path) -> None:
     axes.set_xlabel("relative error of dΨ/dp")
     axes.set_ylabel("time of Ψ and dΨ/dp [ms]")
     axes.grid(which="both", alpha=0.3)
-    axes.legend()
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
+    figure.legend(loc="outside right upper", frameon=False)
+    plotting.save(figure, path)

@@ -1,6 +1,5 @@
 """The tables of rivals.json, in Markdown."""
 
-from pathlib import Path
 from typing import Any
 
 from benchmark import circumstances
@@ -95,14 +94,6 @@ def _scene(name: str, found: dict[str, Any]) -> list[str]:
         lines += ["", f"**{kind}**", "", "| " + " | ".join(COLUMNS) + " |", "|---" * len(COLUMNS) + "|"]
         lines += [_row(record) for record in found["programs"] if record["kind"] == kind]
     return lines
-
-
-def put_into(readme: Path, text: str, name: str) -> None:
-    """Replace what stands between the two marks of that name in the README by the tables."""
-    begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
-    before, rest = readme.read_text(encoding="utf-8").split(begin)
-    _, after = rest.split(end)
-    readme.write_text(f"{before}{begin}\n\n{text}\n\n{end}{after}", encoding="utf-8")
 
 
 def markdown(document: dict[str, Any]) -> str:

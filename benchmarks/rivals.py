@@ -16,7 +16,6 @@ work. Writes rivals.json (scenes that are not run keep their numbers there) and 
 import importlib
 import json
 import os
-from pathlib import Path
 
 from benchmark import WHOLE_LOOPS, options
 
@@ -31,22 +30,18 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", help="only this work, e.g. forward 'gradient, p' (default: all)")
     parser.add_argument("--references", action="store_true", help="compute the references of the scenes and compare")
     parser.add_argument("--table", action="store_true", help="print the tables of rivals.json, measure nothing")
-    parser.add_argument("--readme", action="store_true", help="as --table, and put them into benchmarks/README.md")
     arguments = parser.parse_args()
     path = arguments.out / "rivals.json"
     os.environ.update(WHOLE_LOOPS)  # before jax and numpy are imported
     tables = importlib.import_module("rival_tables")
-    if not (arguments.table or arguments.readme):
+    if not arguments.table:
         run = importlib.import_module("rival_run")
         if arguments.references:
             run.find_references(arguments.scenes, path)
         else:
             run.run(arguments.scenes, arguments.rivals, arguments.kinds, arguments.repeats, path)
         run.compare_again(path)
-    text = tables.markdown(json.loads(path.read_text(encoding="utf-8")))
-    if arguments.readme:
-        tables.put_into(Path(__file__).parent / "README.md", text, "tables")
-    print(text)
+    print(tables.markdown(json.loads(path.read_text(encoding="utf-8"))))
 
 
 if __name__ == "__main__":

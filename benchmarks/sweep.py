@@ -1,7 +1,6 @@
 """Designs per second of a sweep against the size of its batches: the top and the quarter-car, value and gradient.
 
     python benchmarks/sweep.py [--scenes …] [--sizes …] [--devices 2] [--out benchmarks/results]
-    python benchmarks/sweep.py --readme   # the table of sweep.json, into benchmarks/README.md; measures nothing
 
 Each size is a compiled batch, which runs until `--designs` are done; medians of `--repeats` rounds after a warm-up,
 compilation apart. `--devices 2` splits the processor into that many devices of JAX. Writes sweep.json, scene by scene,
@@ -13,14 +12,12 @@ import os
 import statistics
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
 from benchmark import WHOLE_LOOPS, circumstances, environment, options, write
-from rival_tables import put_into
 from tqdm import tqdm
 
 import lgsens as lg
@@ -110,32 +107,25 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
     parser.add_argument("--sizes", nargs="+", type=int, help="sizes of batches, in place of each scene's own")
     parser.add_argument("--designs", type=int, default=1024, help="designs of each row (default: %(default)s)")
-    parser.add_argument("--readme", action="store_true", help="put the table of sweep.json into benchmarks/README.md")
     arguments = parser.parse_args()
     path = arguments.out / "sweep.json"
     scenes = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    if not arguments.readme:
-        settings = WHOLE_LOOPS | {"PJRT_NPROC": str(arguments.devices)}  # a thread for each
-        os.environ.update(settings)  # before the first computation
-        jax.config.update("jax_enable_x64", True)
-        jax.config.update("jax_num_cpu_devices", arguments.devices)
-        for name in arguments.scenes:
-            scene = SCENES[name]
-            if arguments.sizes:
-                scene = scene._replace(sizes=tuple(arguments.sizes))
-            scenes[f"{name}, {arguments.devices} device(s), JAX {jax.__version__}"] = {
-                "name": name,
-                "devices": arguments.devices,
-                "environment": environment(settings),
-                "rows": {
-                    kind: measure(scene, kind, jax.devices(), arguments.repeats, arguments.designs) for kind in KINDS
-                },
-            }
-            write(path, scenes)
-    text = table(scenes)
-    if arguments.readme:
-        put_into(Path(__file__).parent / "README.md", text, "sweeps")
-    print(text)
+    settings = WHOLE_LOOPS | {"PJRT_NPROC": str(arguments.devices)}  # a thread for each
+    os.environ.update(settings)  # before the first computation
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_num_cpu_devices", arguments.devices)
+    for name in arguments.scenes:
+        scene = SCENES[name]
+        if arguments.sizes:
+            scene = scene._replace(sizes=tuple(arguments.sizes))
+        scenes[f"{name}, {arguments.devices} device(s), JAX {jax.__version__}"] = {
+            "name": name,
+            "devices": arguments.devices,
+            "environment": environment(settings),
+            "rows": {kind: measure(scene, kind, jax.devices(), arguments.repeats, arguments.designs) for kind in KINDS},
+        }
+        write(path, scenes)
+    print(table(scenes))
 
 
 if __name__ == "__main__":

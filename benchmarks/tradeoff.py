@@ -3,9 +3,9 @@
     python benchmarks/tradeoff.py [--scenes top quarter-car …] [--cache FOLDER] [--out benchmarks/results]
     python benchmarks/tradeoff.py --check [--scenes quarter-car …]   # with benchmarks/requirements.txt installed
 
-Writes tradeoff_NAME.json and tradeoff_NAME.png, prints the tables, the recommendations, and those again as rows for
-README. Most of the time is compilation: with `--cache` compiled programs are kept there, so that a second run
-measures on a machine that is otherwise idle; it then keeps the compile times of the first one, which are in the files.
+Writes tradeoff_NAME.json and tradeoff_NAME.png, prints the tables and the recommendations. Most of the time is
+compilation: with `--cache` compiled programs are kept there, so that a second run measures on a machine that is
+otherwise idle; it then keeps the compile times of the first one, which are in the files.
 
 `--check` compares what was recommended, for the quarter-cars, with Ψ and dΨ/dp of another program: the equations of
 motion written by hand in CasADi (`rival_casadi.py`), RK4 in generated C and its adjoint, in as many steps as leave it
@@ -117,15 +117,7 @@ def report(path: Path, by: str) -> None:
     found = [recommend(table, target, by=by) for target in TARGETS]
     write(record | {"by": by, "recommendations": recommendations(table, found)}, path)
     plotting.save(plot(table, TARGETS, by=by, title=record["scene"]), path.with_suffix(".png"))
-    print(table, *found, sep="\n\n", end="\n\n")
-    for one in found:
-        if one.row is None:
-            print(f"| {record['scene']} | {one.rtol:.0e} | none | | | | |")
-            continue
-        row = one.row
-        cells = (record["scene"], f"{one.rtol:.0e}", f"`{row.setting.label}`", str(row.setting.num_steps))
-        numbers = (f"{row.value_error:.0e}", f"{row.gradient_error:.0e}", f"{1e3 * getattr(row, by):.3g}")
-        print(f"| {' | '.join((*cells, *numbers))} |")
+    print(table, *found, sep="\n\n")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
     python benchmarks/work_precision.py [--scenes quarter_car …] [--cache FOLDER] [--out benchmarks/results]
     python benchmarks/work_precision.py --table     # table and plot again, from work_precision.json; measures nothing
-    python benchmarks/work_precision.py --readme    # and the table into benchmarks/README.md
 
 The gradient is that of Ψ₀ with respect to stiffness, damping and the 30 coordinates of the hardpoints. Each family of
 programs runs at several numbers of steps or tolerances; its error is that of the gradient against the motion itself
@@ -16,7 +15,6 @@ import importlib
 import json
 import multiprocessing
 import os
-from pathlib import Path
 
 from benchmark import SINGLE_THREAD, options
 
@@ -33,11 +31,10 @@ def main() -> None:
     parser.add_argument("--families", nargs="+", help="only these families of programs, lgsens's always (default: all)")
     parser.add_argument("--cache", help="folder for compiled programs (default: none)")
     parser.add_argument("--table", action="store_true", help="print the table, draw the plot, measure nothing")
-    parser.add_argument("--readme", action="store_true", help="as --table, and put the table into benchmarks/README.md")
     arguments = parser.parse_args()
     path = arguments.out / "work_precision.json"
     os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
-    if not (arguments.table or arguments.readme):
+    if not arguments.table:
         for scene in arguments.scenes:  # a process has memory maps for the programs of one of them
             process = multiprocessing.get_context("spawn").Process(
                 target=measure, args=(scene, arguments.families, arguments.repeats, path, arguments.cache)
@@ -48,12 +45,7 @@ def main() -> None:
                 raise SystemExit(f"The measurement of {scene} ended with {process.exitcode}.")
     tables = importlib.import_module("precision_tables")
     document = json.loads(path.read_text(encoding="utf-8"))
-    text = tables.markdown(document)
-    if arguments.readme:
-        importlib.import_module("rival_tables").put_into(
-            Path(__file__).parent / "README.md", text, "work against precision"
-        )
-    print(text)
+    print(tables.markdown(document))
     for name in document["scenes"]:
         tables.plot(document["scenes"][name], arguments.out / f"work_precision_{name}.png")
 

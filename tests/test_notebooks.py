@@ -97,4 +97,4 @@ def test_what_is_committed(name):
     assert not re.search(r"/(home|root|tmp|Users)/|0x[0-9a-f]{8}", path.read_text(encoding="utf-8"))
     for cell in cells(name, "markdown"):
         for link in re.findall(r"\]\(([^)#]+)\)", "".join(cell["source"])):
-            assert link.startswith(("https://", "out/")) or (NOTEBOOKS / link).exists(), link
+            assert link.startswith("https://") or (NOTEBOOKS / link).exists(), link

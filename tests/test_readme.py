@@ -1,30 +1,80 @@
-"""README.md: its examples run and give what they say; its two commands are there."""
+"""README.md and the pages of the guide: their examples run and give what they say; README's two commands are there.
+
+The blocks marked `python` run, those of a page after those of README, as a reader would; `py` marks fragments.
+"""
 
 import re
+import tomllib
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-def test_examples(tmp_path, monkeypatch):
-    """One after the other, as a reader would."""
-    monkeypatch.chdir(tmp_path)  # where a sweep keeps its results
-    source = "\n".join(re.findall(r"```python\n(.*?)```", README, re.DOTALL))
-    names: dict = {}
-    exec(compile(source, "README.md", "exec"), names)
-    jax, psi, top = names["jax"], names["psi"], names["top"]
-    printed = float(re.search(r"adjoint variable method: (-\d\.\d+)\.\.\.", source)[1])
+def blocks(text, language="python"):
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
+
+
+PAGES = [path for path in sorted((ROOT / "notebooks").rglob("*.md")) if blocks(path.read_text(encoding="utf-8"))]
+
+
+def run(text, filename, names):
+    """The blocks of a page, one after the other; returns `names` with theirs."""
+    exec(compile("\n".join(blocks(text)), filename, "exec"), names)
+    return names
+
+
+@pytest.fixture(scope="module")
+def readme():
+    """What the examples of README define."""
+    return run(README, "README.md", {})
+
+
+def test_readme(readme):
+    jax, psi, top = readme["jax"], readme["psi"], readme["top"]
+    printed = float(re.search(r"adjoint variable method: (-\d\.\d+)\.\.\.", README)[1])
     gradient = float(jax.grad(lambda a: psi(top(a)))(np.pi / 4))
     assert abs(gradient - printed) < 1e-8  # printed with eight decimals, cut
-    assert names["g"].joints["pivot"].at.shape == (3,)
-    assert float(np.abs(names["g"].bodies["top"].inertia).min()) > 0
+    assert readme["g"].joints["pivot"].at.shape == (3,)
+    assert float(np.abs(readme["g"].bodies["top"].inertia).min()) > 0
+
+
+def test_length_and_citation():
+    assert len(README.splitlines()) <= 150
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    assert f"\nversion: {version}\n" in README
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_page(path, readme, tmp_path, monkeypatch, capsys):
+    """And prints what stands below the block, numbers of one or two digits aside: those are round-off."""
+    monkeypatch.chdir(tmp_path)  # where a sweep keeps its results
+    text = path.read_text(encoding="utf-8")
+    names = run(text, path.name, dict(readme))
+    out = re.sub(r"\S*\de[+-]\d\d", "…", capsys.readouterr().out)
+    for shown in re.findall(r"\nprints\n\n```\n(.*?)```", text, re.DOTALL):
+        assert [line.split() for line in re.sub(r"\S*\de[+-]\d\d", "…", shown).splitlines()] == [
+            line.split() for line in out.splitlines()[: len(shown.splitlines())]
+        ]
+    CHECKS.get(path.stem, lambda names: None)(names)
+
+
+def _choosing(names):
+    jax, psi, top = names["jax"], names["psi"], names["top"]
     by_jax = float(jax.grad(lambda length: psi(top(0.7, length=length)))(1.0))
     # the same scheme in two programs, 1000 steps
     np.testing.assert_allclose(names["found"].gradient["side"]["length"], by_jax, rtol=1e-9)
     assert np.isfinite(names["found"].value["force"])
+
+
+def _sweeps(names):
     assert names["values"].shape == names["gradient"]["mass"].shape == (500,)
+
+
+CHECKS = {"choosing": _choosing, "sweeps": _sweeps}
 
 
 def test_commands():

@@ -149,4 +149,7 @@ def _figures(outcome: Outcome, out: Path) -> None:
         plotting.save(fig, out / "curves.png")
     # Preloads do not show either; with any free length they are not computed.
     models = {name: car.model(wheel=design.wheel, free_length=1.0, free_radius=1.0) for name, car in cars.items()}
-    plotting.save(plotting.mechanism(models, title=design.car.name), out / "mechanism.png")
+    plotting.save(
+        plotting.mechanism(models, title=design.car.name, axes_names=("x, forward", "y, left", "z, up")),
+        out / "mechanism.png",
+    )

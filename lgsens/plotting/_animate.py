@@ -13,8 +13,8 @@ import numpy as np
 from lgsens._validate import as_count
 from lgsens.analysis import Kinematics
 from lgsens.model import MultibodySystem
-from lgsens.plotting._mechanism import VIEW, draw, frame
-from lgsens.plotting._shapes import Shapes, placed, shapes, stretched
+from lgsens.plotting._mechanism import draw, frame, view_of
+from lgsens.plotting._shapes import Shapes, corners, placed, shapes
 from lgsens.plotting._style import ROAD, ROLES, figure
 from lgsens.simulation import Trajectory
 
@@ -78,8 +78,9 @@ def animate(
     if not speed > 0:
         raise ValueError(f"`speed` must be positive, got {speed}.")
     found = film(motion, speed, as_count(max_frames, "max_frames"))
-    everything = _corners(found)
-    view = _view(everything) if view is None else view
+    poses = zip(found.position, found.orientation)
+    everything = np.concatenate([corners(found.shapes, *pose) for pose in poses])  # of all frames
+    view = view_of(everything) if view is None else view
     if path.suffix == ".html":
         path.write_text(page(found, title, everything, view), encoding="utf-8")
         return path
@@ -135,22 +136,6 @@ def _digits(film: Film) -> int:
     """Decimals that tell the frames apart."""
     least = np.min(np.abs(np.diff(film.values)), initial=1.0)
     return int(np.clip(np.ceil(-np.log10(max(float(least), 1e-6))), 0, 6))
-
-
-def _corners(film: Film) -> np.ndarray:
-    """The points that must be in sight, of all frames, shape (n, 3)."""
-    found = []
-    for poses in zip(film.position, film.orientation):
-        found += [placed(shape, *poses).reshape(-1, 3) for shape in (*film.shapes.outlines, *film.shapes.joints)]
-        found += [stretched(strut, *poses)[0][[0, -1]] for strut in film.shapes.struts]
-    return np.concatenate(found)
-
-
-def _view(points: np.ndarray) -> tuple[float, float]:
-    """Across the plane of a motion in one of the coordinate planes; else as a mechanism is seen."""
-    extent = np.ptp(points, axis=0)
-    flat = int(np.argmin(extent))
-    return ((0.0, 0.0), (0.0, -90.0), (90.0, -90.0))[flat] if extent[flat] < 1e-6 * extent.max() else VIEW
 
 
 def _patch(centre: np.ndarray, height: float, size: float) -> np.ndarray:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from lgsens.plotting._style import COLOURS, CURVES, LIMIT, LIMIT_LINE, figure, legend_below, plain
+from lgsens.plotting._style import COLOURS, CURVES, IN_AXES, LIMIT, LIMIT_LINE, READABLE, figure, legend_below, plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -147,7 +147,7 @@ def work_precision(
         _target_line(axes, target)
     plain(axes)
     axes.set(xlabel=cost, ylabel=error, title=title)
-    axes.legend(frameon=False, loc="upper right", title=None if target is None else "cost at the target")
+    axes.legend(**IN_AXES, loc="upper right", title=None if target is None else "cost at the target")
     return fig
 
 
@@ -200,5 +200,5 @@ def _drawn(name: str, method: WorkPrecision) -> tuple[np.ndarray, np.ndarray]:
 
 def _target_line(axes: "Axes", target: float, linewidth: float = 1.2, side: str = "left") -> None:
     axes.axhline(target, **LIMIT_LINE | {"linewidth": linewidth})
-    style = {"color": LIMIT, "ha": side, "va": "bottom", "transform": axes.get_yaxis_transform()}
+    style = {"color": LIMIT, "ha": side, "va": "bottom", "transform": axes.get_yaxis_transform(), "bbox": READABLE}
     axes.text({"left": 0.01, "right": 0.99}[side], target, f"target {target:g}", **style)

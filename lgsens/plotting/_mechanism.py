@@ -1,21 +1,28 @@
 """The mechanism in space."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lgsens.model import Model
-from lgsens.plotting._shapes import Shapes, placed, shapes, stretched
-from lgsens.plotting._style import COLOURS, ROLES, figure
+from lgsens.plotting._shapes import Shapes, corners, placed, shapes, stretched
+from lgsens.plotting._style import COLOURS, ROLES, figure, legend_below
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 VIEW = (18.0, -38.0)  # elevation and azimuth [degree]
+ACROSS = ((0.0, 0.0), (0.0, -90.0), (90.0, -90.0))  # those of an eye on an axis of coordinates
+TICKS = 6  # along the longest axis
 
 
-def mechanism(models: Mapping[str, Model], title: str = "", view: tuple[float, float] = VIEW) -> "Figure":
+def mechanism(
+    models: Mapping[str, Model],
+    title: str = "",
+    view: tuple[float, float] | None = None,
+    axes_names: Sequence[str] = ("x", "y", "z"),
+) -> "Figure":
     """Mechanisms in their reference configuration, in space; the last in colour, those before it in grey.
 
     A body is drawn from the points at which joints hold it: two make a bar, more a solid; one with a tyre is a wheel;
@@ -25,46 +32,65 @@ def mechanism(models: Mapping[str, Model], title: str = "", view: tuple[float, f
     Arguments:
         models: scenes by name, drawn over each other.
         title: over the figure.
-        view: elevation and azimuth [degree].
+        view: elevation and azimuth [degree]; None: from the front, or across the plane in which everything lies.
+        axes_names: names of the inertial axes: ("x, forward", "y, left", "z, up") of a car.
 
     Raises `ImportError` without matplotlib.
     """
     fig = figure(8.0, 7.0, title)
     axes: Any = fig.add_subplot(projection="3d")
-    points, labels = [], {}
+    points, held, labels = [], [], {}
     for name, model in models.items():
         last = name == list(models)[-1]
         system = model.system()
         position, orientation = (np.asarray(array) for array in system.pose)
         scene = shapes(system)
         points.append(draw(axes, scene, position, orientation, last))
+        held.append(corners(scene, position, orientation))
         if len(models) > 1:
             labels[name] = ROLES["link"] if last else COLOURS[0]
         else:
             seen = {shape.role for shape in (*scene.outlines, *scene.struts)}
             labels = {role: colour for role, colour in ROLES.items() if role in seen}
-    frame(axes, np.concatenate(points), view)
+    frame(axes, np.concatenate(points), view_of(np.concatenate(held)) if view is None else view, axes_names)
     if labels:
-        handles = [axes.plot([], [], [], color=labels[label], linewidth=3, label=label)[0] for label in labels]
-        axes.legend(handles=handles, frameon=False, loc="upper center", ncols=len(handles), columnspacing=1.2)
+        line = lambda label, colour: axes.plot([], [], [], color=colour, linewidth=3, label=label)[0]
+        handles = {label: line(label, colour) for label, colour in labels.items()}
+        legend_below(fig, handles, len(handles))
     return fig
 
 
-def frame(axes: Any, points: np.ndarray, view: tuple[float, float]) -> None:
+def view_of(points: np.ndarray) -> tuple[float, float]:
+    """Across the plane of points in one of the coordinate planes; else as a mechanism is seen."""
+    extent = np.ptp(points, axis=0)
+    flat = int(np.argmin(extent))
+    return ACROSS[flat] if extent[flat] < 1e-6 * extent.max() else VIEW
+
+
+def frame(axes: Any, points: np.ndarray, view: tuple[float, float], names: Sequence[str] = ("x", "y", "z")) -> None:
     """Equal axes that hold some points, with their names, seen from somewhere."""
+    from matplotlib.ticker import MaxNLocator
+
     low, high = points.min(axis=0), points.max(axis=0)
-    margin = 0.03 * np.max(high - low)
+    span = np.max(high - low)
+    margin, shares = 0.03 * span, (high - low) / span
     for setter, a, b in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), low - margin, high + margin):
         setter(a, b)
-    axes.set_box_aspect(high - low + 2 * margin, zoom=0.95)
+    across = ACROSS.index(tuple(view)) if tuple(view) in ACROSS else None  # the axis that points at the eye
+    tall = max(0.0, shares[2] - max(shares[:2]))  # what stands upright leaves little room below
+    axes.set_box_aspect(high - low + 2 * margin, zoom=0.9 - 0.15 * tall if across is None else 1.05)
+    axes.set_proj_type("persp" if across is None else "ortho")
     axes.view_init(*view)
-    axes.set(xlabel="x [m], forward", ylabel="y [m], left", zlabel="z [m], up")
-    for axis, extent in zip((axes.xaxis, axes.yaxis, axes.zaxis), high - low):
+    for i, (axis, share) in enumerate(zip((axes.xaxis, axes.yaxis, axes.zaxis), shares)):
         axis.set_pane_color((0.98, 0.98, 0.98))
-        axis.labelpad = 8
-        if extent < 1e-6 * np.max(high - low):  # numbers would lie on each other
-            axis.set_ticks([])
-            axis.set_label_text("")
+        ends = 0.1 * share if across is None and i < 2 else 0.0  # where two axes meet before the eye
+        ticks = MaxNLocator(max(1, int(TICKS * share)), min_n_ticks=1).tick_values(low[i], high[i])
+        inside = (ticks >= low[i] + ends * span - margin) & (ticks <= high[i] - ends * span + margin)
+        shown = share >= 0.15  # else numbers would lie on each other
+        axis.set_ticks(ticks[inside] if shown and i != across else [])
+        axis.set_label_text("" if i == across or share < 1e-6 else f"{names[i]} [m]")
+        # matplotlib measures it by the other axes; without numbers the name takes their place
+        axis.labelpad = 10 / max(np.max(np.delete(shares, i)), 0.05) if shown else -8
 
 
 def draw(axes: Any, scene: Shapes, position, orientation, coloured: bool = True) -> np.ndarray:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from lgsens.examples import SuspensionCurves
-from lgsens.plotting._style import COLOURS, LIMIT, LIMIT_LINE, figure, plain
+from lgsens.plotting._style import COLOURS, IN_AXES, LIMIT, LIMIT_LINE, READABLE, figure, legend_below, plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,20 +49,23 @@ def time_histories(t, panels: Sequence[Panel], title: str = "") -> "Figure":
     fig = figure(8.0, 1.2 + 2.3 * len(panels), title)
     all_axes = fig.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     t = np.asarray(t)
+    names = dict.fromkeys(name for panel in panels for name in panel.series)
+    colours = {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
+    handles: dict[str, Any] = {}
     for axes, panel in zip(all_axes, panels):
-        for i, (name, values) in enumerate(panel.series.items()):
-            axes.plot(t, np.asarray(values), label=name, color=COLOURS[i % len(COLOURS)], linewidth=1.8)
+        for name, values in panel.series.items():
+            (handles[name],) = axes.plot(t, np.asarray(values), label=name, color=colours[name], linewidth=1.8)
         for name, value in panel.limits.items():
             axes.axhline(value, **LIMIT_LINE)
             # The name stands at the right end of its line, where motions have died out.
             place = {"xycoords": ("axes fraction", "data"), "xytext": (-4, 3), "textcoords": "offset points"}
-            axes.annotate(name, (1.0, value), **place, ha="right", color=LIMIT, fontsize=9)
+            axes.annotate(name, (1.0, value), **place, ha="right", color=LIMIT, fontsize=9, bbox=READABLE)
         plain(axes)
         axes.margins(x=0, y=0.12)
         axes.set_ylabel(panel.label)
     fig.align_ylabels()
     all_axes[-1].set_xlabel("time [s]")
-    all_axes[0].legend(frameon=False, ncols=len(panels[0].series), loc="upper right")
+    legend_below(fig, handles, len(handles))
     return fig
 
 
@@ -99,7 +102,7 @@ def convergence(history: Any, *, tolerance: float, best: int | None = None, obje
         middle.set_ylim(low, high)
         middle.text(0.99, 0.97, "violated", transform=middle.transAxes, ha="right", va="top", color=LIMIT)
     if best is not None:
-        top.legend(frameon=False, loc="upper right")
+        top.legend(**IN_AXES, loc="upper right")
     bottom.set_xlabel("step")
     fig.align_ylabels()
     return fig
@@ -142,5 +145,5 @@ def suspension_curves(
     for axes in all_axes[-1]:
         axes.set_xlabel("wheel travel [mm], bump +")
     if len(curves) > 1:
-        all_axes[0, 0].legend(frameon=False, loc="lower left")
+        legend_below(fig, dict(zip(curves, all_axes[0, 0].lines)), len(curves))
     return fig

@@ -2,8 +2,9 @@
 
 Elements say what they are drawn as, and where (`AbstractElement`). A body is drawn from the points at which joints
 hold it: two make a bar, more a solid. With one point (a pendulum, a top) it is a bar to the centre of mass and a box,
-with none a box: the homogeneous cuboid of its mass and inertia, of a point mass a small cube. A body with a tyre is a
-wheel. Springs are coils, dampers tubes with a rod, massless rods lines.
+with none a box: the homogeneous cuboid of its mass and inertia, a small cube of a point mass, and of a body on a joint
+where that would be larger than the scene. A body with a tyre is a wheel. Springs are coils, dampers tubes with a rod,
+massless rods lines.
 """
 
 from typing import Any, NamedTuple
@@ -121,6 +122,14 @@ def stretched(strut: StrutShape, position, orientation) -> list[np.ndarray]:
     return [line, np.stack([a, a + 0.6 * (b - a)])] if strut.role == "damper" else [line]
 
 
+def corners(scene: Shapes, position, orientation) -> np.ndarray:
+    """The points of a scene that must be in sight, in the inertial frame, shape (n, 3); coils are their axes."""
+    ends = [stretched(strut, position, orientation)[0][[0, -1]] for strut in scene.struts]
+    return np.concatenate(
+        [*(placed(shape, position, orientation).reshape(-1, 3) for shape in (*scene.outlines, *scene.joints)), *ends]
+    )
+
+
 def coil(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
     """A coil between two points, straight at both ends, shape (n, 3); a line where they meet."""
     length = np.linalg.norm(b - a)
@@ -151,19 +160,20 @@ def _solid(system: MultibodySystem, body: int, points: np.ndarray) -> list[Outli
     if len(points) > 2:
         return [Outline(body, "body", face, True) for face in _hull(points)]
     centre = np.zeros(3) if system.centre is None else np.asarray(system.centre[body])
-    box = [Outline(body, "body", face, True) for face in _box(system, body, centre)]
+    box = [Outline(body, "body", face, True) for face in _box(system, body, points, centre)]
     off = len(points) == 1 and np.abs(points[0] - centre).max() > 1e-9
     return [Outline(body, "link", np.stack([points[0], centre])), *box] if off else box
 
 
-def _box(system: MultibodySystem, body: int, centre: np.ndarray) -> list[np.ndarray]:
+def _box(system: MultibodySystem, body: int, points: np.ndarray, centre: np.ndarray) -> list[np.ndarray]:
     """The faces of the homogeneous cuboid with a body's mass and inertia: J₁ = m (L₂² + L₃²)/12 and so on."""
     mass, inertia = float(system.mass[body]), np.asarray(system.inertia[body])
     inertia = inertia - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))  # about the centre of mass
     moments, axes = np.linalg.eigh(inertia)
-    if not inertia.any():  # a point mass: a cube
-        moments = np.full(3, mass / 6 * (_POINT * float(np.max(system.coordinate_scale()))) ** 2)
     half = np.sqrt(np.maximum(6 * (moments.sum() - 2 * moments) / mass, 0.0)) / 2
+    size = float(np.max(system.coordinate_scale()))
+    if not inertia.any() or (len(points) and np.max(2 * half) > size):
+        half = np.full(3, _POINT * size / 2)
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half @ axes.T + centre
     faces = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
     return [corners[list(face)] for face in faces]

@@ -23,6 +23,9 @@ CURVES: tuple[dict[str, Any], ...] = (
     {"color": "#b3262e", "marker": "x", "markersize": 5, "fillstyle": "full", "linestyle": ":", "linewidth": 0.8},
 )
 ROAD = "#b8a58c"
+# Behind words that may lie on a curve, and behind a legend within axes.
+READABLE: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.0}
+IN_AXES: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "framealpha": 0.85}
 NOTEBOOK_DPI = 80
 ROLES = {"link": "#1b62a5", "body": "#3a8a4d", "wheel": "#3c3c3c", "spring": "#d9822b", "damper": "#7a4b9a"}
 
@@ -62,6 +65,6 @@ def plain(axes: "Axes") -> None:
 
 
 def legend_below(fig: "Figure", handles: Mapping[str, Any], columns: int) -> None:
-    """One legend for all panels of a figure, under them."""
+    """One legend for all panels of a figure, under them, where no curve is."""
     style = {"ncols": columns, "frameon": False, "handlelength": 3.5}
     fig.legend(handles=list(handles.values()), loc="outside lower center", **style)

@@ -9,12 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import lgsens as lg
 from lgsens import plotting
-from lgsens.examples import QuarterCar, SuspensionCurves, spinning_top
+from lgsens.examples import (
+    QuarterCar,
+    SuspensionCurves,
+    four_bar,
+    linear_quarter_car,
+    slider_crank,
+    spatial_chain,
+    spinning_top,
+)
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -29,6 +38,10 @@ def is_png(path):
     return path.read_bytes().startswith(PNG) and path.stat().st_size > 10_000  # an empty canvas has some 3 kB
 
 
+def words(legend):
+    return [text.get_text() for text in legend.get_texts()]
+
+
 def test_time_histories(tmp_path):
     t = np.linspace(0, 2, 101)
     panels = [
@@ -40,9 +53,11 @@ def test_time_histories(tmp_path):
     assert [axes.get_ylabel() for axes in fig.axes] == ["tyre force [kN]", "length [mm]"]
     assert bottom.get_xlabel() == "time [s]"
     assert fig.get_suptitle() == "a title"
-    assert [text.get_text() for text in top.get_legend().get_texts()] == ["before", "after"]
+    assert words(fig.legends[0]) == ["before", "after"]
+    assert top.lines[0].get_color() == bottom.lines[0].get_color() != top.lines[1].get_color()  # a run looks the same
     np.testing.assert_array_equal(top.lines[1].get_ydata(), np.sin(t))
     assert {text.get_text() for text in bottom.texts} == {"l_min", "l_max"}
+    assert all(text.get_bbox_patch().get_facecolor()[:3] == (1, 1, 1) for text in bottom.texts)  # over curves
     low, high = bottom.get_ylim()
     assert low < 0.1 and high > 1.9  # the limits are in sight
     assert is_png(plotting.save(fig, tmp_path / "a.png"))
@@ -111,11 +126,10 @@ def test_errors_over_time():
 
 
 def test_mechanism_of_the_quarter_car(car, tmp_path):
-    fig = plotting.mechanism({"the car": car}, title="five links")
+    fig = plotting.mechanism({"the car": car}, title="five links", axes_names=("x, forward", "y, left", "z, up"))
     (axes,) = fig.axes
-    assert axes.get_xlabel() == "x [m], forward"
-    roles = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert roles == list(plotting.ROLES)
+    assert (axes.get_xlabel(), axes.get_zlabel()) == ("x, forward [m]", "z, up [m]")
+    assert words(fig.legends[0]) == list(plotting.ROLES)
     # Equal axes: a metre is as long along x, y and z.
     extents = [np.ptp(limits) for limits in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
     metre = axes._box_aspect / extents  # matplotlib has no public getter of the aspect of a box in space
@@ -129,8 +143,8 @@ def test_mechanism_of_the_quarter_car(car, tmp_path):
 
 def test_before_and_after_are_told_apart(car):
     fig = plotting.mechanism({"before": car, "after": car})
-    legend = fig.axes[0].get_legend()
-    assert [text.get_text() for text in legend.get_texts()] == ["before", "after"]
+    (legend,) = fig.legends
+    assert words(legend) == ["before", "after"]
     colours = [line.get_color() for line in legend.get_lines()]
     assert colours == [plotting.COLOURS[0], plotting.ROLES["link"]]
 
@@ -145,8 +159,51 @@ def test_a_mechanism_in_a_plane_or_with_one_body_is_drawn():
     (polygon, _) = fig.axes[0].collections[:2]
     assert polygon.get_facecolor().shape[0] == 1  # the hull of a plane would fail
     (axes,) = fig.axes
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["body"]
+    assert words(fig.legends[0]) == ["body"]
     assert len(axes.get_zticks()) == 0 < len(axes.get_xticks())
+
+
+SCENES = {
+    "in a plane": four_bar,
+    "long": lambda: spatial_chain(5),
+    "upright": linear_quarter_car,
+    "flat": slider_crank,
+    "leaning": lambda: spinning_top(0.7),
+    "wheel": lambda: QuarterCar.load().model(free_length=1.0, free_radius=1.0),
+}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_labels_fit(scene, monkeypatch):
+    """Words of a figure: none on another, none beyond it. Names of axes are slanted: where their middles are counts."""
+    drawn, draw = {}, Text.draw
+
+    def record(text, renderer):
+        draw(text, renderer)
+        if text.get_visible() and text.get_text():
+            drawn[text.get_text(), text.get_window_extent(renderer).bounds] = text.get_window_extent(renderer)
+
+    fig = plotting.mechanism({scene: SCENES[scene]()}, title=scene)
+    monkeypatch.setattr(Text, "draw", record)
+    FigureCanvasAgg(fig).draw()
+    slanted = {word: box for word, box in drawn.items() if word[0].endswith(" [m]")}
+    level = {word: box for word, box in drawn.items() if word not in slanted}
+    assert len(level) > 4 and len(slanted) in (2, 3)
+    for word, box in level.items():
+        assert not [other for other, its in level.items() if other != word and box.overlaps(its)], word
+        assert not [name for name, its in slanted.items() if box.contains(*((its.min + its.max) / 2))], word
+    for word, box in drawn.items():
+        assert fig.bbox.contains(*box.min) and fig.bbox.contains(*box.max), word
+
+
+def test_a_plane_is_seen_from_the_front():
+    """And a cuboid larger than the scene, of an inertia that no part of it has, is a small cube."""
+    plane = plotting.mechanism({"four-bar": four_bar()}).axes[0]
+    assert (plane.elev, plane.azim) == (90.0, -90.0)
+    assert len(plane.get_zticks()) == 0 < len(plane.get_xticks())
+    crank = plotting.mechanism({"slider-crank": slider_crank()}).axes[0]  # 1 kg and 1 kg m² in a scene of 1 m
+    assert (crank.elev, crank.azim) != (90.0, -90.0)
+    assert max(np.ptp(limits) for limits in (crank.get_xlim(), crank.get_ylim(), crank.get_zlim())) < 1.2
 
 
 def test_work_precision():
@@ -163,7 +220,7 @@ def test_work_precision():
     )
     np.testing.assert_array_equal(axes.lines[0].get_data(), ([1.0, 2.0, 4.0], [1.6e-3, 4e-4, 1e-4]))
     np.testing.assert_array_equal(axes.lines[2].get_ydata(), [1e-3, 1e-3])
-    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    labels = words(axes.get_legend())
     assert labels == [f"second: {np.sqrt(1.6):.3g} s", "slow: not reached"]
     assert second.cost_of(1e-3) == pytest.approx(np.sqrt(1.6), rel=1e-12)
     assert second.cost_of(0.1) == 1.0  # the cheapest setting is better already
@@ -240,7 +297,7 @@ def test_suspension_curves():
     lower, upper = fig.axes[0].lines[2:4]
     np.testing.assert_allclose(lower.get_ydata(), -0.01 * 180 / np.pi, rtol=1e-14)
     np.testing.assert_allclose(upper.get_data(), (1e3 * band[0], 180 / np.pi * band[2]), rtol=1e-14)
-    assert [text.get_text() for text in fig.axes[0].get_legend().get_texts()] == ["before", "after"]
+    assert words(fig.legends[0]) == ["before", "after"]
     with pytest.raises(ValueError, match="`bounds`: 'cambre' is not one of"):
         plotting.suspension_curves({"a": values(1.0)}, {"cambre": band})
 
