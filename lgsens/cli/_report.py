@@ -47,9 +47,7 @@ def output_folder(out: Path, overwrite: bool) -> Iterator[Path]:
 def suspension_file(arguments: Any) -> str:
     """The file or the name of the suspension that is asked for."""
     if arguments.hardpoints is not None and arguments.suspension != DEFAULT:
-        raise ValueError(
-            f"--hardpoints {arguments.hardpoints}: {arguments.suspension!r} is a file; leave one of them out"
-        )
+        raise ValueError(f"--hardpoints: {arguments.suspension!r} is a suspension already; leave one of them out")
     return arguments.hardpoints or arguments.suspension
 
 

@@ -110,9 +110,8 @@ class Reader:
             if key in keys:
                 continue
             if key not in bodies:
-                raise self.fail(
-                    key, f"is no body and no key of this table; bodies: {sorted(bodies)}, keys: {sorted(keys)}."
-                )
+                known = f"bodies are {sorted(bodies)}, keys {sorted(keys)}"
+                raise self.fail(key, f"is no body and no key of this table; {known}.")
             found[key] = self.points(key)
             for point in np.atleast_2d(found[key]).tolist():
                 if (other := seen.setdefault(tuple(point), key)) != key:

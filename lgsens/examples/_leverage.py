@@ -91,7 +91,7 @@ def motion_ratios(
 def _check_arms(name: str, key: str, link: Link, connection: Connection) -> None:
     """The link turns about both arms, and not about itself."""
     arms = [np.asarray(arm) for arm in connection.arms or ()]
-    normal = np.cross(*arms)
+    normal = np.cross(arms[0], arms[1])
     sine = np.linalg.norm(normal) / np.prod([np.linalg.norm(arm) for arm in arms])
     if not sine > math.sin(LEAST_ANGLE):
         raise ValueError(
@@ -103,5 +103,5 @@ def _check_arms(name: str, key: str, link: Link, connection: Connection) -> None
         angle = math.degrees(math.asin(cosine))
         raise ValueError(
             f"{name}, key '{key}.arm': the cross with the arms {arms[0]} and {arms[1]} is singular, the link lies in "
-            f"their plane to {angle:.1f} degrees and could spin about itself; give arms across the link, or leave them out."
+            f"their plane to {angle:.1f} degrees and could spin about itself; give arms across it, or leave them out."
         )

@@ -160,12 +160,14 @@ class QuarterCar(eqx.Module):
             wheel: "hinged" (45 constraints, 3 degrees of freedom) or "locked" (46 and 2).
             chassis: "guided" by a prismatic joint (6 coordinates, 5 constraints), or "heave": a body that has that
                 one coordinate. The motion is the same.
-            links: "bodies", or "rods": uniform bars that only other bodies hold become massless rods
+            links: "bodies", or "rods": links that are uniform bars and carry nothing become massless rods
                 (`DistanceJoint`), 1 constraint for 6 coordinates and 7 constraints each. Half the mass of each
-                goes to either end, on the bodies there, whose centres of mass and inertias move with it. Mass and centre of mass of a uniform bar stay so, and with them the static forces; its
-                moment of inertia about its centre becomes m L²/4 for m L²/12. A link that carries the spring or
-                the damper is bent and not only pulled, and remains a body.
-            bushings: the links that a `Bushing` holds at the knuckle in place of a ball joint: 3 constraints less each. Such a link remains a body.
+                goes to either end, on the bodies there, whose centres of mass and inertias move with it. Mass and
+                centre of mass of a bar stay so, and with them the static forces; its moment of inertia about its
+                centre becomes m L²/4 for m L²/12. A link that carries the spring or the damper is bent and not only
+                pulled, and remains a body.
+            bushings: the links that a `Bushing` holds at the knuckle in place of a ball joint: 3 constraints less each.
+                Such a link remains a body.
             bushing_stiffness, bushing_damping: of those bushings, in every direction [N/m] and [N s/m].
             free_length: free length of the spring [m]. None: the preloads of spring, tyre and bushings are those that
                 hold the car at the design position, whatever the parameters, and so are their derivatives.

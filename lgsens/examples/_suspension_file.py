@@ -62,9 +62,9 @@ def members(document: dict, path: str) -> dict[str, Any]:
     if not LEAST_RADIUS <= float(wheel.centre[2]) <= LARGEST_RADIUS:
         raise root.table("wheel").fail(
             "centre",
-            f"is {float(wheel.centre[2]):.4g} m over the road, which is at z = {road / metre:g} of the file, and no tyre "
-            f"has a loaded radius outside of {LEAST_RADIUS} to {LARGEST_RADIUS} m; set the key 'road.height' to the z "
-            "of the road at the design position.",
+            f"is {float(wheel.centre[2]):.4g} m over the road, which is at z = {road / metre:g} of the file, and no "
+            f"tyre has a loaded radius outside of {LEAST_RADIUS} to {LARGEST_RADIUS} m; set the key 'road.height' to "
+            "the z of the road at the design position.",
         )
     bars = [link for link in links.values() if link.inertia is None]
     bump = root.table("bump")
@@ -133,18 +133,21 @@ def _with_curve(table: Reader, ends: dict[str, Array], rate: str) -> Strut:
     """The file has compression and push, the element extension and tension."""
     x, force = -table.curve("curve")[:, ::-1]
     free_length = table.number("free_length") if "free_length" in table else None
-    if rate == "damping" and (
-        free_length is not None or float(np.interp(0.0, x, force)) != 0.0 or not x[0] < 0 < x[-1]
-    ):
-        raise table.fail("curve", "of a damper must go through [0, 0] and beyond on both sides: bump and rebound.")
+    if rate == "damping" and (free_length is not None or (0.0, 0.0) not in list(zip(x, force))[1:-1]):
+        raise table.fail(
+            "curve",
+            "of a damper must have a point [0, 0] and some on both sides, bump and rebound, and no free_length.",
+        )
     a, b = ends.values()
     at = 0.0 if free_length is None else jnp.linalg.norm(b - a) - free_length
     signal, at = Sampled(x, force, "monotone"), as_float(at, (), "extension")
     slope = jax.jit(lambda at: jax.jvp(signal, (at,), (jnp.ones_like(at),))[1])(at)
     if not x[0] < float(at) < x[-1]:
         raise table.fail(
-            "curve", f"goes from {-x[-1]} to {-x[0]}, and does not contain the design position, {-float(at):.6g}."
+            "curve", f"goes from {-x[-1]} to {-x[0]}, and does not contain the design position, {0.0 - float(at):.6g}."
         )
     if not slope > 0:
-        raise table.fail("curve", f"must rise at {-float(at):.6g}, the design position, got a slope of {float(slope)}.")
+        raise table.fail(
+            "curve", f"must rise at {0.0 - float(at):.6g}, the design position, got a slope of {float(slope)}."
+        )
     return Strut(ends, slope, jnp.stack([signal.times, signal.values / slope]), free_length)

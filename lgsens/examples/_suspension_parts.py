@@ -70,7 +70,7 @@ class Connection(eqx.Module):
         """A point, and the directions in which it lets b neither turn nor move in a there: in NumPy, for checks."""
         at, every, none = np.atleast_2d(np.asarray(self.at)), np.eye(3), np.zeros((0, 3))
         if self.arms is not None:
-            return at[0], np.cross(*map(np.asarray, self.arms))[None], every
+            return at[0], np.cross(np.asarray(self.arms[0]), np.asarray(self.arms[1]))[None], every
         if self.kind in AT_A_POINT:
             return at[0], every if self.kind == "fixed" else none, every
         across = np.linalg.svd((at[1] - at[0])[None])[2][1:]
@@ -124,7 +124,7 @@ class Link(eqx.Module):
         """Whether a massless rod can take its place."""
         return self.centre is None and self.first is not None
 
-    def part(self, radius: Array | None) -> Part:
+    def part(self, radius: Any) -> Part:
         """Its mass: its own, or of a bar of this radius: m r²/2 about its axis, m L²/12 + m r²/4 across."""
         if self.centre is not None and self.inertia is not None:
             return Part(self.centre, self.mass, self.inertia)
@@ -205,15 +205,17 @@ class Strut(eqx.Module):
         if self.free_length is None or self.curve is None:
             return None
         extension = np.linalg.norm(self.chassis_point - self.link_point) - self.free_length
-        return -float(self.rate * Sampled(*self.curve, "monotone")(extension))
+        return -float(self.rate * Sampled(self.curve[0], self.curve[1], "monotone")(extension))
 
     def element(self, kind: str, free_length: Any = None) -> AbstractForce:
         """The force element, a "spring" or a "damper"; a preload is added at all lengths."""
         a, b = self.bodies
         places: dict[str, Any] = {"a": a, "b": b, "at_a": self.ends[a], "at_b": self.ends[b]}
         if self.curve is None:
-            rates = {"stiffness": self.rate} if kind == "spring" else {"stiffness": 0.0, "damping": self.rate}
+            rates: dict[str, Any] = (
+                {"stiffness": self.rate} if kind == "spring" else {"stiffness": 0.0, "damping": self.rate}
+            )
             return SpringDamper(**places, **rates, free_length=free_length)
-        signal = Sampled(self.curve[0], self.rate * self.curve[1], "monotone")
-        free_length = self.free_length if free_length is None else free_length
-        return CurveSpringDamper(**places, **{kind: signal}, free_length=free_length)
+        signal: Any = Sampled(self.curve[0], self.rate * self.curve[1], "monotone")
+        curve: dict[str, Any] = {kind: signal, "free_length": self.free_length if free_length is None else free_length}
+        return CurveSpringDamper(**places, **curve)

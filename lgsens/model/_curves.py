@@ -94,5 +94,12 @@ class CurveSpringDamper(AbstractForce):
     def loads(self, bodies):
         a, b = (_frame(bodies, name, self.at_a.dtype) for name in (self.a, self.b))
         free_length = _distance(self.at_a, self.at_b) if self.free_length is None else self.free_length
-        points, curves = (a.local_point(self.at_a), b.local_point(self.at_b)), map(prepared, (self.spring, self.damper))
-        return (Attached(CurveLoad(*points, *curves, free_length, self.preload), self.a, self.b),)
+        load = CurveLoad(
+            point_a=a.local_point(self.at_a),
+            point_b=b.local_point(self.at_b),
+            spring=prepared(self.spring),
+            damper=prepared(self.damper),
+            free_length=free_length,
+            preload=self.preload,
+        )
+        return (Attached(load, self.a, self.b),)
