@@ -21,6 +21,7 @@ import lgsens as lg
 from lgsens.model import AbstractForce, AbstractLoad, Attached, BushingLoad, Frame, SpringDamperLoad, TyreLoad
 from lgsens.model._curves import CurveLoad
 from lgsens.model._loads import PointForce, Weight
+from lgsens.testing import check_force
 
 COUNT = 20
 # Stiffnesses, lengths and forces are of order 1 to 10 and |d| is at least 1: some tens of round-offs of the
@@ -215,6 +216,15 @@ def test_spring_damper_with_curves():
     close(residual(free), -(10.0 * 0.5 + 50.0 * 0.125) * np.array([0.0, 0.6, 0.8]), 20)
     more = free.with_preload(jnp.asarray(-3.0))  # at all lengths
     close(residual(more), (3.0 - 10.0 * 0.5 - 50.0 * 0.125) * np.array([0.0, 0.6, 0.8]), 20)
+
+
+def test_every_number_of_spring_and_damper_curves():
+    """Points and values of the curves, ends, free length and preload: derivatives, balance, dissipation."""
+    spring = lg.Sampled((-1.0, -0.2, 0.3, 1.0), (-5.0, -1.0, 1.0, 9.0), "monotone")
+    damper = lg.Sampled((-3.0, 0.0, 2.0), (-2.0, 0.0, 3.0), "monotone")
+    ends = {"at_a": (0.1, 0.2, -0.1), "at_b": (0.5, 0.2, 0.9)}
+    report = check_force(lg.CurveSpringDamper("a", "b", **ends, spring=spring, damper=damper, free_length=1.1))
+    assert report, report
 
 
 @pytest.mark.parametrize("curves", [{}, {"spring": 3.0}, {"spring": lg.Polynomial((0.0, 1.0)), "damper": 2.0}])
