@@ -330,6 +330,11 @@ MISTAKES = {
         {"links.mass": {"chassis": [0.1, 0.4, 0.2], "knuckle": [0.1, 0.8, 0.2], "mass": 1.0}},
         ("key 'links.mass'", "is a name of its own", "choose another"),
     ),
+    "joint of a name that is taken": (
+        "mcpherson",
+        {"joints.hub": {"type": "fixed", "between": ["strut", "knuckle"], "at": [0.0, 0.8, 0.2]}},
+        ("key 'joints.hub'", "another joint of the scene has this name", "'strut_chassis'"),
+    ),
     "joint of a kind that there is not": (
         "mcpherson",
         {"joints.slider.type": "sliding"},
@@ -470,12 +475,14 @@ def test_curves_of_a_file(tmp_path, load):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["double_wishbone", "multi_link", "mcpherson"])
 def test_design_of_a_shipped_suspension(name, tmp_path):
-    """`lgsens optimize` on wishbones, trailing links and struts, a damper with a curve among them."""
+    """`lgsens optimize` on wishbones, trailing links and struts, a damper with a curve among them: the way down."""
     out = tmp_path / "out"
-    assert main(["optimize", name, "--out", str(out), "--parameters", "k,c,hardpoints", "--quiet"]) == 0
+    short = ["--parameters", "k,c,hardpoints", "--t1", "1", "--dt", "4e-3", "--steps", "8", "--quiet"]
+    assert main(["optimize", name, "--out", str(out), *short]) == 0
     result = json.loads((out / "result.json").read_text(encoding="utf-8"))
     assert result["objective"]["reduction"] > 0.2
     assert all(row["after"]["violation_over_scale"] <= 1e-3 for row in result["constraints"])
     assert list(result["design"]["hardpoints"]["after"]) == QuarterCar.load(name).hardpoint_names
     for check in result["gradient_check"].values():
-        assert max(check["relative_error"]) < 1e-5  # round-off of Psi_0 over the step, 1e-12/3e-5, times 10
+        # round-off of Psi_0 over the step, 1e-12/3e-5, times 10; where it has fallen to a tenth, ten times that
+        assert max(check["relative_error"]) < 1e-4

@@ -14,8 +14,8 @@ y left, z up. TOML, or JSON of the same structure.
     [knuckle], [wheel], [chassis]: centre_of_mass (wheel: centre, and bearing, its hub), mass, inertia (principal
                    moments about the axes of the file)
     [spring]       BODY = [x, y, z] twice, and stiffness, or curve = [[compression, force], …], which is counted from
-                   the design position, or with free_length [m] from there; an even preload makes it bear the car
-    [damper]       BODY = [x, y, z] twice, and damping, or curve = [[speed of compression, force], …] through [0, 0]
+                   the design position, or from free_length [m]; a constant is added so that the car rests there
+    [damper]       BODY = [x, y, z] twice, and damping, or curve = [[speed of compression, force], …] with [0, 0]
     [tyre]         stiffness.   [link_section]  radius of bars.   [bump]  height, duration
     [design]       limits of the design problem, see `DesignLimits`
 
@@ -37,6 +37,7 @@ from lgsens.model import Sampled
 
 LEAST_RADIUS, LARGEST_RADIUS = 0.1, 2.0  # m, loaded radii of tyres
 PARTS = ("chassis", "knuckle", "wheel")
+OF_MODEL = ("hub", "heave", "travel")  # joints that there are beside those of the file
 OF_LINK = ("mass", "centre_of_mass", "inertia", "arm", "link_arm")
 
 
@@ -48,11 +49,16 @@ def members(document: dict, path: str) -> dict[str, Any]:
     road = float(root.table("road").number("height", metre, positive=False)) if "road" in root else 0.0
     root = Reader(document, path, metre=metre, road=road)
     tables = root.tables("links")
-    for name in {*PARTS, *OF_LINK} & set(tables):
+    for name in sorted({*PARTS, *OF_LINK} & set(tables)):
         raise root.table("links").fail(name, f"is a name of its own; choose another than {[*PARTS, *OF_LINK]}.")
     bodies = ("chassis", "knuckle", *tables)
     links = {name: _link(name, table, bodies, kilogram) for name, table in tables.items()}
     joints = {name: _joint(table, bodies) for name, table in root.tables("joints").items()}
+    taken = {*OF_MODEL, *links, *(f"{name}_{body}" for name, link in links.items() for body in link.ends)}
+    for name in sorted(taken & set(joints)):
+        raise root.table("joints").fail(
+            name, f"another joint of the scene has this name; those taken are {sorted(taken)}."
+        )
 
     def part(key: str, centre: str) -> Part:
         body = root.table(key)
