@@ -215,6 +215,27 @@ def test_curves_of_spring_and_damper(load):
     assert float(car.spring.push()) == pytest.approx(15000.0, rel=1e-9)
 
 
+def test_preloads_of_rods_and_curves(load):
+    """Bars as bodies or as rods on other bodies, springs with and without curves, carry the same weights."""
+    scene = push_rod()
+    car = load(scene)
+    wanted, *others = (car.model(wheel="locked", chassis="heave", links=links).forces for links in ("bodies", "rods"))
+    assert "push_rod" not in car.model(links="rods", free_length=1.0).bodies
+    del scene["spring"]["stiffness"]
+    scene["spring"]["curve"] = [[-0.1, 0.0], [0.02, 9e3], [0.1, 3e4]]
+    forces = load(scene).model(wheel="locked", chassis="heave", links="rods").forces
+    tension = forces["spring"].preload + forces["spring"].spring(0.0)  # at the design position
+    others.append(forces | {"spring": forces["spring"].with_preload(tension)})
+    for forces in others:
+        for name in ("spring", "tyre"):
+            # linear equations of condition 1e4 or so, N and N m with inertias of 1e-3 and 1e2 kg m²
+            assert float(forces[name].preload) == pytest.approx(float(wanted[name].preload), rel=1e-10)
+    assert float(wanted["tyre"].preload) == pytest.approx(9.81 * float(car.mass), rel=1e-12)
+    weight = 9.81 * float(car.chassis.mass)  # that of links and their way between comes on top of it
+    ratio = motion_ratio(push_rod(), "spring")
+    assert -float(wanted["spring"].preload) * ratio == pytest.approx(weight, rel=0.05)
+
+
 def test_shipped_suspensions():
     assert shipped() == ["double_wishbone", "five_link_suspension", "mcpherson", "multi_link"]
     five = QuarterCar.load("quarter-car")
@@ -428,13 +449,13 @@ def test_what_no_suspension_is(mistake, load):
         load(changed(SCENES[name](), changes))
 
 
-def test_a_car_that_was_changed_is_checked_where_it_is_used():
-    """Hardpoints that come in after the file: the message says which suspension."""
+def test_a_car_that_was_changed_is_checked_where_it_is_preloaded():
+    """Hardpoints that come in after the file: the message says which suspension. Its curves show what it does."""
     car = QuarterCar.load("double_wishbone")
     moved = eqx.tree_at(lambda c: c.spring.ends["lower_wishbone"], car, car.links["lower_wishbone"].chassis[0])
-    for use in (moved.model, lambda: moved.curves(TRAVEL)):
-        with pytest.raises(ValueError, match=says("Suspension 'double wishbone", "key 'spring'", "motion ratio")):
-            use()
+    with pytest.raises(ValueError, match=says("Suspension 'double wishbone", "key 'spring'", "motion ratio")):
+        moved.model()
+    assert "spring" in moved.model(free_length=0.3).forces  # asks for no preload
     with pytest.raises(ValueError, match=says("`bushings`: 'rim' is not one of", "'tie_rod'", "a ball joint at the")):
         car.model(bushings=("rim",))
     with pytest.raises(ValueError, match=says("`bushings`: 'strut' is not one of ['control_arm', 'tie_rod']")):

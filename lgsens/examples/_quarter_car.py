@@ -174,7 +174,8 @@ class QuarterCar(eqx.Module):
             free_radius: free radius of the tyre [m], with `free_length`.
 
         Raises `ValueError` for an unknown kind of wheel, chassis or links, for bushings at links that the car does not
-        have or that have no ball joint at the knuckle, and as `load` for a suspension that does not move as one.
+        have or that have no ball joint at the knuckle, and where preloads are sought as `load` for a suspension that
+        does not move as one.
         """
         _check_choice("wheel", wheel, ("hinged", "locked"))
         _check_choice("chassis", chassis, ("guided", "heave"))
@@ -185,7 +186,6 @@ class QuarterCar(eqx.Module):
                 raise ValueError(
                     f"`bushings`: {suggestion(name, jointed)}, the links with a ball joint at the knuckle."
                 )
-        self._check(f"Suspension {self.name!r}")
         held = {*self.spring.bodies, *self.damper.bodies, *bushings}
         held |= {end for link in self.links.values() for end in link.ends}
         held |= {end for joint in self.joints.values() for end in joint.between}
@@ -226,6 +226,7 @@ class QuarterCar(eqx.Module):
         model = Model(bodies, joints, forces)
         if free_length is not None:
             return model
+        self._check(f"Suspension {self.name!r}")  # else no preload holds it, or one that no car has
         return static_preload(model, ("spring", "tyre", *(f"{name}_bushing" for name in bushings)))[0]
 
     def travel(self, travel, *, links: str = "rods", throw: bool = True) -> Kinematics:
