@@ -270,6 +270,11 @@ MISTAKES = {
         ("key 'links.trailing_link.link_arm'", "[ 0.272 -0.962  0.01 ]", "lies along the other arm", "turn one"),
     ),
     "no arm": ("multi_link", {"links.lateral_link.arm": [0, 0, 0]}, ("key 'links.lateral_link.arm'", "got zero")),
+    "arm of a hinge": (
+        "double_wishbone",
+        {"links.upper_wishbone.arm": [1.0, 0.0, 0.0]},
+        ("key 'links.upper_wishbone.arm'", "no universal joint; leave it out"),
+    ),
     "spring that pulls": (
         "multi_link",
         {"spring.chassis": [0.181, 0.419, -0.4]},
@@ -394,6 +399,11 @@ MISTAKES = {
         "double_wishbone",
         {"spring.curve": RISING},
         ("key 'spring.stiffness'", "give one of `curve` and this key"),
+    ),
+    "free length of a number": (
+        "double_wishbone",
+        {"spring.free_length": 0.339},
+        ("key 'spring.free_length'", "belongs to a `curve`"),
     ),
     "curve that falls": (
         "double_wishbone",

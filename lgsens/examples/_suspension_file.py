@@ -98,7 +98,7 @@ def _link(name: str, table: Reader, bodies: tuple[str, ...], kilogram: float) ->
         table.point("chassis" if "chassis" not in ends else "knuckle")
     if len(ends) > 2 and not own:
         table.point("centre_of_mass")
-    return Link(
+    link = Link(
         ends,
         table.number("mass", kilogram),
         centre=table.point("centre_of_mass") if own else None,
@@ -106,6 +106,10 @@ def _link(name: str, table: Reader, bodies: tuple[str, ...], kilogram: float) ->
         arm=table.direction("arm"),
         link_arm=table.direction("link_arm"),
     )
+    if link.first is None and (link.arm, link.link_arm) != (None, None):
+        key = "link_arm" if link.arm is None else "arm"
+        raise table.fail(key, "the link has a hinge or three ends and no universal joint; leave it out.")
+    return link
 
 
 def _joint(table: Reader, bodies: tuple[str, ...]) -> Connection:
@@ -129,6 +133,8 @@ def _strut(table: Reader, bodies: tuple[str, ...], rate: str) -> Strut:
                 "link", f"it needs one point on each of two bodies of {sorted(bodies)}, got {sorted(ends)}."
             )
     if "curve" not in table:
+        if "free_length" in table:
+            raise table.fail("free_length", "belongs to a `curve`; without one it follows from what the spring bears.")
         return Strut(ends, table.number(rate))
     if rate in table:
         raise table.fail(rate, "a curve has its own slope; give one of `curve` and this key.")
