@@ -47,6 +47,7 @@ from lgsens.model import (
     BumpRoad as BumpRoad,
     Bushing as Bushing,
     Constant as Constant,
+    CurveSpringDamper as CurveSpringDamper,
     CylindricalJoint as CylindricalJoint,
     DistanceJoint as DistanceJoint,
     FixedJoint as FixedJoint,

@@ -1,4 +1,4 @@
-"""`lgsens curves quarter-car`: what a suspension does with its wheel as it travels, drawn, listed and animated."""
+"""`lgsens curves quarter-car|FILE`: what a suspension does with its wheel as it travels, drawn, listed and animated."""
 
 import argparse
 import csv
@@ -8,7 +8,7 @@ import numpy as np
 
 from lgsens import plotting
 from lgsens._progress import compiling
-from lgsens.cli._report import ANEW, interrupted, output_folder, written
+from lgsens.cli._report import ANEW, interrupted, output_folder, suspension_file, written
 from lgsens.examples import QuarterCar, SuspensionCurves
 
 # Heading, member of SuspensionCurves, factor to the unit shown, decimals.
@@ -31,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ValueError(f"argument --points: must be at least 2, got {arguments.points}")
     with output_folder(arguments.out, arguments.overwrite) as out:
         plotting.figure()  # asks for matplotlib now
-        car = QuarterCar.load(arguments.hardpoints)
+        car = QuarterCar.load(suspension_file(arguments))
         travel = np.linspace(-arguments.travel, arguments.travel, arguments.points)
         with compiling("the positions of the wheel", not arguments.quiet):
             curves = car.curves(travel, axle=arguments.axle)

@@ -14,7 +14,7 @@ import jax
 from lgsens._xla import compilation_cache
 from lgsens.cli import _curves, _optimize, _paper, _top, _tradeoff
 from lgsens.cli._report import UNFINISHED, interrupted, version
-from lgsens.examples import PARAMETERS
+from lgsens.examples import DEFAULT, PARAMETERS, shipped
 from lgsens.simulation import SimulationError
 
 BAD_INPUT = 2
@@ -42,9 +42,12 @@ class _Parser(argparse.ArgumentParser):
         )
 
     def hardpoints(self) -> None:
-        """`--hardpoints`."""
-        meaning = "a suspension of your own (default: the one that ships with lgsens)"
-        self.add_argument("--hardpoints", type=Path, metavar="FILE.toml", help=meaning)
+        """The suspension, and `--hardpoints`."""
+        known = ", ".join([f"{DEFAULT} (five links)", *shipped()])
+        self.add_argument(
+            "suspension", metavar=f"{DEFAULT}|FILE", help=f"a file, or one that ships with lgsens: {known}"
+        )
+        self.add_argument("--hardpoints", metavar="FILE", help="the file of the quarter-car, TOML or JSON")
 
     def quiet(self, nothing: str) -> None:
         """`--quiet`."""
@@ -77,10 +80,9 @@ def _parser() -> argparse.ArgumentParser:
         "road and its spring within its travel (Sonneville & Brüls 2014, §9).",
     )
     optimize.set_defaults(run=_optimize.run)
-    optimize.add_argument("problem", choices=["quarter-car"], help="what to optimize")
+    optimize.hardpoints()
     optimize.out("out/quarter-car", "result.json and the figures")
     optimize.resume()
-    optimize.hardpoints()
     optimize.option(
         "--parameters",
         "k,c",
@@ -105,9 +107,8 @@ def _parser() -> argparse.ArgumentParser:
         "figure, a table, and a page on which it moves.",
     )
     curves.set_defaults(run=_curves.run)
-    curves.add_argument("suspension", choices=["quarter-car"], help="which suspension")
-    curves.out("out/curves", "curves.png, curves.csv and travel.html")
     curves.hardpoints()
+    curves.out("out/curves", "curves.png, curves.csv and travel.html")
     curves.option("--axle", "rear", choices=["rear", "front"])
     curves.option("--travel", 0.08, "up and down [m]", type=_positive, metavar="M")
     curves.option("--points", 41, "positions", type=_count)

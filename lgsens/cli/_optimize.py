@@ -1,4 +1,4 @@
-"""`lgsens optimize quarter-car`: the suspension of the paper's §9, optimized, checked and drawn."""
+"""`lgsens optimize quarter-car|FILE`: the suspension of the paper's §9, optimized, checked and drawn."""
 
 import argparse
 import time
@@ -10,7 +10,16 @@ import numpy as np
 
 from lgsens import plotting
 from lgsens._progress import compiling
-from lgsens.cli._report import document, interrupted, output_folder, table, unfinished, write_json, written
+from lgsens.cli._report import (
+    document,
+    interrupted,
+    output_folder,
+    suspension_file,
+    table,
+    unfinished,
+    write_json,
+    written,
+)
 from lgsens.dynamics import RESULTS
 from lgsens.examples import CurveBounds, QuarterCar, Response, SuspensionCurves, SuspensionDesign
 from lgsens.optimize import GradientCheck, OptimizationResult, check_gradient, minimize
@@ -63,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _design(arguments: argparse.Namespace) -> SuspensionDesign:
     """The problem that the arguments ask for."""
-    t1, dt, path = arguments.t1, arguments.dt, arguments.hardpoints
+    t1, dt, path = arguments.t1, arguments.dt, suspension_file(arguments)
     num_steps = round(t1 / dt)
     if num_steps < 1 or abs(num_steps * dt / t1 - 1) > 1e-6:
         raise ValueError(f"--t1 must be a whole number of steps --dt, got t1 = {t1} s and dt = {dt} s")

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from lgsens.examples import DEFAULT
+
 # Name, quantity of the Response, limit of the DesignLimits, unit; in the order of `Response.constraints`.
 CONSTRAINTS = (
     ("minimum tyre force", "tyre_force", "minimum_tyre_force", "N"),
@@ -40,6 +42,13 @@ def output_folder(out: Path, overwrite: bool) -> Iterator[Path]:
             with contextlib.suppress(OSError):
                 out.rmdir()
         raise
+
+
+def suspension_file(arguments: Any) -> str:
+    """The file or the name of the suspension that is asked for."""
+    if arguments.hardpoints is not None and arguments.suspension != DEFAULT:
+        raise ValueError(f"--hardpoints: {arguments.suspension!r} is a suspension already; leave one of them out")
+    return arguments.hardpoints or arguments.suspension
 
 
 def unfinished(out: Path, name: str, resume: bool) -> Path:
@@ -177,7 +186,7 @@ def _row(name: str, unit: str, limit, stages: dict[str, dict[str, float]], toler
 def _values(design: Any, name: str, value: Any) -> Any:
     if name != "hardpoints":
         return float(value)
-    return {link: np.asarray(point).tolist() for link, point in zip(sorted(design.car.links), value)}
+    return {link: np.asarray(point).tolist() for link, point in zip(design.car.hardpoint_names, value)}
 
 
 def table(found: dict[str, Any]) -> str:

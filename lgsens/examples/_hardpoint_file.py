@@ -1,16 +1,21 @@
 """Reads hardpoint files, and says which key is missing or wrong."""
 
+import json
 import math
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jaxtyping import Array
 
 from lgsens._validate import as_float
 from lgsens.model import RigidBody
+
+DATA = resources.files("lgsens.examples") / "data"
+DEFAULT, DEFAULT_FILE = "quarter-car", "five_link_suspension"
 
 
 def _is_number(value: Any) -> bool:
@@ -21,29 +26,42 @@ def _are_numbers(value: Any, count: int) -> bool:
     return isinstance(value, list) and len(value) == count and all(map(_is_number, value))
 
 
+def _are_points(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(_are_numbers(point, 3) for point in value)
+
+
 class Reader:
-    """Reads keys of a TOML document, and says which one is missing or wrong."""
+    """Reads keys of a document, and says which one is missing or wrong.
 
-    def __init__(self, table: dict, path: str, keys: tuple[str, ...] = ()):
+    Points are read in units of `metre` [m] over the road, which is at the height `road` [m] of the document.
+    """
+
+    def __init__(self, table: dict, path: str, keys: tuple[str, ...] = (), metre: float = 1.0, road: float = 0.0):
         self._table, self._path, self._keys = table, path, keys
+        self._metre, self._road = metre, road
 
-    def _fail(self, key: str, why: str) -> ValueError:
+    def fail(self, key: str, why: str) -> ValueError:
         return ValueError(f"Hardpoint file {self._path!r}, key {'.'.join((*self._keys, key))!r}: {why}")
 
     def _get(self, key: str, holds: Callable[[Any], bool], what: str) -> Any:
         if key not in self._table:
-            raise self._fail(key, "is missing; see lgsens/examples/data/five_link_suspension.toml for the format.")
+            raise self.fail(key, f"is missing; see lgsens/examples/data/{DEFAULT_FILE}.toml for the format.")
         value = self._table[key]
         if not holds(value):
-            raise self._fail(key, f"must be {what}, got {value!r}.")
+            raise self.fail(key, f"must be {what}, got {value!r}.")
         return value
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._table
 
     def table(self, key: str) -> "Reader":
         value = self._get(key, lambda value: isinstance(value, dict), "a table")
-        return Reader(value, self._path, (*self._keys, key))
+        return Reader(value, self._path, (*self._keys, key), self._metre, self._road)
 
-    def names(self) -> list[str]:
-        return list(self._table)
+    def tables(self, key: str) -> dict[str, "Reader"]:
+        """The tables in a table, by name; none where there is no such table."""
+        members = self.table(key) if key in self else Reader({}, self._path)
+        return {name: members.table(name) for name in members._table}
 
     def number(self, key: str, scale: float = 1.0, positive: bool = True) -> Array:
         value = self._get(key, _is_number, "a finite number")
@@ -51,15 +69,66 @@ class Reader:
             self._get(key, lambda value: value > 0, "positive")
         return as_float(value * scale, (), key)
 
-    def vector(self, key: str, scale: float = 1.0) -> Array:
+    def vector(self, key: str) -> Array:
+        """Three numbers as they are: a direction, moments of inertia."""
         value = self._get(key, lambda value: _are_numbers(value, 3), "three numbers [x, y, z]")
-        return as_float([x * scale for x in value], (3,), key)
+        return as_float(value, (3,), key)
 
-    def segment(self, first: str, second: str, scale: float) -> tuple[Array, Array]:
-        """Two points that differ."""
-        if self.vector(first).tolist() == self.vector(second).tolist():
-            raise self._fail(second, f"must differ from {first!r}; the two points coincide.")
-        return self.vector(first, scale), self.vector(second, scale)
+    def direction(self, key: str) -> Array | None:
+        """A vector that is not zero; None: it is left out."""
+        if key not in self:
+            return None
+        if not np.any(value := self.vector(key)):
+            raise self.fail(key, "must be a direction, got zero.")
+        return value
+
+    def _over_road(self, point: list) -> list:
+        x, y, z = (coordinate * self._metre for coordinate in point)
+        return [x, y, z - self._road]
+
+    def point(self, key: str) -> Array:
+        self.vector(key)
+        return as_float(self._over_road(self._table[key]), (3,), key)
+
+    def points(self, key: str) -> Array:
+        """One point, shape (3,), or two that differ, (2, 3)."""
+        value = self._get(
+            key,
+            lambda value: _are_numbers(value, 3) or _are_points(value),
+            "three numbers [x, y, z], or two points [[x, y, z], [x, y, z]]",
+        )
+        if not _are_points(value):
+            return self.point(key)
+        if value[0] == value[1]:
+            raise self.fail(key, f"two points must differ to have a line, got {value[0]} twice.")
+        return as_float([self._over_road(point) for point in value], (2, 3), key)
+
+    def ends(self, bodies: Collection[str], keys: Collection[str]) -> dict[str, Array]:
+        """The points by the bodies that name them, beside the other keys of this table; none of them coincide."""
+        found, seen = {}, {}
+        for key in self._table:
+            if key in keys:
+                continue
+            if key not in bodies:
+                known = f"bodies are {sorted(bodies)}, keys {sorted(keys)}"
+                raise self.fail(key, f"is no body and no key of this table; {known}.")
+            found[key] = self.points(key)
+            for point in np.atleast_2d(found[key]).tolist():
+                if (other := seen.setdefault(tuple(point), key)) != key:
+                    raise self.fail(key, f"must differ from {other!r}; the two points coincide.")
+        return found
+
+    def curve(self, key: str) -> np.ndarray:
+        """Points of a curve that rises, shape (2, n)."""
+
+        def holds(value: Any) -> bool:
+            if not (isinstance(value, list) and len(value) > 1 and all(_are_numbers(point, 2) for point in value)):
+                return False
+            steps = np.diff(np.asarray(value, float), axis=0)
+            return bool(np.all(steps[:, 0] > 0) and np.all(steps[:, 1] >= 0))
+
+        what = "two points or more [[x, force], …], x increasing and force never falling"
+        return np.asarray(self._get(key, holds, what), float).T
 
     def moments(self, key: str) -> Array:
         """Principal moments of inertia that a body can have."""
@@ -67,7 +136,7 @@ class Reader:
         try:
             RigidBody(mass=1.0, inertia=value)
         except ValueError as error:
-            raise self._fail(key, str(error)) from error
+            raise self.fail(key, str(error)) from error
         return value
 
     def interval(self, key: str) -> tuple[Array, Array]:
@@ -79,18 +148,42 @@ class Reader:
         # a list, for a value that has no hash
         return self._get(key, lambda value: value in list(known), f"one of {sorted(known)}")
 
+    def pair(self, key: str, known) -> tuple[str, str]:
+        """Two different names."""
+        holds = lambda value: isinstance(value, list) and len(value) == 2 and value[0] != value[1]
+        first, second = self._get(
+            key, lambda value: holds(value) and all(name in list(known) for name in value), f"two of {sorted(known)}"
+        )
+        return first, second
+
+
+def shipped() -> list[str]:
+    """The names of the files of suspensions that ship with lgsens."""
+    return sorted(Path(file.name).stem for file in DATA.iterdir() if file.name.endswith(".toml"))
+
 
 def read(path: str | Path | None) -> tuple[dict, str]:
-    """The TOML document and the name by which messages call it; None: the file that ships with lgsens."""
-    if path is None:
-        source = resources.files("lgsens.examples") / "data" / "five_link_suspension.toml"
-        text, path = source.read_text(encoding="utf-8"), source.name
+    """The document, TOML or by its name JSON, and the name by which messages call it.
+
+    A name of `shipped()` is that file; None or "quarter-car": the five-link suspension.
+    """
+    path = DEFAULT_FILE if path in (None, DEFAULT) else path
+    if str(path) in shipped():
+        source = DATA / f"{path}.toml"
+        text, name = source.read_text(encoding="utf-8"), source.name
     else:
+        name = str(path)
         try:
             text = Path(path).read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            raise ValueError(f"Hardpoint file {str(path)!r} cannot be read: {error}.") from error
+            raise ValueError(
+                f"Hardpoint file {name!r} cannot be read: {error}; those that ship with lgsens are {shipped()}."
+            ) from error
+    language, load = ("JSON", json.loads) if name.endswith(".json") else ("TOML", tomllib.loads)
     try:
-        return tomllib.loads(text), str(path)
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"Hardpoint file {str(path)!r} is not valid TOML: {error}.") from error
+        document = load(text)
+    except ValueError as error:  # of both
+        raise ValueError(f"Hardpoint file {name!r} is not valid {language}: {error}.") from error
+    if not isinstance(document, dict):
+        raise ValueError(f"Hardpoint file {name!r} must hold tables, got a {type(document).__name__}.")
+    return document, name

@@ -7,12 +7,16 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float, require, suggestion
+from lgsens._validate import as_float, suggestion
 from lgsens.analysis import Kinematics, kinematics
-from lgsens.examples._hardpoint_file import Reader, read
+from lgsens.examples._hardpoint_file import read
+from lgsens.examples._leverage import motion_ratios
 from lgsens.examples._suspension_curves import SuspensionCurves, suspension_curves
+from lgsens.examples._suspension_file import members
+from lgsens.examples._suspension_parts import Connection, Link, Part, Strut
 from lgsens.model import (
     ALL_FREE,
     BumpRoad,
@@ -23,13 +27,8 @@ from lgsens.model import (
     Model,
     PrismaticJoint,
     RevoluteJoint,
-    RigidBody,
-    SphericalJoint,
-    SpringDamper,
     TranslationDriver,
     TyreSpring,
-    UniversalJoint,
-    lumped,
     static_preload,
 )
 
@@ -38,49 +37,20 @@ ALONG_Y: Any = (0.0, 1.0, 0.0)
 ALONG_Z: Any = (0.0, 0.0, 1.0)
 
 
-class Link(eqx.Module):
-    """A rigid bar: universal joint at the chassis, spherical joint at the knuckle; points [m], mass [kg]."""
-
-    chassis: Float[Array, "3"]
-    knuckle: Float[Array, "3"]
-    mass: Float[Array, ""]
-
-
-class Strut(eqx.Module):
-    """Where a spring or a damper acts: between a link and the chassis; points [m], rate [N/m] or [N s/m]."""
-
-    link: str = eqx.field(static=True)
-    link_point: Float[Array, "3"]
-    chassis_point: Float[Array, "3"]
-    rate: Float[Array, ""]
-
-    def element(self, **rates: Any) -> SpringDamper:
-        """The force element with these numbers of `SpringDamper`."""
-        return SpringDamper(self.link, "chassis", at_a=self.link_point, at_b=self.chassis_point, **rates)
-
-
-class Part(eqx.Module):
-    """A body: centre of mass [m], mass [kg], principal moments about the axes of the file [kg m²]."""
-
-    centre: Float[Array, "3"]
-    mass: Float[Array, ""]
-    inertia: Float[Array, "3"]
-
-
 class QuarterCar(eqx.Module):
-    """A quarter-car with a five-link suspension: its data, all numbers leaves. `QuarterCar.load()` reads them.
+    """A quarter-car with any independent suspension: its data, all numbers leaves. `QuarterCar.load()` reads them.
 
-    Five links, knuckle, wheel and chassis are eight rigid bodies. Each link has a universal joint at the chassis and a
-    spherical joint at the knuckle; the wheel turns on a hinge of the knuckle or is locked to it; the chassis heaves
-    only. With 48 coordinates and 45 (46) constraints the mechanism has 3 (2) degrees of freedom; a reduced scene has
-    the same with 19 and 16 (17), see `model`. Frame: x forward, y left, z up; SI units.
+    Chassis, knuckle, wheel and links are rigid bodies: `Link` says how a link holds on, and `joints` are all others.
+    The wheel turns on a hinge of the knuckle or is locked to it; the chassis heaves only. The five-link suspension is
+    of eight bodies; with 48 coordinates and 45 (46) constraints it has 3 (2) degrees of freedom, a reduced scene the
+    same with 19 and 16 (17), see `model`. Frame: x forward, y left, z up over the road; SI units.
 
-    Source: Sonneville & Brüls (2014), §9; hardpoints, masses and rates from BPMinaker/eom_pkg,
-    input_5link.m (R. Rieveley 2009).
+    Source: Sonneville & Brüls (2014), §9; each file names that of its hardpoints, masses and rates.
     """
 
     name: str = eqx.field(static=True)
     links: dict[str, Link]
+    joints: dict[str, Connection]
     knuckle: Part
     wheel: Part
     chassis: Part
@@ -88,45 +58,89 @@ class QuarterCar(eqx.Module):
     spring: Strut
     damper: Strut
     tyre_stiffness: Float[Array, ""]
-    link_radius: Float[Array, ""]
+    link_radius: Float[Array, ""] | None
     bump_height: Float[Array, ""]
     bump_duration: Float[Array, ""]
 
     @staticmethod
     def load(path: str | Path | None = None) -> "QuarterCar":
-        """Read a suspension from a TOML file; None: the one that ships with lgsens.
+        """Read a suspension from a file.
 
-        The shipped file, `lgsens/examples/data/five_link_suspension.toml`, shows the format. Raises `ValueError` naming
-        the file and the key (or the line) for a file that cannot be read or is incomplete.
+        Arguments:
+            path: a TOML or JSON file in the format of `lgsens/examples/_suspension_file.py`, or the name of one that
+                ships with lgsens, in `lgsens/examples/data`: "five_link_suspension", "double_wishbone", "multi_link",
+                "mcpherson"; None: the first of them.
+
+        Raises `ValueError` naming the file and the key (or the line) for a file that cannot be read, is incomplete, or
+        describes a suspension that does not move as one: another freedom than travel, singular universal joints,
+        motion ratios that no car has.
         """
         with jax.ensure_compile_time_eval():  # the file's numbers are constants, inside `jit` too
-            return _parse(*read(path))
+            document, name = read(path)
+            car = QuarterCar(**members(document, name))
+            car._check(f"Hardpoint file {name!r}")
+            return car
+
+    def _check(self, name: str) -> None:
+        """Raise `ValueError` for what moves or stands as no car does."""
+        struts = {"spring": self.spring, "damper": self.damper}
+        ratios = motion_ratios(name, self.wheel.centre, self.links, self.joints, struts)
+        push = self.spring.push()
+        if not ratios or push is None:
+            return
+        needed = GRAVITY * float(self.chassis.mass) / ratios["spring"]
+        if not needed / 2 <= push <= 2 * needed:
+            raise ValueError(
+                f"{name}, key 'spring.curve': with this `free_length` it pushes with {push:.0f} N at the design "
+                f"position, and must bear about {needed:.0f} N; a preload can make up for half to double of it. Change "
+                "`free_length` or the curve, or leave `free_length` out: it is then counted from the design position."
+            )
+
+    def _on_chassis(self) -> dict[str, Array]:
+        """By link or joint the points at which it holds on to the chassis, in order."""
+        links = {name: link.chassis for name, link in sorted(self.links.items()) if "chassis" in link.ends}
+        return links | {name: c.at for name, c in sorted(self.joints.items()) if "chassis" in c.between}
 
     @property
-    def hardpoints(self) -> Float[Array, "5 3"]:
-        """The chassis ends of the links in sorted order of their names [m], shape (5, 3)."""
-        return jnp.stack([self.links[name].chassis for name in sorted(self.links)])
+    def hardpoints(self) -> Float[Array, "n 3"]:
+        """Where links and joints hold on to the chassis [m], shape (n, 3), as `hardpoint_names` says."""
+        return jnp.concatenate([jnp.atleast_2d(points) for points in self._on_chassis().values()])
+
+    @property
+    def hardpoint_names(self) -> list[str]:
+        """The links in sorted order, then the joints; of one with two points "NAME 1" and "NAME 2"."""
+        numbers = lambda points: [""] if points.ndim == 1 else [" 1", " 2"]
+        return [name + number for name, points in self._on_chassis().items() for number in numbers(points)]
+
+    @property
+    def mass(self) -> Float[Array, ""]:
+        """Of all bodies [kg]."""
+        return jnp.sum(
+            jnp.stack([part.mass for part in (self.chassis, self.knuckle, self.wheel, *self.links.values())])
+        )
 
     def with_values(self, *, stiffness=None, damping=None, bump_height=None, hardpoints=None) -> "QuarterCar":
         """The car with some numbers replaced; None: it keeps its own.
 
         Arguments:
-            stiffness, damping, bump_height: of spring [N/m] and damper [N s/m], and of the bump [m], shape ().
-            hardpoints: as the property [m], shape (5, 3).
+            stiffness, damping, bump_height: of spring [N/m] and damper [N s/m], of curves the slopes at the design
+                position and at rest, with which the curves grow; and of the bump [m], shape ().
+            hardpoints: as the property [m], shape (n, 3).
 
         Raises `ValueError` for other shapes.
         """
-        names = sorted(self.links)
-        numbers = lambda car: [car.spring.rate, car.damper.rate, car.bump_height]
-        members = lambda car: numbers(car) + [car.links[name].chassis for name in names]
-        points = [None] * len(names)
+        where = lambda car: [car.spring.rate, car.damper.rate, car.bump_height, *car._on_chassis().values()]
+        olds = where(self)
+        points: list[Any] = [None] * (len(olds) - 3)
         if hardpoints is not None:
-            points = as_float(hardpoints, (len(names), 3), "`hardpoints`")
+            rows = as_float(hardpoints, (len(self.hardpoint_names), 3), "`hardpoints`")
+            ends = np.cumsum([old.size // 3 for old in olds[3:]])
+            points = [rows[end - old.size // 3 : end].reshape(old.shape) for old, end in zip(olds[3:], ends)]
         values = [
             old if new is None else as_float(new, old.shape, "`stiffness`, `damping` or `bump_height`")
-            for old, new in zip(members(self), (stiffness, damping, bump_height, *points))
+            for old, new in zip(olds, (stiffness, damping, bump_height, *points))
         ]
-        return eqx.tree_at(members, self, values)
+        return eqx.tree_at(where, self, values)
 
     def model(
         self,
@@ -146,59 +160,63 @@ class QuarterCar(eqx.Module):
             wheel: "hinged" (45 constraints, 3 degrees of freedom) or "locked" (46 and 2).
             chassis: "guided" by a prismatic joint (6 coordinates, 5 constraints), or "heave": a body that has that
                 one coordinate. The motion is the same.
-            links: "bodies", or "rods": the links on which neither spring nor damper acts become massless rods
+            links: "bodies", or "rods": links that are uniform bars and carry nothing become massless rods
                 (`DistanceJoint`), 1 constraint for 6 coordinates and 7 constraints each. Half the mass of each
-                goes to either end, on the knuckle and on the chassis, whose centres of mass and inertias
-                move with it. Mass and centre of mass of a uniform bar stay so, and with them the static forces; its
-                moment of inertia about its centre becomes m L²/4 for m L²/12. A link that carries the spring or
-                the damper is bent and not only pulled, and remains a body.
-            bushings: the links that a `Bushing` holds at the knuckle in place of the spherical joint: 3 constraints
-                less each. Such a link remains a body.
+                goes to either end, on the bodies there, whose centres of mass and inertias move with it. Mass and
+                centre of mass of a bar stay so, and with them the static forces; its moment of inertia about its
+                centre becomes m L²/4 for m L²/12. A link that carries the spring or the damper is bent and not only
+                pulled, and remains a body.
+            bushings: the links that a `Bushing` holds at the knuckle in place of a ball joint: 3 constraints less each.
+                Such a link remains a body.
             bushing_stiffness, bushing_damping: of those bushings, in every direction [N/m] and [N s/m].
             free_length: free length of the spring [m]. None: the preloads of spring, tyre and bushings are those that
                 hold the car at the design position, whatever the parameters, and so are their derivatives.
             free_radius: free radius of the tyre [m], with `free_length`.
 
-        Raises `ValueError` for an unknown kind of wheel, chassis or links, and for bushings at links that the car does
-        not have.
+        Raises `ValueError` for an unknown kind of wheel, chassis or links, for bushings at links that the car does not
+        have or that have no ball joint at the knuckle, and where preloads are sought as `load` for a suspension that
+        does not move as one.
         """
         _check_choice("wheel", wheel, ("hinged", "locked"))
         _check_choice("chassis", chassis, ("guided", "heave"))
         _check_choice("links", links, ("bodies", "rods"))
+        jointed = [name for name, link in self.links.items() if "knuckle" in link.balls]
         for name in bushings:
-            if name not in self.links:
-                raise ValueError(f"`bushings`: {suggestion(name, self.links)}.")
-        kept = {self.spring.link, self.damper.link, *bushings}
-        rods = {name: link for name, link in self.links.items() if links == "rods" and name not in kept}
-        chassis_free = "z" if chassis == "heave" else ALL_FREE
-        bodies = {
-            "chassis": _body(self.chassis, [(rod.mass / 2, rod.chassis) for rod in rods.values()], chassis_free),
-            "knuckle": _body(self.knuckle, [(rod.mass / 2, rod.knuckle) for rod in rods.values()]),
-            "wheel": _body(self.wheel),
-        } | {name: _bar(link, self.link_radius) for name, link in self.links.items() if name not in rods}
+            if name not in jointed:
+                raise ValueError(
+                    f"`bushings`: {suggestion(name, jointed)}, the links with a ball joint at the knuckle."
+                )
+        held = {*self.spring.bodies, *self.damper.bodies, *bushings}
+        held |= {end for link in self.links.values() for end in link.ends}
+        held |= {end for joint in self.joints.values() for end in joint.between}
+        rods = {name: link for name, link in self.links.items() if links == "rods" and link.is_bar and name not in held}
+        parts = {"chassis": self.chassis, "knuckle": self.knuckle, "wheel": self.wheel}
+        parts |= {name: link.part(self.link_radius) for name, link in self.links.items() if name not in rods}
+        halves = {name: [(rod.mass / 2, rod.ends[name]) for rod in rods.values() if name in rod.ends] for name in parts}
+        free = {"chassis": "z"} if chassis == "heave" else {}
+        bodies = {name: part.body(halves[name], free.get(name, ALL_FREE)) for name, part in parts.items()}
         hub: Any = (
             RevoluteJoint("knuckle", "wheel", at=self.bearing, axis=ALONG_Y)
             if wheel == "hinged"
             else FixedJoint("knuckle", "wheel", at=self.bearing)
         )
-        joints = {"hub": hub}
+        joints = {"hub": hub} | {name: connection.joint() for name, connection in self.joints.items()}
         if chassis == "guided":
             joints["heave"] = PrismaticJoint(None, "chassis", at=self.chassis.centre, axis=ALONG_Z)
-        along_x = jnp.asarray([1.0, 0.0, 0.0], self.bearing.dtype)
         for name, link in self.links.items():
             if name in rods:
-                joints[name] = DistanceJoint("chassis", "knuckle", at_a=link.chassis, at_b=link.knuckle)
+                (a, start), (b, end) = sorted(link.ends.items())
+                joints[name] = DistanceJoint(a, b, at_a=start, at_b=end)
                 continue
-            across = jnp.cross(along_x, link.knuckle - link.chassis)
-            joints[f"{name}_chassis"] = UniversalJoint("chassis", name, at=link.chassis, axis_a=along_x, axis_b=across)
-            if name not in bushings:
-                joints[f"{name}_knuckle"] = SphericalJoint("knuckle", name, at=link.knuckle)
+            for connection in link.connections(name):
+                if name not in bushings or connection.between[0] != "knuckle":
+                    joints[f"{name}_{connection.between[0]}"] = connection.joint()
         road = BumpRoad(height=self.bump_height, duration=self.bump_duration)
         tyre = {"stiffness": self.tyre_stiffness, "free_radius": free_radius, "road": road}
         forces: dict[str, Any] = {
             "gravity": Gravity((0.0, 0.0, -GRAVITY)),
-            "spring": self.spring.element(stiffness=self.spring.rate, free_length=free_length),
-            "damper": self.damper.element(stiffness=0.0, damping=self.damper.rate),
+            "spring": self.spring.element("spring", free_length),
+            "damper": self.damper.element("damper"),
             "tyre": TyreSpring("wheel", at=self.wheel.centre, **tyre),
         }
         for name in bushings:
@@ -208,15 +226,8 @@ class QuarterCar(eqx.Module):
         model = Model(bodies, joints, forces)
         if free_length is not None:
             return model
-        model, unbalanced = static_preload(model, ("spring", "tyre", *(f"{name}_bushing" for name in bushings)))
-        require(
-            lambda left, mass: left <= 1e-6 * GRAVITY * mass,  # NaN is not balanced
-            f"The spring and the tyre cannot hold {self.name!r} at its design position ({unbalanced} N remain); does "
-            "the spring change its length as the wheel moves?",
-            unbalanced,
-            self.chassis.mass,
-        )
-        return model
+        self._check(f"Suspension {self.name!r}")  # else no preload holds it, or one that no car has
+        return static_preload(model, ("spring", "tyre", *(f"{name}_bushing" for name in bushings)))[0]
 
     def travel(self, travel, *, links: str = "rods", throw: bool = True) -> Kinematics:
         """The suspension on a rig: the chassis held, the wheel locked, its centre moved up and down at rate 1.
@@ -233,7 +244,7 @@ class QuarterCar(eqx.Module):
         # Lengths that are given need no preload to be found.
         scene = self.model(wheel="locked", chassis="heave", links=links, free_length=1.0, free_radius=1.0)
         driver = TranslationDriver(None, "wheel", at=self.wheel.centre, axis=ALONG_Z)
-        held = {"chassis": _body(self.chassis, free=())}
+        held = {"chassis": self.chassis.body(free=())}
         rig = Model(scene.bodies | held, scene.joints | {"travel": driver}, scene.forces)
         return kinematics(rig, {"travel": travel}, throw=throw)
 
@@ -269,61 +280,3 @@ def stiff_quarter_car(car: QuarterCar, *, wheel: str = "locked", **settings: Any
 def _check_choice(name: str, value: str, known: tuple[str, str]) -> None:
     if value not in known:
         raise ValueError(f"`{name}` must be {known[0]!r} or {known[1]!r}, got {value!r}.")
-
-
-def _body(part: Part, points: Sequence[tuple[Array, Array]] = (), free: str | Sequence[str] = ALL_FREE) -> RigidBody:
-    """A part with point masses, pairs of a mass and a place, fixed to it."""
-    mass, inertia, centre = part.mass, part.inertia, part.centre
-    if points:
-        masses, places = zip((mass, centre), *points)
-        mass, centre, shifted = lumped(jnp.stack(masses), jnp.stack(places))
-        inertia = jnp.diag(inertia) + shifted
-    return RigidBody(mass=mass, inertia=inertia, position=centre, free=free)
-
-
-def _bar(link: Link, radius) -> RigidBody:
-    """A uniform round bar between its two ends: m r²/2 about its axis, m L²/12 + m r²/4 across."""
-    direction = link.knuckle - link.chassis
-    square = jnp.dot(direction, direction)
-    along = jnp.outer(direction, direction) / square
-    across = jnp.eye(3, dtype=square.dtype) - along
-    inertia = link.mass * (radius**2 / 2 * along + (square / 12 + radius**2 / 4) * across)
-    return RigidBody(mass=link.mass, inertia=inertia, position=(link.knuckle + link.chassis) / 2)
-
-
-def _parse(document: dict, path: str) -> QuarterCar:
-    root = Reader(document, path)
-    units = root.table("units")
-    metre, kilogram = float(units.number("length")), float(units.number("mass"))
-    table = root.table("links")
-    if len(table.names()) != 5:
-        raise ValueError(f"Hardpoint file {path!r}, key 'links': five links are needed, got {sorted(table.names())}.")
-    links = {}
-    for name in table.names():
-        link = table.table(name)
-        links[name] = Link(*link.segment("chassis", "knuckle", metre), link.number("mass", kilogram))
-
-    def part(key: str, centre: str) -> Part:
-        body = root.table(key)
-        return Part(body.vector(centre, metre), body.number("mass", kilogram), body.moments("inertia"))
-
-    def strut(key: str, rate: str) -> Strut:
-        element = root.table(key)
-        points = element.segment("link_point", "chassis_point", metre)
-        return Strut(element.choice("link", links), *points, element.number(rate))
-
-    bump = root.table("bump")
-    return QuarterCar(
-        name=str(document.get("name", Path(path).stem)),
-        links=links,
-        knuckle=part("knuckle", "centre_of_mass"),
-        wheel=part("wheel", "centre"),
-        chassis=part("chassis", "centre_of_mass"),
-        bearing=root.table("wheel").vector("bearing", metre),
-        spring=strut("spring", "stiffness"),
-        damper=strut("damper", "damping"),
-        tyre_stiffness=root.table("tyre").number("stiffness"),
-        link_radius=root.table("link_section").number("radius"),
-        bump_height=bump.number("height", positive=False),
-        bump_duration=bump.number("duration"),
-    )

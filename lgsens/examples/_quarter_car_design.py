@@ -92,8 +92,8 @@ class SuspensionDesign(eqx.Module):
         Ψ₃(t) = l(t) − l_max ≤ 0   over l_max − l_min          (50)
 
     at every time step; and, with `keep`, camber and toe within bands over the travel of the wheel. The design is a
-    dict: `stiffness` k [N/m] and `damping` c [N s/m] of shape (), `hardpoints` [m] of shape (5, 3), the chassis ends of
-    the links in sorted order of their names, or all three. Whatever the design, the preloads of spring and tyre are
+    dict: `stiffness` k [N/m] and `damping` c [N s/m] of shape (), `hardpoints` [m] of shape (n, 3), those of
+    `QuarterCar.hardpoints`, or all three. Whatever the design, the preloads of spring and tyre are
     those that hold the car at rest at the design position.
 
     Arguments:
@@ -188,9 +188,7 @@ class SuspensionDesign(eqx.Module):
         limits = self.limits
         acceleration = trajectory.body("chassis").acceleration[:, 2]
         length, force = trajectory.force("spring").length, trajectory.force("tyre")
-        car = self.car
-        parts = (car.chassis, car.knuckle, car.wheel, *car.links.values())
-        static_force = GRAVITY * jnp.sum(jnp.stack([part.mass for part in parts]))
+        static_force = GRAVITY * self.car.mass
         travel = limits.maximum_spring_length - limits.minimum_spring_length
         constraints = (
             (limits.minimum_tyre_force - force) / static_force,  # Ψ₁

@@ -18,6 +18,7 @@ from lgsens.model._controls import (
     MaxwellElement as MaxwellElement,
     PIDController as PIDController,
 )
+from lgsens.model._curves import CurveSpringDamper as CurveSpringDamper
 from lgsens.model._drivers import (
     Angle as Angle,
     Displacement as Displacement,

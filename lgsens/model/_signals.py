@@ -14,6 +14,14 @@ is twice continuously differentiable if the first derivatives of neighbours agre
 
 The natural one has m = 0 at both ends, and with α₊³ = max(α, 0)³ for α³ it goes on straight outside of the samples: C²
 everywhere. m is solved for where a scene is assembled (`prepared`), not in its time steps.
+
+Monotone cubic (Fritsch & Butland, SIAM J. Sci. Stat. Comput. 5, 1984; ends as SciPy's `PchipInterpolator`). With the
+slopes Δ_i of the intervals, the slope d_i at an inner sample is 0 where Δ_{i−1} and Δ_i differ in sign, else their
+weighted harmonic mean; at an end it is that of the parabola through three samples, kept in [0, 3Δ]. On an interval
+
+    y = y_i + β h_i d_i + β² (3Δ_i − 2d_i − d_{i+1}) h_i + β³ (d_i + d_{i+1} − 2Δ_i) h_i
+
+is C¹ and rises where the samples rise, so no force curve has a slope of the wrong sign between its points.
 """
 
 import abc
@@ -27,7 +35,7 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, number_field, require
 
-_KINDS = ("linear", "cubic")
+_KINDS = ("linear", "cubic", "monotone")
 
 
 class AbstractSignal(eqx.Module):
@@ -126,13 +134,14 @@ class Ramp(AbstractSignal):
 
 
 class Sampled(AbstractSignal):
-    """Interpolation between samples, by straight lines or by the natural cubic spline.
+    """Interpolation between samples, by straight lines, the natural cubic spline or a monotone cubic.
 
     Arguments:
         times: sample times [s], shape (n,), n ≥ 2, increasing.
         values: values at these times, in the unit of what they prescribe, shape (n,).
         kind: "linear", constant outside of the samples; its rate jumps at them, so it cannot drive a mechanism
-            smoothly. "cubic", twice continuously differentiable, straight outside of them.
+            smoothly. "cubic", twice continuously differentiable, straight outside of them. "monotone", once
+            continuously differentiable, without overshoot, straight on outside of them with the slope at the end.
 
     Raises `ValueError` for shapes that differ, times that do not increase and another kind.
     """
@@ -148,7 +157,7 @@ class Sampled(AbstractSignal):
             raise ValueError(f"Sampled: `kind` must be one of {_KINDS}, got {kind!r}.")
 
     def __call__(self, t):
-        return jnp.interp(t, self.times, self.values) if self.kind == "linear" else _Spline.through(self)(t)
+        return jnp.interp(t, self.times, self.values) if self.kind == "linear" else prepared(self)(t)
 
 
 class _Spline(AbstractSignal):
@@ -170,14 +179,57 @@ class _Spline(AbstractSignal):
         return cls(times, values, lax.linalg.tridiagonal_solve(lower, diagonal, upper, rhs[:, None])[:, 0])
 
     def __call__(self, t):
-        last = self.times.shape[0] - 2
-        i = jnp.clip(jnp.searchsorted(lax.stop_gradient(self.times), t, side="right") - 1, 0, last)
+        i = _interval(self.times, t)
         (t_0, t_1), (y_0, y_1), (m_0, m_1) = ((x[i], x[i + 1]) for x in (self.times, self.values, self.curvatures))
         h = t_1 - t_0
         beta = (t - t_0) / h
         alpha = 1.0 - beta
         bend = lambda weight: jnp.maximum(weight, 0.0) ** 3 - weight
         return alpha * y_0 + beta * y_1 + h * h / 6.0 * (bend(alpha) * m_0 + bend(beta) * m_1)
+
+
+def _interval(times: Float[Array, " n"], t):
+    """Of two samples around t the first; outside of them those at the end."""
+    return jnp.clip(jnp.searchsorted(lax.stop_gradient(times), t, side="right") - 1, 0, times.shape[0] - 2)
+
+
+class _Monotone(AbstractSignal):
+    """The monotone cubic of the formulas above."""
+
+    times: Float[Array, " n"]
+    values: Float[Array, " n"]
+    slopes: Float[Array, " n"]  # d
+
+    @classmethod
+    def through(cls, sampled: Sampled) -> "_Monotone":
+        times, values = sampled.times, sampled.values
+        h = jnp.diff(times)
+        slope = jnp.diff(values) / h
+        if slope.shape[0] == 1:
+            return cls(times, values, jnp.broadcast_to(slope, (2,)))
+        before, after, short, long = slope[:-1], slope[1:], h[1:] + 2.0 * h[:-1], 2.0 * h[1:] + h[:-1]
+        alike = before * after > 0.0
+        one = jnp.ones_like(before)
+        harmonic = (short + long) / (long / jnp.where(alike, before, one) + short / jnp.where(alike, after, one))
+
+        def end(h_0, h_1, slope_0, slope_1):
+            parabola = ((2.0 * h_0 + h_1) * slope_0 - h_0 * slope_1) / (h_0 + h_1)
+            within = jnp.clip(parabola, jnp.minimum(0.0, 3.0 * slope_0), jnp.maximum(0.0, 3.0 * slope_0))
+            return jnp.where(slope_0 * slope_1 > 0.0, jnp.where(parabola * slope_0 > 0.0, parabola, 0.0), within)[None]
+
+        first, last = end(h[0], h[1], slope[0], slope[1]), end(h[-1], h[-2], slope[-1], slope[-2])
+        return cls(times, values, jnp.concatenate([first, jnp.where(alike, harmonic, 0.0), last]))
+
+    def __call__(self, t):
+        i = _interval(self.times, t)
+        (t_0, t_1), (y_0, y_1), (d_0, d_1) = ((x[i], x[i + 1]) for x in (self.times, self.values, self.slopes))
+        h = t_1 - t_0
+        slope = (y_1 - y_0) / h
+        inside = jnp.where(t < t_0, t_0, jnp.where(t > t_1, t_1, t))  # `clip` halves the slope at a sample
+        beta = (inside - t_0) / h
+        bend = beta * (3.0 * slope - 2.0 * d_0 - d_1 + beta * (d_0 + d_1 - 2.0 * slope))
+        straight = (t - inside) * jnp.where(t < t_0, d_0, d_1)
+        return y_0 + h * beta * (d_0 + bend) + straight
 
 
 def samples(times, values, what: str, name: str) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
@@ -201,7 +253,9 @@ Prescribed = Float[Array, ""] | AbstractSignal
 
 def prepared(value: Any) -> Any:
     """A number or signal with what can be computed before the time steps."""
-    return _Spline.through(value) if isinstance(value, Sampled) and value.kind == "cubic" else value
+    if not isinstance(value, Sampled) or value.kind == "linear":
+        return value
+    return (_Spline if value.kind == "cubic" else _Monotone).through(value)
 
 
 def at_time(value: Prescribed, t) -> Float[Array, ""]:

@@ -19,7 +19,9 @@ from helpers import (
 
 import lgsens as lg
 from lgsens.model import AbstractForce, AbstractLoad, Attached, BushingLoad, Frame, SpringDamperLoad, TyreLoad
+from lgsens.model._curves import CurveLoad
 from lgsens.model._loads import PointForce, Weight
+from lgsens.testing import check_force
 
 COUNT = 20
 # Stiffnesses, lengths and forces are of order 1 to 10 and |d| is at least 1: some tens of round-offs of the
@@ -34,6 +36,7 @@ SIGNALS = {
 LOADS = {
     "weight": lambda v: Weight(v(), v(3)),
     "spring": lambda v: SpringDamperLoad(v(3), v(3), v(), v(), v(), v()),
+    "curve": lambda v: CurveLoad(v(3), v(3), lg.Polynomial(v(4)), lg.Polynomial(v(3)), v(), v()),
     "bushing": lambda v: BushingLoad(v(3), v(3), v(3, 3), v(3, 3), v(3)),
     **{f"tyre-{n}": lambda v, s=s: TyreLoad(v(3), v(), v(), v(), s()) for n, s in SIGNALS.items()},
     "force": lambda v: PointForce(v(3), v(3), v(3), SIGNALS["bump"]()),
@@ -110,6 +113,12 @@ def spring_energy(load, a, b, t):
     return load.preload * length + load.stiffness * (length - load.free_length) ** 2 / 2
 
 
+def curve_energy(load, a, b, t):
+    length = jnp.linalg.norm(b.point(load.point_b) - a.point(load.point_a))
+    extension, rising = length - load.free_length, jnp.arange(1.0, 5.0)
+    return load.preload * length + jnp.sum(load.spring.coefficients / rising * extension**rising)
+
+
 def tyre_energy(load, a, b, t):
     deflection = load.road(t) + load.free_radius - b.point(load.point_b)[2]
     return load.stiffness * deflection**2 / 2 - load.preload * b.point(load.point_b)[2]
@@ -132,6 +141,7 @@ def energy_of(name):
     family = name.partition("-")[0]
     return {
         "spring": spring_energy,
+        "curve": curve_energy,
         "bushing": bushing_energy,
         "tyre": tyre_energy,
         "weight": weight_energy,
@@ -148,6 +158,8 @@ def test_force_is_minus_the_gradient_of_the_potential(name):
     load, a, b, va, vb, t = sample(name, seed=2)
     if name in ("spring", "bushing"):
         load = without(load, "damping")
+    if name == "curve":
+        load = eqx.tree_at(lambda load: load.damper, load, jax.tree.map(jnp.zeros_like, load.damper))
     if name == "bushing":  # a symmetric stiffness
         load = eqx.tree_at(lambda load: load.stiffness, load, load.stiffness + jnp.swapaxes(load.stiffness, 1, 2))
     if name == "force":
@@ -182,6 +194,43 @@ def test_power_of_a_spring_damper():
     dissipated = load.damping * length_rate**2
     assert np.min(dissipated) > 0
     close(power, -energy_rate - dissipated, ULPS, scale=np.abs(force).max() * np.abs(vb).max())
+
+
+def test_spring_damper_with_curves():
+    """Length, rate and tension by hand: a body moves away from the ground along the line, at a slant."""
+    body = lg.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), position=(0.0, 3.0, 4.0), velocity=(0.0, 0.6, 0.8))
+    spring, damper = lg.Polynomial((0.0, 10.0, 0.0, 50.0)), lg.Polynomial((0.0, 2.0, 0.5))
+    element = lg.CurveSpringDamper(
+        None, "body", at_a=(0.0, 0.0, 0.0), at_b=(0.0, 3.0, 4.0), spring=spring, damper=damper, preload=-7.0
+    )
+
+    def residual(element):
+        system = lg.Model({"body": body}, forces={"strut": element}).system()
+        q, v = system.reference()
+        q = q._replace(position=1.2 * q.position)  # from 5 to 6 m
+        return -system.residual(q, v, jnp.zeros(6), jnp.zeros(0), jnp.zeros(()))[:3]
+
+    expected = -7.0 + (10.0 + 50.0) + (2.0 + 0.5)
+    close(residual(element), -expected * np.array([0.0, 0.6, 0.8]), 20)
+    free = lg.CurveSpringDamper(None, "body", at_a=np.zeros(3), at_b=(0.0, 3.0, 4.0), spring=spring, free_length=5.5)
+    close(residual(free), -(10.0 * 0.5 + 50.0 * 0.125) * np.array([0.0, 0.6, 0.8]), 20)
+    more = free.with_preload(jnp.asarray(-3.0))  # at all lengths
+    close(residual(more), (3.0 - 10.0 * 0.5 - 50.0 * 0.125) * np.array([0.0, 0.6, 0.8]), 20)
+
+
+def test_every_number_of_spring_and_damper_curves():
+    """Points and values of the curves, ends, free length and preload: derivatives, balance, dissipation."""
+    spring = lg.Sampled((-1.0, -0.2, 0.3, 1.0), (-5.0, -1.0, 1.0, 9.0), "monotone")
+    damper = lg.Sampled((-3.0, 0.0, 2.0), (-2.0, 0.0, 3.0), "monotone")
+    ends = {"at_a": (0.1, 0.2, -0.1), "at_b": (0.5, 0.2, 0.9)}
+    report = check_force(lg.CurveSpringDamper("a", "b", **ends, spring=spring, damper=damper, free_length=1.1))
+    assert report, report
+
+
+@pytest.mark.parametrize("curves", [{}, {"spring": 3.0}, {"spring": lg.Polynomial((0.0, 1.0)), "damper": 2.0}])
+def test_what_is_no_curve(curves):
+    with pytest.raises(ValueError, match=r"CurveSpringDamper: `spring` and `damper` must be .*; with two numbers"):
+        lg.CurveSpringDamper(None, "body", at_a=np.zeros(3), at_b=np.ones(3), **curves)
 
 
 @pytest.mark.parametrize("ends", [(None, "body"), ("body", None)])

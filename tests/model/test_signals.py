@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import says
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, PchipInterpolator
 
 import lgsens as lg
 from lgsens.model._signals import prepared
@@ -64,10 +64,39 @@ def test_values():
     np.testing.assert_array_equal(linear, jax.vmap(lg.SampledRoad(TIMES, VALUES))(jnp.asarray(t)))
 
 
-@pytest.mark.parametrize("name", [*SMOOTH, "linear"])
+@pytest.mark.parametrize(
+    "values",
+    [
+        (-3.0, -2.5, 0.0, 0.4, 6.0),  # rising
+        (0.2, -0.5, 0.3, 0.1, 0.6),  # turning: slopes of zero at samples
+        (0.0, 0.0, 1.0, 1.0, 0.9),  # flat parts, and a parabola at the end that would overshoot
+    ],
+)
+def test_monotone_cubic(values):
+    """Value and slope of SciPy's; outside of the samples straight on; no value outside of its two neighbours."""
+    signal, scipy = lg.Sampled(TIMES, values, "monotone"), PchipInterpolator(TIMES, values)
+    t = np.union1d(np.linspace(TIMES[0], TIMES[-1], 201), TIMES)
+    value, slope, _ = jet(signal, t)
+    # some ten operations on numbers of up to 30
+    np.testing.assert_allclose(value, scipy(t), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(slope, scipy(t, 1), rtol=0, atol=1e-12)
+    for outside, end in ((np.array([-1.7, -0.5]), 0), (np.array([1.31, 4.0]), -1)):
+        value, slope, _ = jet(signal, outside)
+        np.testing.assert_allclose(slope, scipy(TIMES[end], 1), rtol=0, atol=1e-12)
+        straight = values[end] + scipy(TIMES[end], 1) * (outside - TIMES[end])
+        np.testing.assert_allclose(value, straight, rtol=0, atol=1e-12)
+
+
+def test_monotone_cubic_of_two_samples_is_a_line():
+    value, slope, _ = jet(lg.Sampled((0.0, 2.0), (1.0, 5.0), "monotone"))
+    np.testing.assert_allclose(value, 1.0 + 2.0 * POINTS, rtol=0, atol=1e-15)
+    np.testing.assert_array_equal(slope, 2.0)
+
+
+@pytest.mark.parametrize("name", [*SMOOTH, "linear", "monotone"])
 def test_derivatives_by_every_number(name):
     """Value, rate and acceleration by each leaf, away from breaks, against central differences, in both modes."""
-    signal = SMOOTH.get(name, lg.Sampled(TIMES, VALUES))
+    signal = SMOOTH[name] if name in SMOOTH else lg.Sampled(TIMES, VALUES, name)
     leaves, structure = jax.tree.flatten(signal)
     x, sizes = np.concatenate([np.ravel(leaf) for leaf in leaves]), [leaf.size for leaf in leaves]
 

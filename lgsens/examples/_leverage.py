@@ -1,0 +1,107 @@
+"""Whether a suspension moves as one does, before anything is compiled: velocities at the design position, in NumPy.
+
+Twists (v, w) about the origin of knuckle and links, the chassis held, the wheel locked, per velocity of the wheel
+centre c: of every connection at p and each direction d in which it lets nothing move, e in which nothing turns,
+
+    d·(v_b + w_b × p − v_a − w_a × p) = 0,     e·(w_b − w_a) = 0,     e_z·(v + w × c) = 1 of the knuckle,
+
+as many equations as unknowns where travel is the one freedom. A spring whose ends part at ℓ̇ has the motion ratio −ℓ̇.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from lgsens._validate import is_concrete
+from lgsens.examples._suspension_parts import Connection, Link, Strut
+
+RATIOS = (0.1, 3.0)  # motion ratios that cars have; racing cars' rockers reach some 0.4 to 1.5
+LEAST_ANGLE = math.radians(10.0)  # of a link to the plane of its universal joint's arms, where it would be singular
+
+
+def motion_ratios(
+    name: str,
+    centre: Any,
+    links: Mapping[str, Link],
+    joints: Mapping[str, Connection],
+    struts: Mapping[str, Strut],
+) -> dict[str, float]:
+    """The motion ratios of spring and damper; {}: numbers are traced and not looked at.
+
+    Raises `ValueError`, naming key, value and remedy, for a suspension that does not move up and down, for universal
+    joints that are nearly singular, and for motion ratios that no car has.
+    """
+    if not is_concrete(centre, links, joints, struts):
+        return {}
+    every = [*joints.items(), *((f"links.{key}", c) for key, link in links.items() for c in link.connections(key))]
+    for key, connection in every:
+        if connection.arms is not None:
+            _check_arms(name, key, links[connection.between[1]], connection)
+    columns = {body: slice(6 * i, 6 * i + 6) for i, body in enumerate(("knuckle", *links))}
+
+    def relative(a: str, b: str, directions: np.ndarray, part: np.ndarray) -> np.ndarray:
+        rows = np.zeros((len(directions), 6 * len(columns)))
+        for body, sign in ((b, 1.0), (a, -1.0)):
+            if body in columns:
+                rows[:, columns[body]] += sign * directions @ part
+        return rows
+
+    moves = lambda p: np.hstack([np.eye(3), -np.cross(np.eye(3), np.asarray(p))])  # (v, w) ↦ v + w × p
+    turns = np.hstack([np.zeros((3, 3)), np.eye(3)])
+    rows = []
+    for _, connection in every:
+        at, turning, moving = connection.blocked()
+        turning = turning / np.linalg.norm(turning, axis=1, keepdims=True)
+        rows += [relative(*connection.between, turning, turns), relative(*connection.between, moving, moves(at))]
+    equations, unknowns = sum(map(len, rows)), 6 * len(columns)
+    if equations != unknowns - 1:
+        raise ValueError(
+            f"{name}, key 'links': the wheel has {unknowns - equations} degrees of freedom to the chassis, and needs "
+            f"one, its travel, got the links {sorted(links)} and the joints {sorted(joints)}. A link with two ball "
+            "joints takes one from the knuckle's six, one with a hinge on the chassis and a ball joint takes two."
+        )
+    rows.append(relative("chassis", "knuckle", np.eye(3)[2:], moves(centre)))
+    matrix = np.concatenate(rows)
+    condition = np.linalg.cond(matrix)
+    if not condition < 1e8:
+        raise ValueError(
+            f"{name}, key 'links': joints repeat each other, or leave the wheel no travel at the design position "
+            f"(condition {condition:.0e}); move a hardpoint, or check the line of a hinge."
+        )
+    twists = np.linalg.solve(matrix, np.append(np.zeros(unknowns - 1), 1.0))
+    ratios = {}
+    for key, strut in struts.items():
+        a, b = strut.bodies
+        line = np.asarray(strut.ends[b] - strut.ends[a])
+        speeds = [relative("chassis", end, line[None], moves(strut.ends[end])) @ twists for end in (a, b)]
+        ratios[key] = ratio = float((speeds[0] - speeds[1])[0] / np.linalg.norm(line))
+        if not RATIOS[0] <= ratio <= RATIOS[1]:
+            raise ValueError(
+                f"{name}, key {key!r}: its motion ratio at the design position, compression per wheel travel, is "
+                f"{ratio:.3g}; no car has one outside of {RATIOS[0]:g} to {RATIOS[1]:g}"
+                + (", and it would have to pull to hold one" if ratio < 0 else "")
+                + f". Does it change its length as the wheel moves? Check its two points, that it acts on {a!r} and "
+                f"{b!r}, and their hinges and arms."
+            )
+    return ratios
+
+
+def _check_arms(name: str, key: str, link: Link, connection: Connection) -> None:
+    """The link turns about both arms, and not about itself."""
+    arms = [np.asarray(arm) for arm in connection.arms or ()]
+    normal = np.cross(arms[0], arms[1])
+    sine = np.linalg.norm(normal) / np.prod([np.linalg.norm(arm) for arm in arms])
+    if not sine > math.sin(LEAST_ANGLE):
+        raise ValueError(
+            f"{name}, key '{key}.link_arm': {arms[1]} lies along the other arm, {arms[0]}; turn one of them."
+        )
+    along = link.direction()
+    cosine = abs(normal @ along) / np.linalg.norm(normal) / np.linalg.norm(along)
+    if not cosine > math.sin(LEAST_ANGLE):
+        angle = math.degrees(math.asin(cosine))
+        raise ValueError(
+            f"{name}, key '{key}.arm': the cross with the arms {arms[0]} and {arms[1]} is singular, the link lies in "
+            f"their plane to {angle:.1f} degrees and could spin about itself; give arms across it, or leave them out."
+        )

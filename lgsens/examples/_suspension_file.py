@@ -1,0 +1,165 @@
+"""The format of suspension files: what bodies, connections and forces the tables of a document stand for.
+
+Bodies are `chassis`, `knuckle`, `wheel` and the links; wherever a table has the name of one as a key, its value is a
+point of that body. Lengths and masses of points and bodies are in `units`, all else in SI units; axes are x forward,
+y left, z up. TOML, or JSON of the same structure.
+
+    [units]        length [m], mass [kg]: of the units of the file
+    [road]         height: z of the road at the design position, in units of the file; left out: 0
+    [links.NAME]   BODY = [x, y, z]: a ball joint at that body, or BODY = [[x, y, z], [x, y, z]]: a hinge through both
+                   points; mass; centre_of_mass and inertia, left out: a uniform bar between its two ends; arm and
+                   link_arm: directions of the arms of its universal joint, see `Link`
+    [joints.NAME]  type (cylindrical, fixed, prismatic, revolute, spherical), between = [BODY, BODY], at: a point, or
+                   the two points of its line
+    [knuckle], [wheel], [chassis]: centre_of_mass (wheel: centre, and bearing, its hub), mass, inertia (principal
+                   moments about the axes of the file)
+    [spring]       BODY = [x, y, z] twice, and stiffness, or curve = [[compression, force], …], which is counted from
+                   the design position, or from free_length [m]; a constant is added so that the car rests there
+    [damper]       BODY = [x, y, z] twice, and damping, or curve = [[speed of compression, force], …] with [0, 0]
+    [tyre]         stiffness.   [link_section]  radius of bars.   [bump]  height, duration
+    [design]       limits of the design problem, see `DesignLimits`
+
+Of a spring or damper `link`, `link_point`, `chassis_point` mean the same as the names of its two bodies.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from lgsens._validate import as_float
+from lgsens.examples._hardpoint_file import Reader
+from lgsens.examples._suspension_parts import ALONG_A_LINE, AT_A_POINT, Connection, Link, Part, Strut
+from lgsens.model import Sampled
+
+LEAST_RADIUS, LARGEST_RADIUS = 0.1, 2.0  # m, loaded radii of tyres
+PARTS = ("chassis", "knuckle", "wheel")
+OF_MODEL = ("hub", "heave", "travel")  # joints that there are beside those of the file
+OF_LINK = ("mass", "centre_of_mass", "inertia", "arm", "link_arm")
+
+
+def members(document: dict, path: str) -> dict[str, Any]:
+    """The fields of a `QuarterCar`. Raises `ValueError` naming file and key for what is missing or wrong."""
+    root = Reader(document, path)
+    units = root.table("units")
+    metre, kilogram = float(units.number("length")), float(units.number("mass"))
+    road = float(root.table("road").number("height", metre, positive=False)) if "road" in root else 0.0
+    root = Reader(document, path, metre=metre, road=road)
+    tables = root.tables("links")
+    for name in sorted({*PARTS, *OF_LINK} & set(tables)):
+        raise root.table("links").fail(name, f"is a name of its own; choose another than {[*PARTS, *OF_LINK]}.")
+    bodies = ("chassis", "knuckle", *tables)
+    links = {name: _link(name, table, bodies, kilogram) for name, table in tables.items()}
+    joints = {name: _joint(table, bodies) for name, table in root.tables("joints").items()}
+    taken = {*OF_MODEL, *links, *(f"{name}_{body}" for name, link in links.items() for body in link.ends)}
+    for name in sorted(taken & set(joints)):
+        raise root.table("joints").fail(
+            name, f"another joint of the scene has this name; those taken are {sorted(taken)}."
+        )
+
+    def part(key: str, centre: str) -> Part:
+        body = root.table(key)
+        return Part(body.point(centre), body.number("mass", kilogram), body.moments("inertia"))
+
+    wheel = part("wheel", "centre")
+    if not LEAST_RADIUS <= float(wheel.centre[2]) <= LARGEST_RADIUS:
+        raise root.table("wheel").fail(
+            "centre",
+            f"is {float(wheel.centre[2]):.4g} m over the road, which is at z = {road / metre:g} of the file, and no "
+            f"tyre has a loaded radius outside of {LEAST_RADIUS} to {LARGEST_RADIUS} m; set the key 'road.height' to "
+            "the z of the road at the design position.",
+        )
+    bars = [link for link in links.values() if link.inertia is None]
+    bump = root.table("bump")
+    return {
+        "name": str(document.get("name", Path(path).stem)),
+        "links": links,
+        "joints": joints,
+        "knuckle": part("knuckle", "centre_of_mass"),
+        "wheel": wheel,
+        "chassis": part("chassis", "centre_of_mass"),
+        "bearing": root.table("wheel").point("bearing"),
+        "spring": _strut(root.table("spring"), bodies, "stiffness"),
+        "damper": _strut(root.table("damper"), bodies, "damping"),
+        "tyre_stiffness": root.table("tyre").number("stiffness"),
+        "link_radius": root.table("link_section").number("radius") if bars else None,
+        "bump_height": bump.number("height", positive=False),
+        "bump_duration": bump.number("duration"),
+    }
+
+
+def _link(name: str, table: Reader, bodies: tuple[str, ...], kilogram: float) -> Link:
+    ends = table.ends([body for body in bodies if body != name], OF_LINK)
+    own = "centre_of_mass" in table or "inertia" in table
+    if len(ends) < 2 and not own:  # one end makes no bar
+        table.point("chassis" if "chassis" not in ends else "knuckle")
+    if len(ends) > 2 and not own:
+        table.point("centre_of_mass")
+    link = Link(
+        ends,
+        table.number("mass", kilogram),
+        centre=table.point("centre_of_mass") if own else None,
+        inertia=table.moments("inertia") if own else None,
+        arm=table.direction("arm"),
+        link_arm=table.direction("link_arm"),
+    )
+    if link.first is None and (link.arm, link.link_arm) != (None, None):
+        key = "link_arm" if link.arm is None else "arm"
+        raise table.fail(key, "the link has a hinge or three ends and no universal joint; leave it out.")
+    return link
+
+
+def _joint(table: Reader, bodies: tuple[str, ...]) -> Connection:
+    kind = table.choice("type", [*AT_A_POINT, *ALONG_A_LINE])
+    at, wanted = table.points("at"), 1 if kind in AT_A_POINT else 2
+    if at.ndim != wanted:
+        raise table.fail("at", f"must be {('a point', 'two points, its line,')[wanted - 1]} of a {kind} joint.")
+    return Connection(kind, table.pair("between", bodies), at)
+
+
+def _strut(table: Reader, bodies: tuple[str, ...], rate: str) -> Strut:
+    if "link" in table:
+        link = table.choice("link", [body for body in bodies if body != "chassis"])
+        ends = {link: table.point("link_point"), "chassis": table.point("chassis_point")}
+        if np.array_equal(ends[link], ends["chassis"]):
+            raise table.fail("chassis_point", "must differ from 'link_point'; the two points coincide.")
+    else:
+        ends = table.ends(bodies, (rate, "curve", "free_length"))
+        if len(ends) != 2 or any(point.ndim != 1 for point in ends.values()):
+            raise table.fail(
+                "link", f"it needs one point on each of two bodies of {sorted(bodies)}, got {sorted(ends)}."
+            )
+    if "curve" not in table:
+        if "free_length" in table:
+            raise table.fail("free_length", "belongs to a `curve`; without one it follows from what the spring bears.")
+        return Strut(ends, table.number(rate))
+    if rate in table:
+        raise table.fail(rate, "a curve has its own slope; give one of `curve` and this key.")
+    return _with_curve(table, ends, rate)
+
+
+def _with_curve(table: Reader, ends: dict[str, Array], rate: str) -> Strut:
+    """The file has compression and push, the element extension and tension."""
+    x, force = -table.curve("curve")[:, ::-1]
+    free_length = table.number("free_length") if "free_length" in table else None
+    if rate == "damping" and (free_length is not None or (0.0, 0.0) not in list(zip(x, force))[1:-1]):
+        raise table.fail(
+            "curve",
+            "of a damper must have a point [0, 0] and some on both sides, bump and rebound, and no free_length.",
+        )
+    a, b = ends.values()
+    at = 0.0 if free_length is None else jnp.linalg.norm(b - a) - free_length
+    signal, at = Sampled(x, force, "monotone"), as_float(at, (), "extension")
+    slope = jax.jit(lambda at: jax.jvp(signal, (at,), (jnp.ones_like(at),))[1])(at)
+    if not x[0] < float(at) < x[-1]:
+        raise table.fail(
+            "curve", f"goes from {-x[-1]} to {-x[0]}, and does not contain the design position, {0.0 - float(at):.6g}."
+        )
+    if not slope > 0:
+        raise table.fail(
+            "curve", f"must rise at {0.0 - float(at):.6g}, the design position, got a slope of {float(slope)}."
+        )
+    return Strut(ends, slope, jnp.stack([signal.times, signal.values / slope]), free_length)
