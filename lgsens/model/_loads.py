@@ -11,6 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.liegroups import cross, skew
@@ -161,7 +162,7 @@ class SpringDamperLoad(AbstractClosedFormLoad):
         ∂/∂q = Dᵀ n (k nᵀD + c (sᵀ P D + nᵀS)) + F Dᵀ P D + D_q(Dᵀ f)|_{f = nF},     ∂/∂v = c Dᵀ n nᵀ D.
 
     Points that meet give no direction: n = 0 there, and no force. A spring whose tension vanishes with its length pulls
-    with k d all the same, so F/|d| is continued by k: f = (F/|d|) d has the tangent k D at d = 0 and not zero.
+    with k d all the same: f = (F/|d|) d with F/|d| = k + (F₀ − k ℓ₀ + c ḋ·n)/|d|, and 1/|d| taken as 0 at d = 0.
     """
 
     point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
@@ -177,46 +178,44 @@ class SpringDamperLoad(AbstractClosedFormLoad):
     def drawn(self):
         return "spring" if float(self.stiffness) > 0 else "damper"
 
-    def _line(self, a, b):
-        """n, |d|, and |d| or 1 to divide by."""
+    def _line(self, a, b, va, vb):
+        """d, 1/|d| and the rate of |d|."""
         d = b.point(self.point_b) - a.point(self.point_a)
         square = jnp.sum(d * d)
         meet = square == 0.0
-        length = jnp.where(meet, 0.0, jnp.sqrt(jnp.where(meet, 1.0, square)))
-        divisor = jnp.where(meet, 1.0, length)
-        return d / divisor, length, divisor
-
-    def measure(self, a, b, va, vb, t) -> LineForce:
-        n, length, _ = self._line(a, b)
+        inverse = jnp.where(meet, 0.0, lax.rsqrt(jnp.where(meet, 1.0, square)))
         speed_a, speed_b = (
             v[: ROTATION.start] + frame.axis(cross(v[ROTATION], point))
             for v, frame, point in ((va, a, self.point_a), (vb, b, self.point_b))
         )
-        rate = jnp.sum(n * (speed_b - speed_a))
+        return d, inverse, inverse * jnp.sum(d * (speed_b - speed_a))
+
+    def measure(self, a, b, va, vb, t) -> LineForce:
+        d, inverse, rate = self._line(a, b, va, vb)
+        length = inverse * jnp.sum(d * d)
         tension = self.preload + self.stiffness * (length - self.free_length) + self.damping * rate
         return LineForce(length, rate, tension)
 
-    def _per_length(self, line: LineForce):
+    def _per_length(self, inverse, rate):
         """F/|d|."""
-        meet = line.length == 0.0
-        return jnp.where(meet, self.stiffness, line.tension / jnp.where(meet, 1.0, line.length))
+        constant = self.preload - self.stiffness * self.free_length
+        return self.stiffness + (constant + self.damping * rate) * inverse
 
     def force(self, a, b, va, vb, t):
-        per_length = self._per_length(self.measure(a, b, va, vb, t))
-        d = b.point(self.point_b) - a.point(self.point_a)
-        return -separation_force(a, b, self.point_a, self.point_b, per_length * d)
+        d, inverse, rate = self._line(a, b, va, vb)
+        return -separation_force(a, b, self.point_a, self.point_b, self._per_length(inverse, rate) * d)
 
     def tangents(self, a, b, va, vb, t):
-        n, _, divisor = self._line(a, b)
+        _, inverse, rate = self._line(a, b, va, vb)
         d, gradient = separation(a, b, self.point_a, self.point_b)
-        per_length = self._per_length(self.measure(a, b, va, vb, t))
+        n, per_length = inverse * d, self._per_length(inverse, rate)
         along = n @ gradient
         speed = gradient @ jnp.concatenate([va, vb])
         turning_a = a.orientation @ skew(cross(self.point_a, va[ROTATION]))
         turning_b = b.orientation @ skew(cross(self.point_b, vb[ROTATION]))
         turning = embedded(turning_b, None, ROTATION_B) - embedded(turning_a, None, ROTATION_A)
         across = gradient - jnp.outer(n, along)  # |d| P D
-        rate_gradient = speed @ across / divisor + n @ turning
+        rate_gradient = inverse * (speed @ across) + n @ turning
         position = (
             jnp.outer(along, self.stiffness * along + self.damping * rate_gradient)
             + per_length * (gradient.T @ across)
