@@ -1,8 +1,6 @@
 """`python -m lgsens` is the console script `lgsens`."""
 
-import sys
-
-from lgsens.cli import main
+from lgsens.cli import console
 
 if __name__ == "__main__":
-    sys.exit(main())
+    console()

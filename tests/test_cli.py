@@ -252,6 +252,23 @@ def test_an_interrupted_command_writes_what_there_is_and_goes_on(tmp_path):
         assert optimum("stopped")[name] == optimum("whole")[name]
 
 
+@pytest.mark.slow  # three processes that begin to compile
+@pytest.mark.parametrize("seconds", [0.2, 3.0, 9.0])
+def test_an_interrupt_while_a_program_is_compiled(tmp_path, seconds):
+    """Ctrl-C in the middle of a compilation: the shell's status and a sentence, no traceback and no signal of the
+    compiler's threads."""
+    arguments = [sys.executable, "-m", "lgsens", "optimize", "quarter-car", "--out", str(tmp_path / "new")]
+    environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
+    process = subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True, env=environment)
+    assert process.stderr is not None
+    begun = process.stderr.read(len("compiling"))
+    time.sleep(seconds)
+    process.send_signal(signal.SIGINT)
+    said = process.communicate()[1]
+    assert begun == "compiling" and process.returncode == 130
+    assert "interrupted before anything was found" in said and "Traceback" not in said
+
+
 def test_an_interrupt_before_there_is_anything(tmp_path, capsys, monkeypatch):
     def stop(*_, **__):
         raise KeyboardInterrupt

@@ -1,3 +1,3 @@
 """The console script `lgsens`."""
 
-from lgsens.cli._main import main as main
+from lgsens.cli._main import console as console, main as main

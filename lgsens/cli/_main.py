@@ -1,10 +1,13 @@
 """The console script `lgsens`: arguments in, an exit status out; 2 and one line on stderr for bad input."""
 
+import _thread
 import argparse
 import contextlib
 import io
 import math
+import os
 import sys
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -13,7 +16,7 @@ import jax
 
 from lgsens._xla import compilation_cache
 from lgsens.cli import _curves, _optimize, _paper, _top, _tradeoff
-from lgsens.cli._report import UNFINISHED, interrupted, version
+from lgsens.cli._report import INTERRUPTED, UNFINISHED, interrupted, version
 from lgsens.examples import DEFAULT, PARAMETERS, shipped
 from lgsens.simulation import SimulationError
 
@@ -161,19 +164,63 @@ def _parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status: 0 success, 1 no feasible design or setting, 2 bad input."""
+    arguments = _parsed(argv)
+    try:
+        return _run(arguments)
+    except KeyboardInterrupt:
+        return _interrupted(arguments)
+
+
+def console() -> NoReturn:
+    """`main` as a program of its own, which Ctrl-C ends at any moment.
+
+    In the middle of a compilation two things are different: XLA's callbacks, of which Python drops every exception, and
+    what is then destroyed on the way out, which ends in a segmentation fault.
+    """
+    sys.unraisablehook = _once_more
+    arguments = _parsed()
+    try:
+        status = _run(arguments)
+    except KeyboardInterrupt:
+        status = _interrupted(arguments)
+        _leave(status)
+    if status == INTERRUPTED:
+        _leave(status)
+    sys.exit(status)
+
+
+def _leave(status: int) -> NoReturn:
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
+
+
+def _once_more(unraisable: Any) -> None:
+    if unraisable.exc_type is KeyboardInterrupt:
+        threading.Timer(0.1, _thread.interrupt_main).start()  # by then the callback has returned
+    else:
+        sys.__unraisablehook__(unraisable)
+
+
+def _parsed(argv: Sequence[str] | None = None) -> argparse.Namespace:
     # Names and units are not ASCII; a terminal that cannot show them gets a question mark, not an exception.
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    arguments = _parser().parse_args(argv)
+    return _parser().parse_args(argv)
+
+
+def _run(arguments: argparse.Namespace) -> int:
     jax.config.update("jax_enable_x64", True)  # an application may; the library never does
     with contextlib.suppress(ValueError):  # where nothing can be kept, all is compiled each time
         compilation_cache()
     try:
         return arguments.run(arguments)
-    except KeyboardInterrupt:
-        kept = any((vars(arguments).get("out", Path()) / name).is_file() for name in UNFINISHED)
-        return interrupted(arguments.command, "what was found is kept" if kept else None)
     except (ValueError, OSError, ImportError, SimulationError) as error:
         print(f"lgsens {arguments.command}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return BAD_INPUT
+
+
+def _interrupted(arguments: argparse.Namespace) -> int:
+    kept = any((vars(arguments).get("out", Path()) / name).is_file() for name in UNFINISHED)
+    return interrupted(arguments.command, "what was found is kept" if kept else None)

@@ -61,11 +61,14 @@ def unfinished(out: Path, name: str, resume: bool) -> Path:
     return path
 
 
+INTERRUPTED = 130  # the exit status that shells have for it
+
+
 def interrupted(command: str, found: str | None, remedy: str = "the same command with --resume goes on") -> int:
-    """Say so, what there is and how to go on; the exit status that shells have for it."""
+    """Say so, what there is and how to go on."""
     more = f": {found}; {remedy}" if found else " before anything was found"
     print(f"\nlgsens {command}: interrupted{more}", file=sys.stderr)
-    return 130
+    return INTERRUPTED
 
 
 def version(distribution: str = "lgsens") -> str:
