@@ -1,6 +1,7 @@
 """The result of a simulation, and one instant of it: the same questions, asked of all times or of one."""
 
 import abc
+from collections.abc import Iterable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -9,10 +10,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from lgsens._validate import suggestion
+from lgsens._validate import as_float, suggestion
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate import Stages
-from lgsens.model import MultibodySystem
+from lgsens.model import AbstractJoint, Frame, MultibodySystem, joint_wrenches, motion_at
+from lgsens.simulation._joint_motion import JointMotion, joint_motion
 
 
 class BodyMotion(NamedTuple):
@@ -41,6 +43,20 @@ class BodyMotion(NamedTuple):
         """
         local = self.orientation[0].T @ (jnp.asarray(at, self.position.dtype) - self.position[0])
         return self.position + self.orientation @ local
+
+
+class PointMotion(NamedTuple):
+    """The motion of a point fixed to a body, inertial frame; arrays have a leading axis n + 1, at an `Instant` none.
+
+    Attributes:
+        position: where it is [m], shape (n+1, 3).
+        velocity: its velocity [m/s], shape (n+1, 3).
+        acceleration: its acceleration [m/s²], shape (n+1, 3).
+    """
+
+    position: Float[Array, "*n 3"]
+    velocity: Float[Array, "*n 3"]
+    acceleration: Float[Array, "*n 3"]
 
 
 class StateError(NamedTuple):
@@ -84,6 +100,33 @@ class AbstractMotion(eqx.Module):
             raise ValueError(f"`body`: {suggestion(name, system.body_names)}.")
         return BodyMotion(*system.motion(system.body_names.index(name), *motion))
 
+    def point(self, body: str, at) -> PointMotion:
+        """The motion of a point of a body (a marker).
+
+            x + R X,   ẋ + R (Ω × X),   ẍ + R (Ω̇ × X + Ω × (Ω × X)),     X = R₀ᵀ(at − x₀)
+
+        Arguments:
+            body: name of the body.
+            at: where the point is in the reference configuration [m], inertial frame, shape (3,), like the hardpoints
+                of joints; x₀ and R₀ are the body's there. The motion is differentiable by it.
+
+        Raises `ValueError` for an unknown name or a wrong shape.
+        """
+        motion, local = self.body(body), self._reference(body).local_point(as_float(at, (3,), "`at`"))
+        both = lambda linear, angular: jnp.concatenate([linear, angular], axis=-1)
+        twist, rate = (
+            both(motion.velocity, motion.angular_velocity),
+            both(motion.acceleration, motion.angular_acceleration),
+        )
+        return PointMotion(*motion_at(local, motion.position, motion.orientation, twist, rate))
+
+    def _reference(self, body: str) -> Frame:
+        """The frame at a body's centre of mass in the reference configuration."""
+        system = self._multibody()
+        system = system if system.parts is None else system.parts.system
+        still = jnp.zeros_like(system.velocity)
+        return Frame(*system.motion(system.body_names.index(body), system.pose, still, still)[:2])
+
     def multiplier(self, joint: str) -> Float[Array, "*n rows"]:
         """The Lagrange multipliers of a joint, shape (n+1, its equations); the joint says what they mean.
 
@@ -120,7 +163,46 @@ class AbstractMotion(eqx.Module):
         return measure(q, v, t)
 
 
-class Trajectory(AbstractMotion):
+class AbstractRun(AbstractMotion):
+    """What motions over time answer besides, those of `simulate` and of `kinematics`."""
+
+    joints: eqx.AbstractVar[dict[str, AbstractJoint] | None]
+
+    def joint(self, name: str) -> JointMotion:
+        """The motion of the joint `name`: angle, displacement, their rates, force and moment on its body b.
+
+        The force is −Bᵀλ of all its equations, so each of its multipliers is found there again. Equations that freed
+        bodies cannot violate (`RigidBody.free`) transmit nothing here: what holds such bodies in the coordinates that
+        they do not have is no joint.
+
+        Raises `ValueError` for an unknown name, for a motion of equations that do not know their joints, and for a
+        batch of motions. Source: Haug (1989), §11.4 (reaction forces).
+        """
+        return self._joint_motions((name,))[name]
+
+    def _joint_motions(self, names: Iterable[str]) -> dict[str, JointMotion]:
+        system, (states, t) = self._multibody(), self._kinematics()
+        joints = self.joints
+        if joints is None:
+            raise ValueError(
+                "`joint`: this is the motion of equations, which do not know their joints; give `simulate` the Model "
+                "itself and not its `system()`, or use `multiplier`."
+            )
+        if jnp.ndim(t) != 1:
+            raise ValueError(
+                f"`joint`: this is a batch of motions, of shape {jnp.shape(t)[:-1]}; ask each of them: "
+                "jax.vmap(lambda trajectory: trajectory.joint(name))(trajectories)."
+            )
+        for name in names:
+            if name not in joints:
+                raise ValueError(f"`joint`: {suggestion(name, joints)}.")
+        wrenches = joint_wrenches(system, names, states.q, states.v, states.vdot, states.lam, t)
+        return {
+            name: joint_motion(joints[name], self.body, self._reference, wrench, t) for name, wrench in wrenches.items()
+        }
+
+
+class Trajectory(AbstractRun):
     """A simulated motion, a pytree like every other: criteria of it are differentiated as usual.
 
     Attributes:
@@ -129,6 +211,7 @@ class Trajectory(AbstractMotion):
         result: a value of `RESULTS`, shape (), int32; 0 is success.
         stats: Newton's iterations, increments and residuals; what the integrator says of its steps.
         system: the equations that were integrated.
+        joints: the joints of the model by name, for `joint`; None if equations were given.
         error: an estimate of the errors of the states, from integrators that have one (`Richardson`); else None.
         order: 2, or 4 where the states deserve a rule of fourth order: what to give `time_integral`, static.
         stages: those of `IndexReducedODE` without `rtol`, by which a `Criterion` integrates; else None.
@@ -142,6 +225,7 @@ class Trajectory(AbstractMotion):
     error: StateError | None = None
     order: int = eqx.field(static=True, default=2)
     stages: Stages | None = None
+    joints: dict[str, AbstractJoint] | None = None
 
     def _kinematics(self):
         return self.states, self.t
