@@ -1,6 +1,7 @@
 """The result of a simulation, and one instant of it: the same questions, asked of all times or of one."""
 
 import abc
+import os
 from collections.abc import Iterable
 from functools import partial
 from typing import Any, NamedTuple
@@ -15,6 +16,7 @@ from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate import Stages
 from lgsens.model import AbstractJoint, Frame, MultibodySystem, joint_wrenches, motion_at
 from lgsens.simulation._joint_motion import JointMotion, joint_motion
+from lgsens.simulation._tables import to_csv, to_pandas, to_xarray
 
 
 class BodyMotion(NamedTuple):
@@ -112,13 +114,10 @@ class AbstractMotion(eqx.Module):
 
         Raises `ValueError` for an unknown name or a wrong shape.
         """
-        motion, local = self.body(body), self._reference(body).local_point(as_float(at, (3,), "`at`"))
-        both = lambda linear, angular: jnp.concatenate([linear, angular], axis=-1)
-        twist, rate = (
-            both(motion.velocity, motion.angular_velocity),
-            both(motion.acceleration, motion.angular_acceleration),
-        )
-        return PointMotion(*motion_at(local, motion.position, motion.orientation, twist, rate))
+        x, orientation, velocity, spin, acceleration, change = self.body(body)
+        local = self._reference(body).local_point(as_float(at, (3,), "`at`"))
+        twist, rate = (jnp.concatenate(parts, axis=-1) for parts in ((velocity, spin), (acceleration, change)))
+        return PointMotion(*motion_at(local, x, orientation, twist, rate))
 
     def _reference(self, body: str) -> Frame:
         """The frame at a body's centre of mass in the reference configuration."""
@@ -166,6 +165,8 @@ class AbstractMotion(eqx.Module):
 class AbstractRun(AbstractMotion):
     """What motions over time answer besides, those of `simulate` and of `kinematics`."""
 
+    t: eqx.AbstractVar[Float[Array, " n+1"]]
+    result: eqx.AbstractVar[Int[Array, ""]]
     joints: eqx.AbstractVar[dict[str, AbstractJoint] | None]
 
     def joint(self, name: str) -> JointMotion:
@@ -200,6 +201,37 @@ class AbstractRun(AbstractMotion):
         return {
             name: joint_motion(joints[name], self.body, self._reference, wrench, t) for name, wrench in wrenches.items()
         }
+
+    def to_xarray(self) -> Any:
+        """An `xarray.Dataset` over the dimension "time": all bodies, joints and states of force elements.
+
+        Variables are "top.position" (time, axis), "top.orientation" (time, axis, body_axis), … as in `BodyMotion`;
+        "hinge.angle", "hinge.angle_rate", …, "hinge.force", "hinge.moment" as in `JointMotion`, "hinge.multiplier";
+        "motor.output" as in `states_of`. Each has its unit as attribute `units`, but for multipliers and states, whose
+        meaning their elements say. Of a motion of equations that do not know their joints: multipliers alone.
+
+        Raises `ImportError` without xarray (`pip install "lgsens[data]"`), and `ValueError` for a motion that is traced
+        or a batch.
+        """
+        return to_xarray(self)
+
+    def to_pandas(self) -> Any:
+        """A `pandas.DataFrame` with the times as index and a column for each number, "top.position.x".
+
+        Contents and errors are those of `to_xarray`; units by column are in `attrs["units"]`.
+        """
+        return to_pandas(self)
+
+    def to_csv(self, path: str | os.PathLike) -> None:
+        """Write a table with a line for each time and a column for each number, "top.position.x [m]", in full
+        precision: what `to_xarray` has, without any package.
+
+        Arguments:
+            path: of the file, which is overwritten.
+
+        Raises `ValueError` for a motion that is traced or a batch.
+        """
+        to_csv(self, path)
 
 
 class Trajectory(AbstractRun):
