@@ -144,7 +144,8 @@ def kinematics(
     (states, result), details = _kinematics_jit(drive, (values, time), (speed, clock))
     if throw:
         states = throw_if_failed(states, result, details, system.constraint_names)
-    return Kinematics(dict(zip(names, columns)), time, states, result, system, model.joints)
+    values = dict(zip(names, columns))
+    return Kinematics(values=values, t=time, states=states, result=result, system=system, joints=model.joints)
 
 
 @eqx.filter_jit

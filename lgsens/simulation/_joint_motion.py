@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lgsens._brief import brief
 from lgsens.model import AbstractJoint, Frame, continued, relative_motion
 
 
@@ -43,6 +44,8 @@ class JointMotion(NamedTuple):
     moment: Float[Array, "n 3"]
     local_force: Float[Array, "n 3"]
     local_moment: Float[Array, "n 3"]
+
+    __repr__ = brief
 
     @property
     def angle(self) -> Float[Array, " n"]:

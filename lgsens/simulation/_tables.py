@@ -11,7 +11,7 @@ import numpy as np
 from lgsens._validate import is_concrete, optional
 from lgsens.dynamics import RESULTS
 
-_AXES = ("x", "y", "z")
+_AXES: tuple[str, ...] = ("x", "y", "z")
 _UNITS = {  # of a body, of the coordinates of a joint and of what it does
     "position": "m",
     "orientation": "1",
@@ -24,11 +24,14 @@ _UNITS = {  # of a body, of the coordinates of a joint and of what it does
 }
 
 
+Axes = dict[str, tuple[str, ...]]
+
+
 class Quantity(NamedTuple):
     """What a motion has of an element: values (n, …), the labels of each further axis with its name, and the unit."""
 
     values: np.ndarray
-    axes: dict[str, tuple[str, ...]]
+    axes: Axes
     unit: str | None
 
     @property
@@ -49,17 +52,19 @@ def quantities(run: Any, what: str) -> dict[str, Quantity]:
             f"`{what}`: this is a batch of motions, of shape {t.shape[:-1]}; write each of them: "
             "jax.tree.map(lambda leaf: leaf[i], trajectories)."
         )
-    whole, found = system if system.parts is None else system.parts.system, {}
-    vector = {"axis": _AXES}
+    whole = system if system.parts is None else system.parts.system
+    found: dict[str, Quantity] = {}
+    vector: Axes = {"axis": _AXES}
 
-    def add(name: str, values, unit: str | None, axes: dict[str, tuple[str, ...]]):
+    def add(name: str, values, unit: str | None, axes: Axes):
         found[name] = Quantity(np.asarray(values), axes, unit)
 
     for name in whole.body_names:
         for field, values in run.body(name)._asdict().items():
             add(f"{name}.{field}", values, _UNITS[field], vector | {"body_axis": _AXES} if values.ndim == 3 else vector)
-    for name, joint in ({} if run.joints is None else run._joint_motions(run.joints)).items():
-        for s in run.joints[name].coordinates:
+    joints = run.joints or {}
+    for name, joint in (run._joint_motions(joints) if joints else {}).items():
+        for s in joints[name].coordinates:
             add(f"{name}.{s.name}", joint.coordinates[s.name], s.unit, {})
             add(f"{name}.{s.name}_rate", joint.rates[s.name], f"{s.unit}/s", {})
             add(f"{name}.{s.name}_acceleration", joint.accelerations[s.name], f"{s.unit}/s²", {})

@@ -9,10 +9,12 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from lgsens._validate import as_float, suggestion
-from lgsens.dynamics import AbstractSystem, State
+from lgsens._brief import brief, listed, roster, shown
+from lgsens._validate import as_float, is_concrete, suggestion
+from lgsens.dynamics import RESULTS, AbstractSystem, State
 from lgsens.integrate import Stages
 from lgsens.model import AbstractJoint, Frame, MultibodySystem, joint_wrenches, motion_at
 from lgsens.simulation._joint_motion import JointMotion, joint_motion
@@ -38,6 +40,8 @@ class BodyMotion(NamedTuple):
     acceleration: Float[Array, "*n 3"]
     angular_acceleration: Float[Array, "*n 3"]
 
+    __repr__ = brief
+
     def point(self, at) -> Float[Array, "n 3"]:
         """The path [m], inertial frame, of the body's point that is at `at` (inertial frame, shape (3,)) at first.
 
@@ -60,6 +64,8 @@ class PointMotion(NamedTuple):
     velocity: Float[Array, "*n 3"]
     acceleration: Float[Array, "*n 3"]
 
+    __repr__ = brief
+
 
 class StateError(NamedTuple):
     """Errors of the states of a trajectory, estimated; every array has a leading axis over the n + 1 times.
@@ -76,6 +82,17 @@ class StateError(NamedTuple):
     vdot: Float[Array, "n+1 k"]
     lam: Float[Array, "n+1 m"]
 
+    __repr__ = brief
+
+
+def _ending(result: Any) -> str:
+    """How a simulation ended, or how many of a batch did so."""
+    if not is_concrete(result):
+        return "traced"
+    codes, counts = np.unique(np.asarray(result), return_counts=True)
+    one = np.ndim(result) == 0
+    return ", ".join(RESULTS(code).name + ("" if one else f" {count}") for code, count in zip(codes, counts))
+
 
 class AbstractMotion(eqx.Module):
     """What `Trajectory` and `Instant` answer alike; arrays of a trajectory have a leading axis n + 1."""
@@ -85,6 +102,22 @@ class AbstractMotion(eqx.Module):
     @abc.abstractmethod
     def _kinematics(self) -> tuple[State, Any]:
         """The states and their times."""
+
+    def __repr__(self) -> str:
+        states, t = self._kinematics()
+        system, joints, result = self.system, getattr(self, "joints", None), getattr(self, "result", None)
+        fields = {"t": f"{shown(t)} s"}
+        if hasattr(self, "stats"):
+            fields = {"steps": str(t.shape[-1] - 1)} | fields
+        if result is not None:
+            fields["result"] = _ending(result)
+        if isinstance(system, MultibodySystem):
+            whole = system if system.parts is None else system.parts.system
+            own = dict.fromkeys(whole.constraint_names) if joints is None else joints
+            fields |= {"bodies": roster(whole.body_names), "joints": roster(own)}
+            fields["forces"] = roster(dict.fromkeys(owner for stack in whole.loads for owner in stack.owners))
+        unknowns = f"{states.v.shape[-1]} coordinates, {states.lam.shape[-1]} multipliers of"
+        return listed(type(self).__name__, fields | {"states": f"{unknowns} {type(system).__name__}"})
 
     def _multibody(self) -> MultibodySystem:
         if not isinstance(self.system, MultibodySystem):
@@ -283,6 +316,10 @@ class Saved(eqx.Module):
     final: State
     result: Int[Array, ""]
     stats: Any
+
+    def __repr__(self) -> str:
+        fields = {"t": f"{shown(self.t)} s", "result": _ending(self.result), "values": shown(self.values)}
+        return listed("Saved", fields)
 
 
 class Instant(AbstractMotion):

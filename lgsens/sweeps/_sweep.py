@@ -11,6 +11,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jaxtyping import PyTree
 
+from lgsens._brief import brief
 from lgsens._progress import compiling, progress_bar
 from lgsens._validate import as_count, leaf_name, optional
 from lgsens.sweeps._batches import compile_batch, trace
@@ -34,6 +35,8 @@ class SweepResult(NamedTuple):
     batch_size: int
     compile_seconds: float
     run_seconds: float
+
+    __repr__ = brief
 
     def design(self, index: int) -> PyTree:
         """One design. `fn(found.design(i))` on its own raises what a failed one has to say, with step and advice."""
