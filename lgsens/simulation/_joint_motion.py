@@ -29,7 +29,7 @@ class JointMotion(NamedTuple):
         orientation: of the frame on b in that on a, shape (n+1, 3, 3).
         point: where the joint's point on b is [m], inertial frame, shape (n+1, 3).
         force: what the joint does to b [N], inertial frame, shape (n+1, 3); to a it does the opposite, at the same
-            point.
+            point (one of one's own if Φ depends on how a and b are to each other, and not to the ground).
         moment: its moment about that point [N m], inertial frame, shape (n+1, 3).
         local_force, local_moment: the same in the joint's frame.
     """
