@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from lgsens._validate import as_float, suggestion
+from lgsens._xla import alike
 from lgsens.dynamics import RESULTS, AbstractDrive, State, forces_of_motion, positions
 from lgsens.model import AbstractJoint, AbstractSignal, Model, MultibodySystem
 from lgsens.simulation import AbstractRun, throw_if_failed
@@ -141,7 +142,7 @@ def kinematics(
     values, speed = table(columns), table([jnp.broadcast_to(speed, shape) for speed in speeds])
     time = jnp.broadcast_to(start, shape) if t is None else times[0]
     clock = jnp.zeros_like(time) if t is None else jnp.ones_like(time)
-    (states, result), details = _kinematics_jit(drive, (values, time), (speed, clock))
+    (states, result), details = _kinematics_jit(*alike((drive, (values, time), (speed, clock))))
     if throw:
         states = throw_if_failed(states, result, details, system.constraint_names)
     values = dict(zip(names, columns))
