@@ -1,10 +1,12 @@
 """`Trajectory.joint` and `Trajectory.point`: against Newton and Euler by hand, SciPy's rotations, closed forms."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import EPS, GRAVITY, random_body, random_rotation, says
+from helpers import EPS, GRAVITY, central_difference, random_body, random_point, random_rotation, says
 from scipy.spatial.transform import Rotation
 
 import lgsens as lg
@@ -138,7 +140,7 @@ def test_rates_and_accelerations_are_derivatives_by_time(name):
     assert len(joint.coordinates) == len(values[2]) > 0
 
 
-@pytest.mark.parametrize("rate", [7.0, -100.0])
+@pytest.mark.parametrize("rate", [pytest.param(7.0, marks=pytest.mark.slow), -100.0])
 def test_angle_over_many_turns(rate):
     """ω t, also where a step is more than half a turn (5 rad)."""
     rotor = lg.RigidBody(2.0, (0.3, 0.3, 0.5), position=(0.1, 0.2, 0.0), angular_velocity=(0.0, 0.0, rate))
@@ -149,9 +151,6 @@ def test_angle_over_many_turns(rate):
     # each step adds a rotation to round-off
     np.testing.assert_allclose(found.angle, rate * np.asarray(trajectory.t), rtol=0, atol=100 * 10 * EPS * abs(rate))
     np.testing.assert_allclose(found.rate, np.full(101, rate), rtol=1e-13)
-    on = lg.simulate(model, t0=5.0, t1=6.0, num_steps=20, state0=trajectory.state(-1)).joint("hinge").angle
-    np.testing.assert_allclose(on - on[0], rate * np.linspace(0.0, 1.0, 21), rtol=0, atol=1e-10)
-    assert abs(on[0]) <= np.pi
 
 
 def two_parts(**options):
@@ -173,9 +172,11 @@ def two_parts(**options):
     return lg.Model(bodies, joints, {"gravity": lg.Gravity(G)}, **options)
 
 
-@pytest.mark.parametrize(
-    "options", [{"merge_fixed": True}, {"free": "x z ry"}, {"free": "x z ry", "merge_fixed": True}]
-)
+PLANAR = {"free": "x z ry"}
+SLOW = [pytest.param(options, marks=pytest.mark.slow) for options in ({"merge_fixed": True}, PLANAR)]
+
+
+@pytest.mark.parametrize("options", [*SLOW, PLANAR | {"merge_fixed": True}])
 def test_of_merged_and_freed_bodies(options):
     model = two_parts(**options)
     trajectory = lg.simulate(model, t1=0.2, num_steps=40)
@@ -192,6 +193,7 @@ def test_of_merged_and_freed_bodies(options):
     close(hinge.angle, angle)
 
 
+@pytest.mark.slow
 def test_redundant_joints_share_what_the_motion_needs():
     """A door on two hinges: the sum of their forces, and least norm: alike for two alike at the same distance."""
     door = lg.RigidBody(3.0, (0.3, 0.2, 0.1), position=(0.5, 0.0, 0.0), velocity=(0.0, 0.5, 0.0), angular_velocity=Z)
@@ -210,6 +212,7 @@ def test_redundant_joints_share_what_the_motion_needs():
     np.testing.assert_allclose(low.angle, up.angle, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_of_a_driven_mechanism():
     """Crank and slider over three turns: x = r cos φ + √(l² − r² sin²φ); the driving moment by virtual work."""
     r, length, weight = 0.3, 1.0, 4.0
@@ -258,6 +261,7 @@ def pendulum(p):
     return lg.Model({"body": body}, {"hinge": hinge}, {"gravity": lg.Gravity(G)})
 
 
+@pytest.mark.slow  # gradients of simulations in both modes
 def test_derivatives_in_both_modes_are_those_of_differences():
     """By the hardpoint, the axis and the marker."""
     p = {"at": jnp.array([0.0, 0.05, 0.1]), "axis": jnp.array([0.1, 1.0, 0.2]), "marker": jnp.array([0.8, 0.2, 0.1])}
@@ -296,6 +300,8 @@ def test_point_is_where_the_reference_configuration_has_it():
     close(found.velocity, velocity + turned(np.cross(spin, local)))
     close(found.acceleration, acceleration + turned(np.cross(change, local) + np.cross(spin, np.cross(spin, local))))
     assert np.abs(found.position[0] - at).max() > 0.1
+    swung = np.arctan2(-orientation[:, 2, 0], orientation[:, 0, 0])  # about y
+    close(trajectory.joint("hinge").angle, swung)  # counted from the reference configuration too
     instant = lg.Instant(t=trajectory.t[3], state=trajectory.state(3), system=trajectory.system)
     for one, every in zip(instant.point("body", at), found):
         np.testing.assert_allclose(one, every[3], rtol=0, atol=1e-14)
@@ -303,9 +309,35 @@ def test_point_is_where_the_reference_configuration_has_it():
     close(path[0], found.position)
 
 
+def test_derivatives_by_a_hardpoint_of_one_motion():
+    """Of angle, force and moment by the hinge's point and axis, the motion as it is: forward, reverse, differences."""
+    rng = np.random.default_rng(1)
+    model = pendulum({"at": np.zeros(3), "axis": Y})
+    system = model.system()
+    points = [random_point(system, rng) for _ in range(3)]
+    states = [lg.State(q, v, vdot, lam, vdot) for q, v, vdot, lam, _ in points]
+    still = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+    run = lg.Trajectory(t=jnp.arange(3.0), states=still, result=jnp.asarray(0), stats=None, system=system)
+
+    def what(p):
+        found = dataclasses.replace(run, joints=pendulum(p).joints).joint("hinge")
+        one = [found.angle, found.rate, found.acceleration]
+        return jnp.concatenate([*one, found.moment.ravel(), found.local_moment.ravel(), found.local_force.ravel()])
+
+    p = {"at": jnp.array([0.0, 0.05, 0.1]), "axis": jnp.array([0.1, 1.0, 0.2])}
+    forward, reverse = jax.jit(jax.jacfwd(what))(p), jax.jit(jax.jacrev(what))(p)
+    value = jax.jit(what)
+    for name in p:
+        scale = np.abs(forward[name]).max()
+        np.testing.assert_allclose(reverse[name], forward[name], rtol=0, atol=1e-13 * scale)
+        columns = central_difference(lambda x, name=name: value(p | {name: p[name] + x}), 3)
+        np.testing.assert_allclose(forward[name], columns, rtol=0, atol=1e-8 * scale)  # 4e-11 of third derivatives
+    assert np.abs(forward["at"]).max() > 0.1 and np.abs(forward["axis"]).max() > 0.1
+
+
 def test_messages():
-    model = each_joint()
-    trajectory = lg.simulate(two_parts(), t1=0.01, num_steps=1)
+    model = two_parts(**PLANAR)
+    trajectory = lg.simulate(model, t1=0.01, num_steps=1)
     with pytest.raises(ValueError, match=says("`joint`: 'hing' is not one of ['hinge', 'weld']")):
         trajectory.joint("hing")
     with pytest.raises(ValueError, match=says("`angle`", "relative coordinates of this joint are []", "`coordinates`")):
@@ -317,10 +349,9 @@ def test_messages():
     with pytest.raises(ValueError, match=says("`at` must have shape (3,), got shape (2,)")):
         trajectory.point("arm", (0.0, 1.0))
     with pytest.raises(ValueError, match=says("do not know their joints", "give `simulate` the Model", "`multiplier`")):
-        lg.simulate(two_parts().system(), t1=0.01, num_steps=1).joint("hinge")
+        dataclasses.replace(trajectory, joints=None).joint("hinge")  # of `simulate(model.system(), …)`
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), trajectory)
     with pytest.raises(ValueError, match=says("batch of motions, of shape (2,)", "jax.vmap")):
         batch.joint("hinge")
     angles = jax.vmap(lambda trajectory: trajectory.joint("hinge").angle)(batch)
     np.testing.assert_allclose(angles[1], trajectory.joint("hinge").angle, rtol=0, atol=1e-15)
-    assert model.joints["sleeve"].coordinates[1].unit == "m"
