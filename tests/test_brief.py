@@ -89,6 +89,7 @@ def test_says_what_one_wants_to_know():
     assert "float64[5000], 2.901 to 3, 4875 not finite" in repr(lg.PointMotion(broken, broken, broken))
     assert "[0.25, 0.5 ]" in repr(lg.PointMotion(*[np.array([0.25, 0.5])] * 3))
     assert "bodies         2: link_0, link_1" in repr(model)
+    assert "Trajectory(" in repr(jax.tree.map(lambda _: None, trajectory(model)))  # as it is elsewhere
     said = []
     jax.jit(lambda run: said.append(repr(run)))(trajectory(model))
     assert "traced float64[101]" in said[0] and "result  traced" in said[0]

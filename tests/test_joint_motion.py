@@ -309,15 +309,17 @@ def test_point_is_where_the_reference_configuration_has_it():
     close(path[0], found.position)
 
 
+def anywhere(model) -> lg.Trajectory:
+    """Three states of a model, whatever its joints say."""
+    rng, system = np.random.default_rng(1), model.system()
+    states = [lg.State(q, v, vdot, lam, vdot) for q, v, vdot, lam, _ in (random_point(system, rng) for _ in range(3))]
+    stacked, t = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states), jnp.arange(3.0)
+    return lg.Trajectory(t=t, states=stacked, result=jnp.asarray(0), stats=None, system=system, joints=model.joints)
+
+
 def test_derivatives_by_a_hardpoint_of_one_motion():
     """Of angle, force and moment by the hinge's point and axis, the motion as it is: forward, reverse, differences."""
-    rng = np.random.default_rng(1)
-    model = pendulum({"at": np.zeros(3), "axis": Y})
-    system = model.system()
-    points = [random_point(system, rng) for _ in range(3)]
-    states = [lg.State(q, v, vdot, lam, vdot) for q, v, vdot, lam, _ in points]
-    still = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
-    run = lg.Trajectory(t=jnp.arange(3.0), states=still, result=jnp.asarray(0), stats=None, system=system)
+    run = anywhere(pendulum({"at": np.zeros(3), "axis": Y}))
 
     def what(p):
         found = dataclasses.replace(run, joints=pendulum(p).joints).joint("hinge")
@@ -336,8 +338,7 @@ def test_derivatives_by_a_hardpoint_of_one_motion():
 
 
 def test_messages():
-    model = two_parts(**PLANAR)
-    trajectory = lg.simulate(model, t1=0.01, num_steps=1)
+    trajectory = anywhere(two_parts())
     with pytest.raises(ValueError, match=says("`joint`: 'hing' is not one of ['hinge', 'weld']")):
         trajectory.joint("hing")
     with pytest.raises(ValueError, match=says("`angle`", "relative coordinates of this joint are []", "`coordinates`")):
