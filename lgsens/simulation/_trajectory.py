@@ -106,8 +106,8 @@ class AbstractMotion(eqx.Module):
     def __repr__(self) -> str:
         states, t = self._kinematics()
         system, joints, result = self.system, getattr(self, "joints", None), getattr(self, "result", None)
-        v, lam = (getattr(states, name, None) for name in ("v", "lam"))
-        if not all(hasattr(array, "shape") for array in (t, v, lam)):  # a tree of something else than arrays
+        sizes = [getattr(array, "shape", (None,))[-1] for array in (getattr(states, of, None) for of in ("v", "lam"))]
+        if not hasattr(t, "shape") or None in sizes:  # a tree of something else than arrays
             return super().__repr__()
         fields = {"t": f"{shown(t)} s"}
         if hasattr(self, "stats"):
@@ -119,7 +119,7 @@ class AbstractMotion(eqx.Module):
             own = dict.fromkeys(whole.constraint_names) if joints is None else joints
             fields |= {"bodies": roster(whole.body_names), "joints": roster(own)}
             fields["forces"] = roster(dict.fromkeys(owner for stack in whole.loads for owner in stack.owners))
-        unknowns = f"{v.shape[-1]} coordinates, {lam.shape[-1]} multipliers of"
+        unknowns = f"{sizes[0]} coordinates, {sizes[1]} multipliers of"
         return listed(type(self).__name__, fields | {"states": f"{unknowns} {type(system).__name__}"})
 
     def _multibody(self) -> MultibodySystem:
