@@ -84,6 +84,8 @@ from lgsens.simulation import (
     BodyMotion as BodyMotion,
     Extrapolated as Extrapolated,
     Instant as Instant,
+    JointMotion as JointMotion,
+    PointMotion as PointMotion,
     Richardson as Richardson,
     Saved as Saved,
     SimulationError as SimulationError,

@@ -1,5 +1,6 @@
 """Checks of arguments: conversion to float leaves once, at construction, and clear errors."""
 
+import importlib
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -62,6 +63,14 @@ def require_setting(owner: Any, name: str, valid: bool, must: str, advice: str =
     """Raise `ValueError` unless a static setting of `owner` is valid."""
     if not valid:
         raise ValueError(f"{type(owner).__name__}: `{name}` must be {must}, got {getattr(owner, name)!r}{advice}.")
+
+
+def optional(module: str, what: str, extra: str = "data") -> Any:
+    """A module that an extra of lgsens installs; raises `ImportError` that says how."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(f'`{what}` needs {module}: pip install "lgsens[{extra}]".') from error
 
 
 def suggestion(name: str, known: Any) -> str:

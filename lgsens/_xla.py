@@ -1,4 +1,5 @@
-"""What XLA has to be told for results to be right and for programs to be ready soon, and where they are kept.
+"""What XLA has to be told for results to be right and for programs to be ready soon, where they are kept; and what JAX
+has to be told inside of `shard_map`.
 
 From jaxlib 0.10.2 on XLA hands sums on a CPU to YNNPACK ("YNN fusions"), alone or with the product before them, and
 what comes back can be wrong without a word. Measured, the largest error relative to the largest result:
@@ -36,12 +37,16 @@ import contextlib
 import gc
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
+import numpy as np
+from jax import lax
 from jax.experimental.compilation_cache import compilation_cache as jax_cache
+from jax.flatten_util import ravel_pytree
 from jaxlib.version import __version_info__ as _VERSION
 
 _SUMS = "--xla_cpu_experimental_ynn_fusion_type"
@@ -53,6 +58,8 @@ _OPTIONS = (
     (_SUMS, "-reduce", (0, 10, 2), (0, 13)),
     (_EXTRA, _SMALL_PROGRAMS, (0, 10), (0, 11)),
 )
+Carry = TypeVar("Carry")
+Y = TypeVar("Y")
 _COLLECTED = 100_000  # how many objects are made before Python looks for those that are no longer used
 
 
@@ -99,6 +106,69 @@ def tracing() -> Iterator[None]:
             yield
     finally:
         gc.set_threshold(*before)
+
+
+# Inside of `shard_map` numbers of a design differ from device to device ("vary"), constants do not, and JAX refuses
+# loops and derivatives in which one becomes the other. So what a simulation is made of varies as a whole (`alike`), and
+# the carries of its loops do. Elsewhere the functions below are JAX's.
+
+
+def alike(tree: Any, *others: Any) -> Any:
+    """A tree whose arrays vary over the same axes of a mesh: those over which one of them or of `others` does."""
+    if not jax.sharding.get_abstract_mesh().manual_axes:
+        return tree
+    is_array = lambda leaf: isinstance(leaf, jax.Array | np.ndarray | jax.ShapeDtypeStruct)
+    of = lambda leaf: jax.typeof(leaf).manual_axis_type.varying
+    axes = frozenset().union(*(of(leaf) for leaf in jax.tree.leaves((tree, others)) if is_array(leaf)))
+
+    def varying(leaf):
+        missing = tuple(axes - of(leaf)) if is_array(leaf) else ()
+        return lax.pcast(leaf, missing, to="varying") if missing else leaf
+
+    return jax.tree.map(varying, tree)
+
+
+def while_loop(unfinished: Callable[[Carry], Any], body: Callable[[Carry], Carry], init: Carry) -> Carry:
+    if jax.sharding.get_abstract_mesh().manual_axes:
+        init = alike(init, jax.eval_shape(body, init))
+        return lax.while_loop(unfinished, lambda carry: alike(body(carry), carry), init)
+    return lax.while_loop(unfinished, body, init)
+
+
+def fori_loop(first: int, after: int, body: Callable[[Any, Carry], Carry], init: Carry) -> Carry:
+    if jax.sharding.get_abstract_mesh().manual_axes:
+        init = alike(init, jax.eval_shape(body, first, init))
+        return lax.fori_loop(first, after, lambda i, carry: alike(body(i, carry), carry), init)
+    return lax.fori_loop(first, after, body, init)
+
+
+def scan(body: Callable[[Carry, Any], tuple[Carry, Y]], init: Carry, xs: Any, **options: Any) -> tuple[Carry, Y]:
+    def same(carry, x):
+        after, y = body(carry, x)
+        return alike(after, carry), y
+
+    if jax.sharding.get_abstract_mesh().manual_axes:
+        init = alike(init, jax.eval_shape(body, init, jax.tree.map(lambda leaf: leaf[0], xs))[0])
+        return lax.scan(same, init, xs, **options)
+    return lax.scan(body, init, xs, **options)
+
+
+def linear_solve(matvec: Callable, b: Any, solve: Callable, transpose_solve: Callable | None = None, symmetric=False):
+    """`lax.custom_linear_solve`, which inside of `shard_map` has to be spared two things.
+
+    JAX makes the constants of these functions vary without telling the functions, so they are hidden in a `jit`; and
+    transposed it gives them zeros that do not vary, of several arrays those on which nothing depends, so b is one.
+    """
+    if not jax.sharding.get_abstract_mesh().manual_axes:
+        return lax.custom_linear_solve(matvec, b, solve, transpose_solve, symmetric)
+    flat, unravel = ravel_pytree(b)
+
+    def hidden(function: Callable) -> Callable:
+        inner = jax.jit(lambda flat: ravel_pytree(function(unravel(flat)))[0])
+        return lambda *args: inner(args[-1])
+
+    back = None if transpose_solve is None else hidden(partial(transpose_solve, matvec))
+    return unravel(lax.custom_linear_solve(hidden(matvec), flat, hidden(partial(solve, matvec)), back, symmetric))
 
 
 def compilation_cache(folder: str | os.PathLike | None = None) -> Path:

@@ -26,9 +26,9 @@ RANKS = (
     ("cli",),
 )
 BELOW = {name: {below for rank in RANKS[:i] for below in rank} for i, rank in enumerate(RANKS) for name in rank}
-AT_ROOT = {"__init__", "__main__", "_progress", "_validate", "_xla"}
+AT_ROOT = {"__init__", "__main__", "_brief", "_progress", "_validate", "_xla"}
 FOUNDATION = "lgsens._validate"
-FOUNDATIONS = {FOUNDATION, "lgsens._progress", "lgsens._xla"}
+FOUNDATIONS = {FOUNDATION, "lgsens._brief", "lgsens._progress", "lgsens._xla"}
 MAX_LINES = 350
 
 

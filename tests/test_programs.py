@@ -12,6 +12,7 @@ from helpers import says
 from jax import export
 
 import lgsens as lg
+from lgsens._xla import fori_loop, linear_solve, scan, while_loop
 from lgsens.examples import spinning_top
 
 P = jnp.array([0.7, 1.0])  # angle, length
@@ -62,3 +63,71 @@ def test_a_folder_that_cannot_be_written(tmp_path):
     taken.write_text("")
     with pytest.raises(ValueError, match=says("`folder`", "cannot be written", "name another one")):
         lg.compilation_cache(taken)
+
+
+def at_rest(p):
+    """A chain of links with blocks, from its equilibrium, and what is saved of it."""
+    names = [f"link {i}" for i in range(3)]
+    bodies = {name: lg.RigidBody(p[1], (0.1, 0.1, 0.1), position=(0.0, 0.0, -i - p[0])) for i, name in enumerate(names)}
+    joints = {b: lg.SphericalJoint(a, b, at=(0.0, 0.0, -i)) for i, (a, b) in enumerate(zip([None, *names], names))}
+    spring = lg.SpringDamper(None, names[-1], at_a=(1.0, 0.0, 0.0), at_b=(0.0, 0.0, -3.0), stiffness=20.0, damping=1.0)
+    forces = {"gravity": lg.Gravity((0.0, 0.0, -9.81)), "spring": spring}
+    model = lg.Model(bodies, joints, forces, linear_solver=lg.BlockSparse())
+    start = lg.initial_state(model)
+    save = lambda s: s.body(names[-1]).position[0] ** 2
+    run = lg.simulate(model, t1=0.1, num_steps=4, state0=start, save=save)
+    return jnp.sum(run.values)
+
+
+MESH, SPEC = jax.sharding.Mesh(jax.devices()[:1], ("designs",)), jax.sharding.PartitionSpec("designs")
+
+
+def over_mesh(function):
+    """With the check of what varies, which is that of one device as well."""
+    return jax.jit(jax.shard_map(jax.vmap(function), mesh=MESH, in_specs=SPEC, out_specs=SPEC))
+
+
+@pytest.mark.slow  # gradients are compiled twice
+@pytest.mark.parametrize(
+    "derivative, f",
+    [
+        (jax.value_and_grad, psi),
+        (lambda f: jax.jacfwd(lambda p: (f(p), f(p)), has_aux=True), psi),
+        (jax.value_and_grad, at_rest),
+    ],
+    ids=["top", "top, forward", "chain, saved"],
+)
+def test_designs_over_a_mesh(derivative, f):
+    designs = P[None] + jnp.array([[0.0, 0.0], [0.1, -0.1]])
+    both = over_mesh(derivative(f))(designs), jax.jit(jax.vmap(derivative(f)))(designs)
+    for found, expected in zip(*map(jax.tree.leaves, both)):
+        np.testing.assert_allclose(found, expected, rtol=1e-9)  # two programs
+
+
+def test_constants_in_loops_and_solves_over_a_mesh():
+    """What JAX alone refuses: carries that begin or end as constants, constants in the functions of a solve, and b of
+    several parts of which not all are used; values by hand, derivatives in both modes."""
+
+    def f(x):
+        total, _ = scan(lambda carry, i: (carry + i * x, None), jnp.zeros(()), jnp.arange(4.0))  # 6x
+        going = lambda carry: carry[0]
+        _, doubled = while_loop(going, lambda carry: (jnp.zeros((), bool), carry[1] + 2 * x), (x > 0, jnp.zeros(())))
+        powered = fori_loop(0, 3, lambda i, carry: carry * x, jnp.ones(()))
+        return total + 10.0 * doubled + 100.0 * powered
+
+    designs = jnp.array([0.5, 3.0])
+    with pytest.raises(Exception, match="carry"):  # else there is nothing to do any more
+        jax.eval_shape(over_mesh(lambda x: jax.lax.fori_loop(0, 3, lambda i, carry: carry * x, jnp.ones(()))), designs)
+    np.testing.assert_allclose(over_mesh(f)(designs), 26.0 * designs + 100.0 * designs**3, rtol=1e-14)
+    np.testing.assert_allclose(over_mesh(jax.jacfwd(f))(designs), 26.0 + 300.0 * designs**2, rtol=1e-14)
+
+    order = np.array([2, 0, 1])
+
+    def of_solve(x):  # which can be transposed, as `while_loop` cannot
+        times = lambda parts: (x * parts[0][order], parts[1])
+        solve = lambda _, parts: (parts[0][np.argsort(order)] / x, parts[1])
+        back = lambda _, parts: (parts[0][order] / x, parts[1])
+        y, _ = linear_solve(times, (jnp.stack([x, x**2, x**3]), x), solve, back)  # [x, x², 1]
+        return jnp.sum(y * jnp.array([1.0, 10.0, 100.0]))
+
+    np.testing.assert_allclose(over_mesh(jax.grad(of_solve))(designs), 1.0 + 20.0 * designs, rtol=1e-12)

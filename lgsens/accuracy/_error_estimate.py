@@ -40,6 +40,8 @@ solves the variational equation with the local error as its load); Arnold, Brül
 (2015), doi:10.1007/s00211-014-0633-1, for the local errors on a Lie group.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -186,12 +188,4 @@ def corrected(trajectory: Trajectory, error: StateError) -> Trajectory:
     q = jax.vmap(group.retract)(states.q, error.w)
     vdot = states.vdot + error.vdot
     better = State(q, states.v + error.v, vdot, states.lam + error.lam, vdot)
-    return Trajectory(
-        t=trajectory.t,
-        states=better,
-        result=trajectory.result,
-        stats=trajectory.stats,
-        system=trajectory.system,
-        error=error,
-        order=4,
-    )
+    return dataclasses.replace(trajectory, states=better, error=error, order=4, stages=None)

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lgsens._brief import brief
 from lgsens.accuracy._programs import Evaluated, Study, evaluate
 from lgsens.accuracy._setting import Setting
 from lgsens.integrate import GeneralizedAlpha, IndexReducedODE
@@ -53,6 +54,8 @@ class Reference:
     gradient_error: float
     evidence: tuple[str, ...] = ()
     confirmed: bool = False
+
+    __repr__ = brief
 
     @property
     def error(self) -> float:

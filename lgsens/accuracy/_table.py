@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from lgsens._brief import brief
 from lgsens.accuracy._reference import Reference
 from lgsens.accuracy._setting import Setting
 
@@ -45,6 +46,8 @@ class Row:
     energy_drift: float | None = None
     iterations: float | None = None
     unfinished: int = 0
+
+    __repr__ = brief
 
     @property
     def error(self) -> float:

@@ -65,6 +65,8 @@ class Growth(NamedTuple):
             said += f" From t = {float(self.horizon):.4g} s on the motion itself is one of round-off."
         return said
 
+    __repr__ = __str__
+
 
 def sensitivity_growth(
     model: Model | AbstractSystem, *, t0=0.0, t1, num_steps: int, integrator: AbstractIntegrator = GeneralizedAlpha()

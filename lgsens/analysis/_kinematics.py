@@ -9,13 +9,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from lgsens._validate import as_float, suggestion
+from lgsens._xla import alike
 from lgsens.dynamics import RESULTS, AbstractDrive, State, forces_of_motion, positions
-from lgsens.model import AbstractSignal, Model, MultibodySystem
-from lgsens.simulation import AbstractMotion, throw_if_failed
+from lgsens.model import AbstractJoint, AbstractSignal, Model, MultibodySystem
+from lgsens.simulation import AbstractRun, throw_if_failed
 
 
-class Kinematics(AbstractMotion):
-    """The positions of a driven mechanism, with what `Trajectory` answers: `body`, `multiplier`, `force`.
+class Kinematics(AbstractRun):
+    """The positions of a driven mechanism, with what `Trajectory` answers: `body`, `joint`, `force`, ….
 
     Attributes:
         values: the driven values by joint, shape (n,) each: [m], of a `RotationDriver` [rad].
@@ -23,6 +24,7 @@ class Kinematics(AbstractMotion):
         states: q; v and v̇ with respect to the rates; λ of that motion. Stacked along a leading axis n.
         result: a value of `RESULTS`, shape (), int32; 0 is success.
         system: the equations of motion, the driven values those of the reference.
+        joints: the joints of the model by name.
     """
 
     values: dict[str, Float[Array, " n"]]
@@ -30,6 +32,7 @@ class Kinematics(AbstractMotion):
     states: State
     result: Int[Array, ""]
     system: MultibodySystem
+    joints: dict[str, AbstractJoint] | None
 
     def _kinematics(self):
         return self.states, self.t
@@ -139,10 +142,11 @@ def kinematics(
     values, speed = table(columns), table([jnp.broadcast_to(speed, shape) for speed in speeds])
     time = jnp.broadcast_to(start, shape) if t is None else times[0]
     clock = jnp.zeros_like(time) if t is None else jnp.ones_like(time)
-    (states, result), details = _kinematics_jit(drive, (values, time), (speed, clock))
+    (states, result), details = _kinematics_jit(*alike((drive, (values, time), (speed, clock))))
     if throw:
         states = throw_if_failed(states, result, details, system.constraint_names)
-    return Kinematics(values=dict(zip(names, columns)), t=time, states=states, result=result, system=system)
+    values = dict(zip(names, columns))
+    return Kinematics(values=values, t=time, states=states, result=result, system=system, joints=model.joints)
 
 
 @eqx.filter_jit

@@ -22,8 +22,8 @@ class Criterion(eqx.Module):
         Ψ = G(q, v, p)|_{t1} + ∫ F(q, v, v̇, λ, p) dt
 
     Arguments:
-        integrand: F(s, p) → scalar; `s` is an `Instant` (`s.body(name)`, `s.multiplier(joint)`, `s.force(name)`,
-            `s.state`, `s.t`), `p` the design parameters. None: no integral.
+        integrand: F(s, p) → scalar; `s` is an `Instant` (`s.body(name)`, `s.point(body, at)`,
+            `s.multiplier(joint)`, `s.force(name)`, `s.state`, `s.t`), `p` the design parameters. None: no integral.
         terminal: G(s, p) → scalar, of the instant t1. None: no terminal term.
 
     `criterion(trajectory, p)` is Ψ, by `time_integral` of the order of the trajectory or, where this has `stages`, by

@@ -11,6 +11,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
+from lgsens._brief import brief
 from lgsens._validate import as_count, as_float
 from lgsens._xla import tracing
 from lgsens.criteria._advice import direct_or_adjoint
@@ -49,6 +50,8 @@ class Sensitivities(NamedTuple):
     gradient: PyTree
     method: Method
     result: Int[Array, ""]
+
+    __repr__ = brief
 
 
 def differentiate(

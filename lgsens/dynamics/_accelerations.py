@@ -30,6 +30,7 @@ import jax.scipy.linalg as jsl
 from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens._xla import linear_solve
 from lgsens.dynamics._constraints import constraint_acceleration, fixed_velocity_rate, full_jacobian
 from lgsens.dynamics._matrices import kkt_product
 from lgsens.dynamics._redundant import SOFTNESS, refined, softness
@@ -97,7 +98,7 @@ class ConstrainedInertia(eqx.Module):
         def eliminate(product, rhs):
             return refined(product, self._eliminate, rhs) if self.inertia.redundant else self._eliminate(rhs)
 
-        solution = lax.custom_linear_solve(product, rhs, eliminate, symmetric=True)
+        solution = linear_solve(product, rhs, eliminate, symmetric=True)
         return solution[: force.shape[0]], solution[force.shape[0] :]
 
 

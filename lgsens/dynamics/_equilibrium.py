@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from lgsens._xla import while_loop
 from lgsens.dynamics._constraints import depends_on_time
 from lgsens.dynamics._initial import Initial, accelerations, consistent_velocity, is_redundant
 from lgsens.dynamics._matrices import constraint_jacobian, mass_scale
@@ -85,7 +86,7 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
             return (size > jnp.sqrt(eps)) & (iteration < _MAX_ITERATIONS)
 
         start = (z, jnp.full((), jnp.inf, dtype), jnp.zeros((), jnp.int32))
-        z, _, _ = lax.while_loop(unfinished, body, start)
+        z, _, _ = while_loop(unfinished, body, start)
         # Newton is quadratic: one step from √eps is at round-off.
         return z - jnp.linalg.lstsq(matrix(z), equation(z), rcond=1e3 * eps)[0]
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from lgsens._xla import while_loop
 from lgsens.dynamics._constraints import fixed_velocity_rate, prescribed_velocity
 from lgsens.dynamics._matrices import ConstrainedMass, constraint_jacobian, factorized, for_once
 from lgsens.dynamics._redundant import softness
@@ -112,7 +113,7 @@ def assemble(system: AbstractSystem, t):
             return (size > tolerance) & (iteration < _MAX_ITERATIONS)
 
         start = (mu, jnp.full((), jnp.inf, mu.dtype), jnp.zeros((), jnp.int32))
-        return lax.while_loop(unfinished, body, start)[0]
+        return while_loop(unfinished, body, start)[0]
 
     def tangent_solve(linear, rhs):
         return solve(jax.jacfwd(linear)(jnp.zeros_like(rhs)), rhs)

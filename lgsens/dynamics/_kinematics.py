@@ -28,9 +28,9 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from lgsens._xla import scan, while_loop
 from lgsens.dynamics._system import AbstractSystem, State
 
 _MAX_ITERATIONS = 40
@@ -73,7 +73,7 @@ def _newton(drive: AbstractDrive, q, values, t):
         _, size, iteration = carry
         return ~_small(size) & (iteration < _MAX_ITERATIONS)  # a NaN goes on to the end, and costs nothing else
 
-    q, size, _ = lax.while_loop(unfinished, body, (q, jnp.full((), jnp.inf, scale.dtype), jnp.zeros((), jnp.int32)))
+    q, size, _ = while_loop(unfinished, body, (q, jnp.full((), jnp.inf, scale.dtype), jnp.zeros((), jnp.int32)))
     # Newton is quadratic: one step from √eps is at round-off.
     return system.group.retract(q, -step(q)), size
 
@@ -90,7 +90,7 @@ def _configurations(drive: AbstractDrive, values: Float[Array, "n d"], t: Float[
         q, size = _newton(drive, start, *row)
         return jax.tree.map(lambda new, old: jnp.where(_small(size), new, old), q, start), (q, size)
 
-    return lax.scan(follow, drive.system.reference()[0], (values, t))[1]
+    return scan(follow, drive.system.reference()[0], (values, t))[1]
 
 
 @_configurations.defjvp

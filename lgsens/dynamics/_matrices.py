@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens._xla import linear_solve
 from lgsens.dynamics._constraints import full_jacobian
 from lgsens.dynamics._redundant import refined, softness
 from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem, Tangents
@@ -134,5 +135,5 @@ class ConstrainedMass(eqx.Module):
         product = partial(kkt_product, self.mass, self.jacobian)
         once = lambda rhs: jnp.concatenate(factors.solve(rhs[:k], rhs[k:]))
         solve = lambda product, rhs: refined(product, once, rhs) if self.soft else once(rhs)
-        solution = lax.custom_linear_solve(product, jnp.concatenate([force, rate]), solve, symmetric=True)
+        solution = linear_solve(product, jnp.concatenate([force, rate]), solve, symmetric=True)
         return solution[:k], solution[k:]

@@ -41,10 +41,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._validate import as_count, require_setting
+from lgsens._xla import scan
 from lgsens.dynamics import (
     RESULTS,
     ConstrainedInertia,
@@ -229,7 +229,7 @@ class IndexReducedODE(AbstractScheme):
         # T(0) is the unit matrix
         slopes = tuple(jnp.zeros((len(b), *k.shape), k.dtype).at[0].set(k) for k in (begun.v, begun.vdot))
         inputs = jnp.arange(1, len(b)), a[1:], node.begin + c[1:] * h
-        (rates, vdots), stages = lax.scan(stage, slopes, inputs)
+        (rates, vdots), stages = scan(stage, slopes, inputs)
         q, u = group.retract(begun.q, h * (b @ rates)), begun.v + h * (b @ vdots)
         state, found, left = ended(shared, system, q, u, node.t)
         state = dataclasses.replace(state, inner=Inner(*stages, *found))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens._xla import scan
 from lgsens.dynamics import (
     AbstractSystem,
     ConstrainedInertia,
@@ -98,7 +99,7 @@ class ExplicitLinearizedStep(AbstractLinearizedStep):
         count = len(b)
         slopes = tuple(jnp.zeros((count, *k.shape), k.dtype).at[0].set(k) for k in (previous.v, previous.vdot))
         linear = at(self.factors, slice(-2)), at(self.motion, slice(-1)), self.kinematics
-        (rates, vdots), stages = lax.scan(stage, slopes, (jnp.arange(1, count), a[1:], tuple(rows[:4]), *linear))
+        (rates, vdots), stages = scan(stage, slopes, (jnp.arange(1, count), a[1:], tuple(rows[:4]), *linear))
 
         dq, du = self.to_end(dq, b @ rates), previous.v + b @ vdots
         there = at(self.factors, -1)

@@ -9,7 +9,8 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jax import lax
+
+from lgsens._xla import while_loop
 
 Found = TypeVar("Found")
 
@@ -29,4 +30,4 @@ def _of_all_lanes(axis_size, in_batched, flag):
 def renewed_where(due, new: Callable[[], Found], earlier: Found) -> Found:
     """`new()` where it is due. A loop of no or one turn, because `cond` would copy what is large."""
     renewed = lambda carry: (jnp.zeros((), bool), new())
-    return lax.while_loop(lambda carry: carry[0], renewed, (due, earlier))[1]
+    return while_loop(lambda carry: carry[0], renewed, (due, earlier))[1]

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from lgsens._xla import scan
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate._grid import AbstractGrid, with_first
 from lgsens.integrate._linearized import Node
@@ -109,7 +109,7 @@ def _marched(walk: Walk, grid: AbstractGrid, progress: Progress, output: Output)
         progress, stats = walk.on(grid, progress, place)
         return progress, (output(progress.state, grid.node(place).t), stats)
 
-    end, (outputs, stats) = lax.scan(step, progress, grid.places())
+    end, (outputs, stats) = scan(step, progress, grid.places())
     return outputs, end, stats
 
 

@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from lgsens._xla import fori_loop, while_loop
 from lgsens.dynamics import State
 from lgsens.integrate._alpha import AbstractStep, Matrix
 from lgsens.integrate._guess import Guess
@@ -122,8 +122,8 @@ def take_step(
 
     def repeated(corrected, iterate: _Iterate) -> _Iterate:
         if scheme.iterations is not None:
-            return lax.fori_loop(0, scheme.iterations, lambda _, iterate: corrected(iterate), iterate)
-        return lax.while_loop(lambda iterate: iterate.going & ~iterate.due, corrected, iterate)
+            return fori_loop(0, scheme.iterations, lambda _, iterate: corrected(iterate), iterate)
+        return while_loop(lambda iterate: iterate.going & ~iterate.due, corrected, iterate)
 
     def round_of(carry: tuple[_Iterate, Solver]) -> tuple[_Iterate, Solver]:
         iterate, solver = carry
@@ -154,7 +154,7 @@ def take_step(
         due = in_any_lane(due & running)  # where one lane of a batch makes a matrix, all have the time to
         carry = iterate._replace(due=due), matrix.solver
         if scheme.iterations is None:
-            iterate, solver = lax.while_loop(lambda carry: in_any_lane(carry[0].going), round_of, carry)
+            iterate, solver = while_loop(lambda carry: in_any_lane(carry[0].going), round_of, carry)
         else:
             iterate, solver = round_of(carry)
         made = running & (due | iterate.full)

@@ -33,6 +33,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._validate import as_float, is_concrete, require, require_setting
+from lgsens._xla import scan, while_loop
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
 from lgsens.integrate._grid import UnevenGrid, with_first
@@ -256,7 +257,7 @@ def _controlled_steps(
 
         none = jnp.zeros((), jnp.int32)
         stats = Stats(none, h * 0.0, h * 0.0, progress.running, jnp.nan * h)
-        trial = lax.while_loop(
+        trial = while_loop(
             lambda trial: in_any_lane(trial.trying), attempt, _Trial(wanted, progress, stats, h * 0.0, none, active)
         )
         _, size = begins(trial)
@@ -275,7 +276,7 @@ def _controlled_steps(
     memory = scheme.memory(walk.shared, begun, Node(t0, t0 + guess, guess), uneven=True)
     running = jnp.all(jnp.isfinite(begun.a))
     begin = (Progress(begun, memory, running), guess, guess, jnp.full((), _AIM, h.dtype), h * 0.0)
-    (*_, elapsed), (sizes, later, newton, errors, rejected) = lax.scan(step, begin, jnp.arange(num_steps))
+    (*_, elapsed), (sizes, later, newton, errors, rejected) = scan(step, begin, jnp.arange(num_steps))
     states = with_first(first.at(system, sizes[0]), later)
     taken = jnp.sum((sizes > 0.0) & newton.converged).astype(jnp.int32)
     stats = ControlledStats(*newton, errors, rejected, taken)

@@ -19,6 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens._xla import fori_loop, scan
 from lgsens.linear._elimination import Elimination, Loop
 from lgsens.linear._sparse import added, chosen
 
@@ -105,7 +106,7 @@ class BlockFactors(eqx.Module):
                 return entries.at[places].add(change, mode="drop"), level
 
             places = np.where(loop.coupled < 0, len(entries), loop.coupled)
-            entries, levels = lax.scan(eliminate, entries, (loop.size * np.arange(plan.looped), places))
+            entries, levels = scan(eliminate, entries, (loop.size * np.arange(plan.looped), places))
             eliminated.append(levels)
             entries = entries[loop.size * plan.looped :]
         return cls(tuple(eliminated), kind.of(entries.reshape(2 * (len(plan.rest),))), plan)
@@ -141,7 +142,7 @@ def _solved_in_loop(loop: Loop, levels: Eliminated, b, rest: Callable):
         own = lax.dynamic_slice_in_dim(b, start, size).reshape(loop.own)
         return b.at[boundary].add(-_product(level.left, own), mode="drop"), own
 
-    b, known = lax.scan(down, b, (levels, starts, boundaries))
+    b, known = scan(down, b, (levels, starts, boundaries))
 
     def up(x, at):
         level, own, start, boundary = at
@@ -150,7 +151,7 @@ def _solved_in_loop(loop: Loop, levels: Eliminated, b, rest: Callable):
 
     end = jnp.concatenate([rest(b[count * size :]), jnp.zeros(1, b.dtype)])  # the last one is what fills up
     x = jnp.concatenate([jnp.zeros(count * size, b.dtype), end])
-    return lax.scan(up, x, (levels, known, starts, boundaries), reverse=True)[0][:-1]
+    return scan(up, x, (levels, known, starts, boundaries), reverse=True)[0][:-1]
 
 
 def inverses(blocks: Float[Array, "c p p"]) -> Float[Array, "c p p"]:
@@ -170,7 +171,7 @@ def inverses(blocks: Float[Array, "c p p"]) -> Float[Array, "c p p"]:
         rest = jnp.where((here[:, None] | here[None, :])[:, :, None], jnp.zeros_like(matrix), matrix)
         return rest - column[:, None, :] * row[None, :, :]
 
-    return jnp.moveaxis(lax.fori_loop(0, size, eliminate, jnp.moveaxis(blocks, 0, 2)), 2, 0)
+    return jnp.moveaxis(fori_loop(0, size, eliminate, jnp.moveaxis(blocks, 0, 2)), 2, 0)
 
 
 def _turned(blocks):

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from lgsens._xla import fori_loop
 from lgsens.linear import tuned
 
 
@@ -61,7 +62,7 @@ def _substituted(lu, rhs, of_lower: bool, transposed: bool):
         return jnp.where(places == j, known, x - jnp.where(later, column, jnp.zeros_like(column)) * known)
 
     # of no rows, which block elimination may leave, none can be traced
-    return lax.fori_loop(0, size, eliminate, rhs) if size else rhs
+    return fori_loop(0, size, eliminate, rhs) if size else rhs
 
 
 def _permutation(pivots: Int[Array, " n"], *, inverse: bool = False) -> Int[Array, " n"]:
@@ -78,7 +79,7 @@ def _permutation(pivots: Int[Array, " n"], *, inverse: bool = False) -> Int[Arra
         second = pivots[first]
         return jnp.where(places == first, rows[second], jnp.where(places == second, rows[first], rows))
 
-    return lax.fori_loop(0, size, exchange, places) if size else places
+    return fori_loop(0, size, exchange, places) if size else places
 
 
 class Inverse(eqx.Module):

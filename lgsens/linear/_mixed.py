@@ -21,9 +21,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens._xla import while_loop
 from lgsens.linear._block_factors import BlockFactors, BlockMatrix
 from lgsens.linear._dense import Inverse
 
@@ -96,5 +96,5 @@ class Refined(eqx.Module):
             return (last * ratio > _ENOUGH * largest(x)) & falling & (count < _TURNS)
 
         start = (x, largest(x), jnp.ones((), x.dtype), jnp.zeros((), jnp.int32))
-        x, last, _, _ = lax.while_loop(unfinished, refined, start)
+        x, last, _, _ = while_loop(unfinished, refined, start)
         return unit * jnp.where(last <= _WRONG * largest(x), x, jnp.nan)

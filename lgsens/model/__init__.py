@@ -35,8 +35,9 @@ from lgsens.model._forces import (
     SpringDamper as SpringDamper,
     TyreSpring as TyreSpring,
 )
-from lgsens.model._frames import Frame as Frame
+from lgsens.model._frames import Frame as Frame, motion_at as motion_at
 from lgsens.model._free import ALL_FREE as ALL_FREE
+from lgsens.model._joint_forces import joint_wrenches as joint_wrenches
 from lgsens.model._joints import (
     AbstractJoint as AbstractJoint,
     CylindricalJoint as CylindricalJoint,
@@ -59,6 +60,11 @@ from lgsens.model._loads import (
 )
 from lgsens.model._model import Model as Model
 from lgsens.model._on_merged_bodies import carried as carried
+from lgsens.model._relative import (
+    Coordinate as Coordinate,
+    continued as continued,
+    relative_motion as relative_motion,
+)
 from lgsens.model._roads import BumpRoad as BumpRoad, FlatRoad as FlatRoad, SampledRoad as SampledRoad
 from lgsens.model._rolling import Rolling as Rolling
 from lgsens.model._signals import (

@@ -7,8 +7,9 @@ from jaxtyping import Array, Float
 from lgsens._validate import axis_field, point_field
 from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint, InPlane
 from lgsens.model._elements import body_fixed
-from lgsens.model._frames import TURNING_A, TURNING_B, Frame
-from lgsens.model._joints import AbstractJoint, _normals
+from lgsens.model._frames import TURNING_A, TURNING_B, Frame, normals
+from lgsens.model._joints import AbstractJoint
+from lgsens.model._relative import ANGLE, DISPLACEMENT, frames_along, frames_at
 from lgsens.model._signals import Prescribed, at_time, number_of, prepared, prescribed_field
 
 
@@ -103,6 +104,9 @@ class TranslationDriver(AbstractJoint):
     def assembled(self):
         return self.value is None
 
+    coordinates = (DISPLACEMENT,)
+    frames = frames_at
+
     def constraints(self, a: Frame, b: Frame):
         unit = self.axis / jnp.linalg.norm(self.axis)
         line = InPlane(a.local_point(self.at), b.local_point(self.at), a.local_axis(unit))
@@ -132,8 +136,15 @@ class RotationDriver(AbstractJoint):
     def assembled(self):
         return self.value is None
 
+    coordinates = (ANGLE,)
+
+    @property
+    def frames(self):
+        anywhere = jnp.zeros_like(self.axis)  # it transmits no force
+        return frames_along(anywhere, anywhere, self.axis)
+
     def constraints(self, a: Frame, b: Frame):
-        _, first, second = _normals(self.axis)
+        _, first, second = normals(self.axis)
         axes = a.local_axis(first), a.local_axis(second), b.local_axis(first)
         return (Angle(*axes, _or_zero(self.value, first.dtype)),)
 

@@ -36,6 +36,16 @@ class Attached(NamedTuple):
 class AbstractForce(eqx.Module):
     """A force element. One of one's own has leaves for its numbers, and `bodies` and `loads`.
 
+    Each load (`lgsens.model.AbstractLoad`, with equations of its own `AbstractDynamicLoad`) acts between two bodies a
+    and b, None the ground, and returns twelve numbers,
+
+        Q = [F_a, M_a, F_b, M_b],     with the power  F_a·ẋ_a + M_a·Ω_a + F_b·ẋ_b + M_b·Ω_b:
+
+    F the force on a body [N] in the inertial frame, M its moment [N m] about the origin of the body frame (the centre
+    of mass, or the `pivot`), in the body frame; what it says of the ground is not used. A force f of the inertial frame
+    at the body's point X (body frame) is F = f, M = X × Rᵀf. A load is given the `Frame` (x, R) of each body and its
+    velocity [ẋ, Ω], ẋ in the inertial frame, Ω in that of the body. `lgsens.testing.check_force` checks a force.
+
     `preload_shape` is that of its `preload`, in which its force is linear, for `static_preload`; None: it has none.
     `on_merged` says whether its loads on bodies that fixed joints merge are one load on what they are merged to.
     """

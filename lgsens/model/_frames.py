@@ -7,6 +7,7 @@ rotation in the body frame, δx and δθ = (Rᵀ δR)^∨, for each body.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -66,6 +67,19 @@ def motion_at(arm, position, orientation, twist, rate):
     swing = jnp.cross(spin, arm)
     acceleration = acceleration + to_inertial(jnp.cross(change, arm) + jnp.cross(spin, swing))
     return position + to_inertial(arm), velocity + to_inertial(swing), acceleration
+
+
+def normals(axis: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
+    """The unit vector along `axis` and two unit vectors that complete it to a right-handed triad.
+
+    The triad starts from the coordinate axis least aligned with `axis`; which one it is does not
+    change the motion, only the meaning of the joint's multipliers.
+    """
+    unit = axis / jnp.linalg.norm(axis)
+    least = jax.nn.one_hot(jnp.argmin(jnp.abs(unit)), 3, dtype=axis.dtype)
+    first = cross(unit, least)
+    first = first / jnp.linalg.norm(first)
+    return unit, first, cross(unit, first)
 
 
 def ground_frame(dtype) -> Frame:

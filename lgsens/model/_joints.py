@@ -10,7 +10,6 @@ from collections.abc import Sequence, Set
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -24,22 +23,19 @@ from lgsens.model._constraints import (
     InPlane,
     Orthogonality,
 )
-from lgsens.model._frames import Frame
+from lgsens.model._frames import Frame, normals
 from lgsens.model._free import single_rotation
+from lgsens.model._relative import (
+    ANGLE,
+    ARM_ANGLES,
+    DISPLACEMENT,
+    LENGTH,
+    ROTATION_VECTOR,
+    Coordinate,
+    frames_along,
+    frames_at,
+)
 from lgsens.model._signals import Prescribed, prepared, prescribed_field
-
-
-def _normals(axis: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
-    """The unit vector along `axis` and two unit vectors that complete it to a right-handed triad.
-
-    The triad starts from the coordinate axis least aligned with `axis`; which one it is does not
-    change the motion, only the meaning of the joint's multipliers.
-    """
-    unit = axis / jnp.linalg.norm(axis)
-    least = jax.nn.one_hot(jnp.argmin(jnp.abs(unit)), 3, dtype=axis.dtype)
-    first = cross(unit, least)
-    first = first / jnp.linalg.norm(first)
-    return unit, first, cross(unit, first)
 
 
 def _coincidence(a: Frame, b: Frame, at) -> Coincidence:
@@ -59,13 +55,21 @@ class AbstractJoint(eqx.Module):
 
     A joint of one's own has these two names, leaves for its numbers, and `constraints`. It is `assembled` if the
     reference configuration satisfies it by construction; others are assembled before the motion starts. It is `rigid`
-    if its bodies move as one, which `Model(merge_fixed=True)` makes of them.
+    if its bodies move as one, which `Model(merge_fixed=True)` makes of them. `coordinates` are those that it leaves its
+    bodies, functions of the pose of its frame on b in that on a (`lgsens.model.Coordinate`), for `Trajectory.joint`.
     """
 
     a: eqx.AbstractVar[str | None]
     b: eqx.AbstractVar[str | None]
     assembled: ClassVar[Any] = False
     rigid: ClassVar[bool] = False
+    coordinates: ClassVar[tuple[Coordinate, ...]] = ()
+
+    @property
+    def frames(self) -> tuple[Frame, Frame] | None:
+        """Its frames on a and on b, inertial frame, in the reference configuration; None: both at the centre of mass of
+        b, with the axes of the inertial frame."""
+        return None
 
     @property
     def hinge(self) -> Float[Array, "3"] | None:
@@ -103,6 +107,8 @@ class SphericalJoint(AbstractJoint):
     at: Float[Array, "3"] = point_field("at")
 
     assembled = True
+    coordinates = ROTATION_VECTOR
+    frames = frames_at
 
     def constraints(self, a, b):
         return (_coincidence(a, b, self.at),)
@@ -125,6 +131,8 @@ class RevoluteJoint(AbstractJoint):
     axis: Float[Array, "3"] = axis_field("axis")
 
     assembled = True
+    coordinates = (ANGLE,)
+    frames = frames_at
 
     @property
     def hinge(self):
@@ -134,7 +142,7 @@ class RevoluteJoint(AbstractJoint):
         return constraints[0].violable(free), (False,), (False,)  # the one rotation is about the hinge
 
     def constraints(self, a, b):
-        unit, first, second = _normals(self.axis)
+        unit, first, second = normals(self.axis)
         return (
             _coincidence(a, b, self.at),
             _orthogonality(a, b, first, unit),
@@ -171,11 +179,21 @@ class UniversalJoint(AbstractJoint):
         )
 
     assembled = True
+    coordinates = ARM_ANGLES
 
-    def constraints(self, a, b):
+    def _arms(self):
         arm_a = self.axis_a / jnp.linalg.norm(self.axis_a)
         arm_b = self.axis_b - jnp.dot(arm_a, self.axis_b) * arm_a
-        arm_b = arm_b / jnp.linalg.norm(arm_b)
+        return arm_a, arm_b / jnp.linalg.norm(arm_b)
+
+    @property
+    def frames(self):
+        arm_a, arm_b = self._arms()
+        own = Frame(self.at, jnp.stack([arm_a, arm_b, cross(arm_a, arm_b)], axis=1))
+        return own, own
+
+    def constraints(self, a, b):
+        arm_a, arm_b = self._arms()
         return (_coincidence(a, b, self.at), _orthogonality(a, b, arm_a, arm_b))
 
 
@@ -196,9 +214,11 @@ class PrismaticJoint(AbstractJoint):
     axis: Float[Array, "3"] = axis_field("axis")
 
     assembled = True
+    coordinates = (DISPLACEMENT,)
+    frames = frames_at
 
     def constraints(self, a, b):
-        unit, first, second = _normals(self.axis)
+        unit, first, second = normals(self.axis)
         return (
             *_same_orientation(a, b, (unit, first, second)),
             _in_plane(a, b, self.at, first),
@@ -223,9 +243,11 @@ class CylindricalJoint(AbstractJoint):
     axis: Float[Array, "3"] = axis_field("axis")
 
     assembled = True
+    coordinates = (ANGLE, DISPLACEMENT)
+    frames = frames_at
 
     def constraints(self, a, b):
-        unit, first, second = _normals(self.axis)
+        unit, first, second = normals(self.axis)
         return (
             _orthogonality(a, b, first, unit),
             _orthogonality(a, b, second, unit),
@@ -251,6 +273,7 @@ class FixedJoint(AbstractJoint):
 
     assembled = True
     rigid = True
+    frames = frames_at
 
     def violable(self, constraints, free):
         # of the orthogonalities x·y, y·z, z·x only that of the two axes other than that of the one rotation changes
@@ -299,6 +322,12 @@ class DistanceJoint(AbstractJoint):
     @property
     def assembled(self):
         return self.length is None
+
+    coordinates = (LENGTH,)
+
+    @property
+    def frames(self):
+        return frames_along(self.at_a, self.at_b, self.at_b - self.at_a)
 
     def constraints(self, a, b):
         length = jnp.linalg.norm(self.at_b - self.at_a) if self.length is None else prepared(self.length)

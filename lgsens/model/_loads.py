@@ -51,7 +51,7 @@ class AbstractLoad(AbstractElement):
 
     @abc.abstractmethod
     def force(self, a: Frame, b: Frame, va, vb, t) -> Float[Array, "12"]:
-        """Q at the given poses, velocities [ẋ, Ω] of shape (6,) each, and time [s]."""
+        """Q = [F_a, M_a, F_b, M_b] at the given poses, velocities [ẋ, Ω] of shape (6,) each, and time [s]."""
 
     def measure(self, a: Frame, b: Frame, va, vb, t) -> Any:
         """What `Trajectory.force` shows of it."""

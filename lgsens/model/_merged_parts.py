@@ -69,6 +69,7 @@ class Parts(eqx.Module, Generic[System]):
         """All merged joints."""
         return tuple(name for own in self.fixed for name in own)
 
+    @partial(jax.jit, static_argnums=1, inline=True)  # one program where it is not called inside another
     def with_fixed(self, joint: str, q, v, vdot, lam, t):
         """λ of the parts with μ of a fixed joint, and of those of the same body, in their rows; at one instant."""
         names = np.asarray(self.system.constraint_names)

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from lgsens._brief import listed, roster
 from lgsens._validate import is_concrete, require
 from lgsens.liegroups import nearest_rotation
 from lgsens.linear import AbstractLinearSolver
@@ -121,6 +122,11 @@ class Model(eqx.Module):
         self._check_duplicates()
         if self._groups is not None and all(group.name is None for group in self._groups):
             raise ValueError("Model: fixed joints hold all bodies on the ground; let at least one of them move.")
+
+    def __repr__(self) -> str:
+        fields = {name: roster(getattr(self, name)) for name in ("bodies", "joints", "forces")}
+        options = {name: getattr(self, name) for name in ("linear_solver", "merge_fixed", "redundant")}
+        return listed("Model", fields | {name: repr(value) for name, value in options.items()})
 
     def _check_connection(self, what: str, ends: tuple[str | None, ...]) -> None:
         for end in ends:

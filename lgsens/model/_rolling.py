@@ -18,6 +18,8 @@ two rows remain, which no function of the configuration has as its rate,
 forward and along the projected axle. Source: Neimark & Fufaev, Dynamics of Nonholonomic Systems (1972), ch. 1.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +31,7 @@ from lgsens.model._constraints import AbstractConstraint, AbstractVelocityConstr
 from lgsens.model._frames import ROTATION, Frame
 from lgsens.model._free import ROTATIONS, TRANSLATIONS, is_along
 from lgsens.model._joints import AbstractJoint
+from lgsens.model._relative import Coordinate
 
 
 class _Contact(eqx.Module):
@@ -90,6 +93,22 @@ class Slip(AbstractVelocityConstraint):
         return jnp.stack([jnp.sum(forward * w), jnp.sum(cross(n, forward) * w)])
 
 
+def _rolled(i: int) -> Callable[[Frame], Float[Array, ""]]:
+    """A coordinate of a wheel whose frame has y along e, in the frame of a plane with z along n."""
+
+    def of(seen: Frame):
+        x, e = seen.orientation[:, 0], seen.orientation[:, 1]
+        n = jnp.zeros_like(e).at[2].set(1.0)
+        u, length = _upright(n, e)
+        forward, centre = cross(e, n) / length, seen.position
+        contact = centre - centre[2] / length * u / length  # ρ = d_z/|u|
+        lean, spin = (e[2], length), (jnp.sum(x * cross(e, forward)), jnp.sum(x * forward))
+        angles = [jnp.arctan2(*sides) for sides in ((forward[1], forward[0]), lean, spin)]
+        return [contact[0], contact[1], *angles][i]
+
+    return of
+
+
 class Rolling(AbstractJoint):
     """A disc or wheel that rolls without slip on a plane; 3 equations.
 
@@ -106,6 +125,8 @@ class Rolling(AbstractJoint):
         point: a point of the plane [m], inertial frame, shape (3,); None: the lowest point of the wheel. With a point
             the mechanism is assembled before it moves.
 
+    Its coordinates (`Trajectory.joint`): how far the lowest point is, forward (axis × normal) and along the projected
+    axle, from the point of the plane; heading about the normal, lean of the axle towards it, spin about the axle.
     The multipliers are the force of the wheel on the ground along the normal, forward (axis × normal) and sideways
     [N]; the first is negative where it presses. Equations are solved by dense matrices. Raises `ValueError` for a
     wrong shape, a zero direction, a radius ≤ 0, or a wheel that lies flat.
@@ -138,10 +159,29 @@ class Rolling(AbstractJoint):
     def assembled(self):
         return self.point is None
 
-    def constraints(self, a: Frame, b: Frame):
+    coordinates = (
+        Coordinate("forward", "m", _rolled(0)),
+        Coordinate("sideways", "m", _rolled(1)),
+        Coordinate("heading", "rad", _rolled(2), True),
+        Coordinate("lean", "rad", _rolled(3)),
+        Coordinate("spin", "rad", _rolled(4), True),
+    )
+
+    def _plane(self):
+        """n, e, |u|, P."""
         n, e = (x / jnp.sqrt(jnp.sum(x * x)) for x in (self.normal, self.axis))
         u, length = _upright(n, e)
-        point = self.at - self.radius * u / length if self.point is None else self.point
+        return n, e, length, self.at - self.radius * u / length if self.point is None else self.point
+
+    @property
+    def frames(self):
+        n, e, length, point = self._plane()
+        forward = cross(e, n) / length
+        axes = lambda y, z: jnp.stack([forward, y, z], axis=1)
+        return Frame(point, axes(cross(n, forward), n)), Frame(self.at, axes(e, cross(forward, e)))
+
+    def constraints(self, a: Frame, b: Frame):
+        n, e, _, point = self._plane()
         ends = a.local_point(point), a.local_axis(n), b.local_point(self.at), b.local_axis(e)
         contact = _Contact(*ends, self.radius)
         return ContactHeight(contact), Slip(contact)

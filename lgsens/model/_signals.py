@@ -39,14 +39,25 @@ _KINDS = ("linear", "cubic", "monotone")
 
 
 class AbstractSignal(eqx.Module):
-    """A scalar function of time. A signal of one's own has leaves for its numbers and `__call__`.
+    """A scalar function of time: what drivers, rods, roads and forces follow.
 
-    What drives a mechanism needs two derivatives by t; JAX takes them.
+    A signal of one's own has leaves for its numbers and `__call__`, so that it can be differentiated by them and
+    compiled once, which a Python function could not. What drives a mechanism needs two derivatives by t; JAX takes
+    them.
+
+    ```python
+    class Chirp(lg.AbstractSignal):
+        amplitude: jax.Array
+        rate: jax.Array  # [1/s²]
+
+        def __call__(self, t):
+            return self.amplitude * jnp.sin(jnp.pi * self.rate * t**2)
+    ```
     """
 
     @abc.abstractmethod
     def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
-        """The value at time t [s]."""
+        """The value at time t [s], shape (), in the unit of what it prescribes, shape ()."""
 
 
 class Constant(AbstractSignal):

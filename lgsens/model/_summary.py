@@ -4,6 +4,7 @@ import dataclasses
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
+from lgsens._brief import brief
 from lgsens._validate import is_concrete
 from lgsens.model._body import RigidBody
 from lgsens.model._forces import AbstractForce
@@ -38,6 +39,8 @@ class Summary:
 
     def __str__(self) -> str:
         return self.table
+
+    __repr__ = brief
 
 
 def summarize(

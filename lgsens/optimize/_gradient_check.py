@@ -9,6 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
+from lgsens._brief import brief
 from lgsens._validate import as_float
 from lgsens.optimize._box import entry_names
 from lgsens.optimize._parametrization import magnitude
@@ -30,6 +31,8 @@ class GradientCheck(NamedTuple):
     difference: np.ndarray
     error: np.ndarray
     step: float
+
+    __repr__ = brief
 
 
 def check_gradient(

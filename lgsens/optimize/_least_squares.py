@@ -15,6 +15,7 @@ import optimistix
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from lgsens._brief import brief
 from lgsens._validate import as_count
 from lgsens.optimize._parametrization import variables
 
@@ -40,6 +41,8 @@ class LeastSquaresResult(NamedTuple):
     deviation: PyTree
     converged: Bool[Array, ""]
     steps: Int[Array, ""]
+
+    __repr__ = brief
 
 
 class LineSearchGaussNewton(optimistix.AbstractGaussNewton):

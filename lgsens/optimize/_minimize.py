@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from lgsens._brief import brief
 from lgsens._progress import compiling, progress_bar
 from lgsens._validate import as_count
 from lgsens.linear import tuned
@@ -38,6 +39,8 @@ class History(NamedTuple):
     gradient_norm: np.ndarray
     complementarity: np.ndarray
     design: PyTree
+
+    __repr__ = brief
 
 
 class OptimizationResult(NamedTuple):
@@ -69,6 +72,8 @@ class OptimizationResult(NamedTuple):
     multipliers: np.ndarray
     compile_seconds: float
     run_seconds: float
+
+    __repr__ = brief
 
 
 def minimize(

@@ -11,6 +11,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
+from lgsens._brief import brief
 from lgsens._progress import compiling, progress_bar
 from lgsens._validate import as_count
 from lgsens.optimize import _reverse_steps, _slsqp
@@ -47,6 +48,8 @@ class MultiStartResult(NamedTuple):
     best: int
     compile_seconds: float
     run_seconds: float
+
+    __repr__ = brief
 
 
 def multi_start(

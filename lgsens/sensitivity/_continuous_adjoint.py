@@ -29,9 +29,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens._xla import scan
 from lgsens.dynamics import AbstractSystem, State, mass_scale
 from lgsens.integrate import GeneralizedAlpha, earlier, with_last
 from lgsens.sensitivity._criterion_terms import Functional, PathPoint, gradients, near
@@ -108,7 +108,7 @@ def continuous_adjoint_sweep(
         return motion, (motion.x, motion.lam)
 
     inputs = (earlier(path), sizes, sizes / jnp.concatenate([sizes[1:], sizes[-1:]]))
-    motion, multipliers = lax.scan(step, begin, inputs, reverse=True)
+    motion, multipliers = scan(step, begin, inputs, reverse=True)
     multipliers = with_last(multipliers, (begin.x, begin.lam))
     bar = final_cotangents(functional, p, system, at(-1), final.eta1, final.eta2)
     bar = accumulated(bar, functional, p, system, path, *multipliers)
@@ -165,4 +165,4 @@ def accumulated(bar, functional: Functional, p, system: AbstractSystem, path: Pa
 
     sizes = jnp.pad(jnp.diff(path.t), 1)
     weights = (sizes[1:] + sizes[:-1]) / 2
-    return lax.scan(add, bar, (path, mu, nu, weights), reverse=True)[0]
+    return scan(add, bar, (path, mu, nu, weights), reverse=True)[0]

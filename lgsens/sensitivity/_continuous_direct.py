@@ -18,8 +18,8 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
+from lgsens._xla import scan
 from lgsens.dynamics import State, consistent_velocity, full_jacobian, kkt_solve
 from lgsens.integrate import GeneralizedAlpha, Variation, earlier, later, with_first
 from lgsens.sensitivity._linear_alpha import LinearMotion, LinearNode, advance, started
@@ -61,7 +61,7 @@ def continuous_direct_sweep(
         return current, current
 
     links = jax.vmap(lambda place, state: grid.link(scheme, place, state))(places, earlier(states))
-    _, rest = lax.scan(sweep, motion, (later(states), places, d_places, links))
+    _, rest = scan(sweep, motion, (later(states), places, d_places, links))
     motion = jax.tree.map(lambda leaf: leaf[..., 0], with_first(motion, rest))
     return jax.vmap(partial(_variation, group))(states, motion)
 

@@ -23,9 +23,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens._xla import scan
 from lgsens.dynamics import AbstractSystem, State, accelerations, kkt_solve
 from lgsens.integrate import GeneralizedAlpha, Variation
 from lgsens.sensitivity._linearization import cotangent_to_algebra
@@ -179,7 +179,7 @@ def differentiated(scheme: GeneralizedAlpha, values: Float[Array, "n d"], h) -> 
         return (new_b, new_y), new_y
 
     start = (first + (alpha_m - alpha_f) * h * second, first)
-    _, rest = lax.scan(step, start, jnp.stack([values[:-1], values[1:]], axis=1))
+    _, rest = scan(step, start, jnp.stack([values[:-1], values[1:]], axis=1))
     return jnp.concatenate([first[None], rest])
 
 

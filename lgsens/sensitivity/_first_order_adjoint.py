@@ -28,8 +28,8 @@ initial state are −η_q and −η_v at t_0.
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
+from lgsens._xla import scan
 from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk, mass_scale
 from lgsens.integrate import with_last
 from lgsens.linear import Factors
@@ -78,7 +78,7 @@ def first_order_adjoint_sweep(path: PathPoint, parameters: Parameters, functiona
         return (far, eta), (mu, nu)
 
     before = jax.tree.map(lambda leaf: leaf[:-3], path)
-    (_, (eta_q, eta_v)), multipliers = lax.scan(step, (near, far), before, reverse=True)
+    (_, (eta_q, eta_v)), multipliers = scan(step, (near, far), before, reverse=True)
     # ν_f by extrapolation: it belongs to one end point, whose weight is h/2
     for of_r_and_phi in ((mu2, nu2), (mu1, nu1), (mu, 2.0 * nu1 - nu2)):
         multipliers = with_last(multipliers, of_r_and_phi)

@@ -15,6 +15,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from lgsens._validate import require_setting
+from lgsens._xla import linear_solve
 from lgsens.dynamics import State, require_independent
 from lgsens.integrate import AbstractScheme, GeneralizedAlpha, Stats, Variation, earlier, states_of, with_first
 from lgsens.sensitivity._continuous_adjoint import Cotangents, continuous_adjoint_sweep
@@ -267,7 +268,7 @@ def _direct_rule(scheme, primals, tangents):
         nothing = 0.0 * states.v[0, 0]
         return jax.tree.map(lambda leaf: leaf + nothing * leaf, matvec(scheme, states, parameters, *unknown))
 
-    delta, _ = lax.custom_linear_solve(
+    delta, _ = linear_solve(
         matrix,
         (b, d_parameters),
         solve=lambda _, rhs: direct_sweep(scheme, states, parameters, *rhs),

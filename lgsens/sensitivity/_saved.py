@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
+from lgsens._xla import linear_solve
 from lgsens.dynamics import State
 from lgsens.integrate import AbstractScheme, Stats, march
 from lgsens.sensitivity._linearization import Parameters
@@ -137,7 +138,7 @@ def _direct_segments_rule(output, scheme, segments, primals, tangents):
         found = adjoint_in_segments(output, scheme, segments, *kept, primals[1], c_outputs)
         return ravel_pytree((jax.tree.map(jnp.add, c, found), c_outputs))[0]
 
-    solution = lax.custom_linear_solve(matvec, flat, solve=solve, transpose_solve=transpose_solve)
+    solution = linear_solve(matvec, flat, solve=solve, transpose_solve=transpose_solve)
     d_outputs, d_final = eqx.combine(unravel(solution)[1], _without_derivative((run.outputs, run.final)))
     return (run, marks), (SavedRun(d_outputs, d_final, _without_derivative(run.stats)), _without_derivative(marks))
 

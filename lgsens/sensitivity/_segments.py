@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Int
 
+from lgsens._xla import scan
 from lgsens.dynamics import State
 from lgsens.integrate import (
     AbstractGrid,
@@ -114,7 +114,7 @@ def run_in_segments(output: Output, scheme, segments: Segments, state0: State, p
         return end, (mark, outputs, stats, jax.tree.map(lambda leaf: leaf[found.last], found.states))
 
     begin = first_mark(Walk.of(scheme, system), grid, state0)
-    _, (marks, outputs, stats, ends) = lax.scan(segment, begin, segments.grids(grid))
+    _, (marks, outputs, stats, ends) = scan(segment, begin, segments.grids(grid))
     first = jax.tree.map(jnp.asarray, output(system, state0, grid.t0))
     outputs = with_first(first, segments.joined(outputs))
     stats: Stats = segments.joined(stats)
@@ -147,7 +147,7 @@ def direct_in_segments(output: Output, scheme, segments: Segments, marks: Mark, 
         return ends[0], (d_outputs, ends[1])
 
     delta0 = to_algebra(group, state0, d_state0)
-    _, (d_outputs, ends) = lax.scan(segment, delta0, (marks, grids, d_grids))
+    _, (d_outputs, ends) = scan(segment, delta0, (marks, grids, d_grids))
     d_state0 = to_ambient(group, state0, delta0)
     _, first = jax.jvp(output, (system, state0, grid.t0), (d.system, d_state0, d.grid.t0))
     return with_first(first, segments.joined(d_outputs)), jax.tree.map(lambda leaf: leaf[-1], ends)
@@ -178,7 +178,7 @@ def adjoint_in_segments(output: Output, scheme, segments: Segments, marks: Mark,
 
     start = (cotangent_to_algebra(group, final, c_final), none)
     inputs = (marks, grids, segments.split(later(c_outputs)))
-    (c, bar), bar_grids = lax.scan(segment, start, inputs, reverse=True)
+    (c, bar), bar_grids = scan(segment, start, inputs, reverse=True)
     _, pull_back = jax.vjp(output, system, state0, grid.t0)
     of_system, of_state0, of_t0 = pull_back(jax.tree.map(lambda leaf: leaf[0], c_outputs))
     c = jax.tree.map(jnp.add, c, cotangent_to_algebra(group, state0, of_state0))

@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
+from lgsens._xla import scan
 from lgsens.dynamics import State
 from lgsens.integrate import AbstractScheme, Variation, earlier, later, with_first
 from lgsens.linear import tuned
@@ -62,7 +62,7 @@ class StepBlocks(NamedTuple):
         """
         # No −1 among the sizes: without constraints there are arrays of size 0.
         split = lambda leaf: leaf.reshape(leaf.shape[0] // self.length, self.length, *leaf.shape[1:])
-        carry, outputs = lax.scan(sweep, carry, jax.tree.map(split, inputs), reverse=reverse)
+        carry, outputs = scan(sweep, carry, jax.tree.map(split, inputs), reverse=reverse)
 
         def joined(leaf):
             size = leaf.shape[0] * self.length
@@ -95,7 +95,7 @@ def direct_sweep(scheme: AbstractScheme, states: State, parameters: Parameters, 
 
     def block(previous: Variation, inputs):
         step, rows, d_place = inputs
-        return lax.scan(one, previous, (jax.vmap(prepare)(step, d_place), step, rows, d_place))
+        return scan(one, previous, (jax.vmap(prepare)(step, d_place), step, rows, d_place))
 
     first = jax.tree.map(lambda leaf: leaf[0], b)
     inputs = (steps(scheme, states, grid), later(b), place_tangents(grid, d.grid))
@@ -131,7 +131,7 @@ def adjoint_sweep(scheme: AbstractScheme, states: State, parameters: Parameters,
         loads, pull_back = jax.vjp(all_loads, system, grid, step.place)
         shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), loads)
         inputs = (jax.vmap(prepare)(step), step, own)
-        c, (mu, of_loads, of_ratio) = lax.scan(partial(one, shapes), c, inputs, reverse=True)
+        c, (mu, of_loads, of_ratio) = scan(partial(one, shapes), c, inputs, reverse=True)
         of_system, of_grid, of_places = pull_back(of_loads)
         if of_ratio is not None:
             of_places = of_places._replace(ratio=of_places.ratio + of_ratio)

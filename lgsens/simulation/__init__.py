@@ -8,6 +8,7 @@ from lgsens.simulation._errors import (
     redundant_names as redundant_names,
     throw_if_failed as throw_if_failed,
 )
+from lgsens.simulation._joint_motion import JointMotion as JointMotion
 from lgsens.simulation._richardson import (
     Extrapolated as Extrapolated,
     Richardson as Richardson,
@@ -29,8 +30,10 @@ from lgsens.simulation._start import (
 )
 from lgsens.simulation._trajectory import (
     AbstractMotion as AbstractMotion,
+    AbstractRun as AbstractRun,
     BodyMotion as BodyMotion,
     Instant as Instant,
+    PointMotion as PointMotion,
     Saved as Saved,
     StateError as StateError,
     Trajectory as Trajectory,

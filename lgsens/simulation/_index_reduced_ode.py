@@ -10,9 +10,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens._xla import scan
 from lgsens.dynamics import AbstractSystem, Inertia, State, factorized_accelerations
 from lgsens.integrate import EqualGrid, IndexReducedODE, Stats, ended, with_first
 
@@ -88,5 +88,5 @@ def integrate_ode(settings: IndexReducedODE, system: AbstractSystem, grid: Equal
         return (end, converged), (end, Stats(steps, 0.0 * h, left, converged, jnp.nan * h))
 
     count = jnp.arange(grid.num_steps, dtype=h.dtype)
-    later, stats = lax.scan(step, (first, jnp.ones((), bool)), count)[1]
+    later, stats = scan(step, (first, jnp.ones((), bool)), count)[1]
     return with_first(first, later), stats

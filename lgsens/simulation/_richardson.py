@@ -33,6 +33,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
+from lgsens._brief import brief
 from lgsens._validate import as_count
 from lgsens.dynamics import RESULTS, AbstractSystem, State
 from lgsens.integrate import AbstractIntegrator, AbstractScheme, GeneralizedAlpha, scheme_of
@@ -91,6 +92,8 @@ class Extrapolated(NamedTuple):
 
     value: PyTree
     error: PyTree
+
+    __repr__ = brief
 
 
 def richardson(fn: Callable[[int], Any], num_steps: int, runs: int = 2) -> Extrapolated:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from lgsens._validate import as_count, as_float, require
-from lgsens._xla import tracing
+from lgsens._xla import alike, tracing
 from lgsens.dynamics import RESULTS, AbstractSystem, State, unsteady_rate
 from lgsens.integrate import (
     AbstractIntegrator,
@@ -134,12 +134,15 @@ def simulate(
         raise ValueError(f"`save` must be a function of an Instant, got {save!r}. Leave it out to have the trajectory.")
     t0, t1 = interval(t0, t1)
     with tracing():
+        system, t0, t1, state0 = alike((system, t0, t1, state0))
         found, details = _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, save)
     if throw:
         fields = ("states", "error", "stages") if save is None else ("values", "final")  # the others say what happened
         motion = {name: getattr(found, name) for name in fields}
         motion = throw_if_failed(motion, found.result, details, system.constraint_names)
         found = dataclasses.replace(found, **motion)
+    if isinstance(found, Trajectory) and isinstance(model, Model):
+        found = dataclasses.replace(found, joints=model.joints)
     return found
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from lgsens._validate import as_float
+from lgsens._xla import alike
 from lgsens.dynamics import (
     RESULTS,
     AbstractSystem,
@@ -28,9 +29,9 @@ from lgsens.simulation._errors import throw_if_failed
 
 def as_system(model: Model | AbstractSystem) -> AbstractSystem:
     if isinstance(model, Model):
-        return model.system()
+        return alike(model.system())
     if isinstance(model, AbstractSystem):
-        return model
+        return alike(model)
     raise ValueError(f"`model` must be a Model or an AbstractSystem, got {type(model).__name__}.")
 
 

@@ -1,18 +1,24 @@
 """The result of a simulation, and one instant of it: the same questions, asked of all times or of one."""
 
 import abc
+import os
+from collections.abc import Iterable
 from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from lgsens._validate import suggestion
-from lgsens.dynamics import AbstractSystem, State
+from lgsens._brief import brief, listed, roster, shown
+from lgsens._validate import as_float, is_concrete, suggestion
+from lgsens.dynamics import RESULTS, AbstractSystem, State
 from lgsens.integrate import Stages
-from lgsens.model import MultibodySystem
+from lgsens.model import AbstractJoint, Frame, MultibodySystem, joint_wrenches, motion_at
+from lgsens.simulation._joint_motion import JointMotion, joint_motion
+from lgsens.simulation._tables import to_csv, to_pandas, to_xarray
 
 
 class BodyMotion(NamedTuple):
@@ -34,6 +40,8 @@ class BodyMotion(NamedTuple):
     acceleration: Float[Array, "*n 3"]
     angular_acceleration: Float[Array, "*n 3"]
 
+    __repr__ = brief
+
     def point(self, at) -> Float[Array, "n 3"]:
         """The path [m], inertial frame, of the body's point that is at `at` (inertial frame, shape (3,)) at first.
 
@@ -41,6 +49,22 @@ class BodyMotion(NamedTuple):
         """
         local = self.orientation[0].T @ (jnp.asarray(at, self.position.dtype) - self.position[0])
         return self.position + self.orientation @ local
+
+
+class PointMotion(NamedTuple):
+    """The motion of a point fixed to a body, inertial frame; arrays have a leading axis n + 1, at an `Instant` none.
+
+    Attributes:
+        position: where it is [m], shape (n+1, 3).
+        velocity: its velocity [m/s], shape (n+1, 3).
+        acceleration: its acceleration [m/s²], shape (n+1, 3).
+    """
+
+    position: Float[Array, "*n 3"]
+    velocity: Float[Array, "*n 3"]
+    acceleration: Float[Array, "*n 3"]
+
+    __repr__ = brief
 
 
 class StateError(NamedTuple):
@@ -58,6 +82,17 @@ class StateError(NamedTuple):
     vdot: Float[Array, "n+1 k"]
     lam: Float[Array, "n+1 m"]
 
+    __repr__ = brief
+
+
+def _ending(result: Any) -> str:
+    """How a simulation ended, or how many of a batch did so."""
+    if not is_concrete(result):
+        return "traced"
+    codes, counts = np.unique(np.asarray(result), return_counts=True)
+    one = np.ndim(result) == 0
+    return ", ".join(RESULTS(code).name + ("" if one else f" {count}") for code, count in zip(codes, counts))
+
 
 class AbstractMotion(eqx.Module):
     """What `Trajectory` and `Instant` answer alike; arrays of a trajectory have a leading axis n + 1."""
@@ -67,6 +102,25 @@ class AbstractMotion(eqx.Module):
     @abc.abstractmethod
     def _kinematics(self) -> tuple[State, Any]:
         """The states and their times."""
+
+    def __repr__(self) -> str:
+        states, t = self._kinematics()
+        system, joints, result = self.system, getattr(self, "joints", None), getattr(self, "result", None)
+        sizes = [getattr(array, "shape", (None,))[-1] for array in (getattr(states, of, None) for of in ("v", "lam"))]
+        if not hasattr(t, "shape") or None in sizes:  # a tree of something else than arrays
+            return super().__repr__()
+        fields = {"t": f"{shown(t)} s"}
+        if hasattr(self, "stats"):
+            fields = {"steps": str(t.shape[-1] - 1)} | fields
+        if result is not None:
+            fields["result"] = _ending(result)
+        if isinstance(system, MultibodySystem):
+            whole = system if system.parts is None else system.parts.system
+            own = dict.fromkeys(whole.constraint_names) if joints is None else joints
+            fields |= {"bodies": roster(whole.body_names), "joints": roster(own)}
+            fields["forces"] = roster(dict.fromkeys(owner for stack in whole.loads for owner in stack.owners))
+        unknowns = f"{sizes[0]} coordinates, {sizes[1]} multipliers of"
+        return listed(type(self).__name__, fields | {"states": f"{unknowns} {type(system).__name__}"})
 
     def _multibody(self) -> MultibodySystem:
         if not isinstance(self.system, MultibodySystem):
@@ -83,6 +137,30 @@ class AbstractMotion(eqx.Module):
         if name not in system.body_names:
             raise ValueError(f"`body`: {suggestion(name, system.body_names)}.")
         return BodyMotion(*system.motion(system.body_names.index(name), *motion))
+
+    def point(self, body: str, at) -> PointMotion:
+        """The motion of a point of a body (a marker).
+
+            x + R X,   ẋ + R (Ω × X),   ẍ + R (Ω̇ × X + Ω × (Ω × X)),     X = R₀ᵀ(at − x₀)
+
+        Arguments:
+            body: name of the body.
+            at: where the point is in the reference configuration [m], inertial frame, shape (3,), like the hardpoints
+                of joints; x₀ and R₀ are the body's there. The motion is differentiable by it.
+
+        Raises `ValueError` for an unknown name or a wrong shape.
+        """
+        x, orientation, velocity, spin, acceleration, change = self.body(body)
+        local = self._reference(body).local_point(as_float(at, (3,), "`at`"))
+        twist, rate = (jnp.concatenate(parts, axis=-1) for parts in ((velocity, spin), (acceleration, change)))
+        return PointMotion(*motion_at(local, x, orientation, twist, rate))
+
+    def _reference(self, body: str) -> Frame:
+        """The frame at a body's centre of mass in the reference configuration."""
+        system = self._multibody()
+        system = system if system.parts is None else system.parts.system
+        still = jnp.zeros_like(system.velocity)
+        return Frame(*system.motion(system.body_names.index(body), system.pose, still, still)[:2])
 
     def multiplier(self, joint: str) -> Float[Array, "*n rows"]:
         """The Lagrange multipliers of a joint, shape (n+1, its equations); the joint says what they mean.
@@ -120,7 +198,79 @@ class AbstractMotion(eqx.Module):
         return measure(q, v, t)
 
 
-class Trajectory(AbstractMotion):
+class AbstractRun(AbstractMotion):
+    """What motions over time answer besides, those of `simulate` and of `kinematics`."""
+
+    t: eqx.AbstractVar[Float[Array, " n+1"]]
+    result: eqx.AbstractVar[Int[Array, ""]]
+    joints: eqx.AbstractVar[dict[str, AbstractJoint] | None]
+
+    def joint(self, name: str) -> JointMotion:
+        """The motion of the joint `name`: angle, displacement, their rates, force and moment on its body b.
+
+        The force is −Bᵀλ of all its equations, so each of its multipliers is found there again. Equations that freed
+        bodies cannot violate (`RigidBody.free`) transmit nothing here: what holds such bodies in the coordinates that
+        they do not have is no joint.
+
+        Raises `ValueError` for an unknown name, for a motion of equations that do not know their joints, and for a
+        batch of motions. Source: Haug (1989), §11.4 (reaction forces).
+        """
+        return self._joint_motions((name,))[name]
+
+    def _joint_motions(self, names: Iterable[str]) -> dict[str, JointMotion]:
+        system, (states, t) = self._multibody(), self._kinematics()
+        joints = self.joints
+        if joints is None:
+            raise ValueError(
+                "`joint`: this is the motion of equations, which do not know their joints; give `simulate` the Model "
+                "itself and not its `system()`, or use `multiplier`."
+            )
+        if jnp.ndim(t) != 1:
+            raise ValueError(
+                f"`joint`: this is a batch of motions, of shape {jnp.shape(t)[:-1]}; ask each of them: "
+                "jax.vmap(lambda trajectory: trajectory.joint(name))(trajectories)."
+            )
+        for name in names:
+            if name not in joints:
+                raise ValueError(f"`joint`: {suggestion(name, joints)}.")
+        wrenches = joint_wrenches(system, names, states.q, states.v, states.vdot, states.lam, t)
+        return {
+            name: joint_motion(joints[name], self.body, self._reference, wrench, t) for name, wrench in wrenches.items()
+        }
+
+    def to_xarray(self) -> Any:
+        """An `xarray.Dataset` over the dimension "time": all bodies, joints and states of force elements.
+
+        Variables are "top.position" (time, axis), "top.orientation" (time, axis, body_axis), … as in `BodyMotion`;
+        "hinge.angle", "hinge.angle_rate", …, "hinge.force", "hinge.moment" as in `JointMotion`, "hinge.multiplier";
+        "motor.output" as in `states_of`. Each has its unit as attribute `units`, but for multipliers and states, whose
+        meaning their elements say. Of a motion of equations that do not know their joints: multipliers alone.
+
+        Raises `ImportError` without xarray (`pip install "lgsens[data]"`), and `ValueError` for a motion that is traced
+        or a batch.
+        """
+        return to_xarray(self)
+
+    def to_pandas(self) -> Any:
+        """A `pandas.DataFrame` with the times as index and a column for each number, "top.position.x".
+
+        Contents and errors are those of `to_xarray`; units by column are in `attrs["units"]`.
+        """
+        return to_pandas(self)
+
+    def to_csv(self, path: str | os.PathLike) -> None:
+        """Write a table with a line for each time and a column for each number, "top.position.x [m]", in full
+        precision: what `to_xarray` has, without any package.
+
+        Arguments:
+            path: of the file, which is overwritten.
+
+        Raises `ValueError` for a motion that is traced or a batch.
+        """
+        to_csv(self, path)
+
+
+class Trajectory(AbstractRun):
     """A simulated motion, a pytree like every other: criteria of it are differentiated as usual.
 
     Attributes:
@@ -129,6 +279,7 @@ class Trajectory(AbstractMotion):
         result: a value of `RESULTS`, shape (), int32; 0 is success.
         stats: Newton's iterations, increments and residuals; what the integrator says of its steps.
         system: the equations that were integrated.
+        joints: the joints of the model by name, for `joint`; None if equations were given.
         error: an estimate of the errors of the states, from integrators that have one (`Richardson`); else None.
         order: 2, or 4 where the states deserve a rule of fourth order: what to give `time_integral`, static.
         stages: those of `IndexReducedODE` without `rtol`, by which a `Criterion` integrates; else None.
@@ -142,6 +293,7 @@ class Trajectory(AbstractMotion):
     error: StateError | None = None
     order: int = eqx.field(static=True, default=2)
     stages: Stages | None = None
+    joints: dict[str, AbstractJoint] | None = None
 
     def _kinematics(self):
         return self.states, self.t
@@ -167,6 +319,10 @@ class Saved(eqx.Module):
     final: State
     result: Int[Array, ""]
     stats: Any
+
+    def __repr__(self) -> str:
+        fields = {"t": f"{shown(self.t)} s", "result": _ending(self.result), "values": shown(self.values)}
+        return listed("Saved", fields)
 
 
 class Instant(AbstractMotion):

@@ -1,6 +1,5 @@
 """`sweep`: a function of one design, for thousands of them, on all devices, not lost when the process dies."""
 
-import importlib
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -12,8 +11,9 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jaxtyping import PyTree
 
+from lgsens._brief import brief
 from lgsens._progress import compiling, progress_bar
-from lgsens._validate import as_count, leaf_name
+from lgsens._validate import as_count, leaf_name, optional
 from lgsens.sweeps._batches import compile_batch, trace
 from lgsens.sweeps._folder import Store, in_folder, in_memory
 
@@ -35,6 +35,8 @@ class SweepResult(NamedTuple):
     batch_size: int
     compile_seconds: float
     run_seconds: float
+
+    __repr__ = brief
 
     def design(self, index: int) -> PyTree:
         """One design. `fn(found.design(i))` on its own raises what a failed one has to say, with step and advice."""
@@ -68,11 +70,7 @@ class SweepResult(NamedTuple):
 
         Raises `ImportError` if xarray is not installed (`pip install "lgsens[data]"`).
         """
-        try:
-            xarray = importlib.import_module("xarray")
-        except ImportError as error:
-            raise ImportError('`to_xarray` needs xarray: pip install "lgsens[data]".') from error
-        return xarray.Dataset.from_dict(self.variables())
+        return optional("xarray", "to_xarray").Dataset.from_dict(self.variables())
 
 
 def sweep(

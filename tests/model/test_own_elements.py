@@ -5,10 +5,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import close
+from helpers import close, random_body, random_point
 
 import lgsens as lg
-from lgsens.model import AbstractConstraint, AbstractForce, AbstractJoint, AbstractLoad, Attached, body_fixed
+from lgsens.model import (
+    AbstractConstraint,
+    AbstractForce,
+    AbstractJoint,
+    AbstractLoad,
+    Attached,
+    Coordinate,
+    Frame,
+    body_fixed,
+)
 from lgsens.plotting._shapes import shapes
 from lgsens.testing import check_force, check_joint
 
@@ -175,3 +184,116 @@ def test_what_is_declared_is_drawn():
     (strap,) = shapes(hung().system()).struts
     assert strap.role == "spring"
     assert not shapes(hung(plain=True).system()).struts
+
+
+class Flat(AbstractConstraint):
+    """A point of b stays in the xy-plane of a."""
+
+    there: jax.Array
+
+    @property
+    def num_rows(self):
+        return 1
+
+    def value(self, a, b, t):
+        return a.local_point(b.point(self.there))[2:]
+
+
+class Sheet(AbstractJoint):
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+
+    def constraints(self, a, b):
+        return (Flat(b.local_point(TIP)),)
+
+
+class Slope(Sheet):
+    """With a coordinate and frames: how much higher the frame on b is, in that on a."""
+
+    coordinates = (Coordinate("climb", "m", lambda seen: seen.position[2]),)
+
+    @property
+    def frames(self):
+        return Frame(TIP, jnp.eye(3)), Frame(2.0 * TIP, jnp.eye(3))
+
+
+@pytest.mark.parametrize("kind", [Sheet, Slope])
+def test_what_a_joint_of_ones_own_does(kind):
+    """Any motion, any λ: F·(ẋ_b − ẋ_a at the point) + M·(ω_b − ω_a) = −λᵀB v; without frames at the centre of mass."""
+    rng = np.random.default_rng(4)
+    joint = kind("a", "b")
+    model = lg.Model({name: random_body(rng) for name in "ab"}, {"table": joint})
+    system = model.system()
+    q, v, vdot, lam, t = random_point(system, rng)
+    states = jax.tree.map(lambda leaf: leaf[None], lg.State(q, v, vdot, lam, vdot))
+    run = lg.Trajectory(t=t[None], states=states, result=jnp.asarray(0), stats=None, system=system, joints=model.joints)
+    found = run.joint("table")
+    power, point = 0.0, np.asarray(found.point[0])
+    for name, sign in (("a", -1.0), ("b", 1.0)):
+        x, orientation, velocity, spin, *_ = (np.asarray(array[0]) for array in run.body(name))
+        omega = orientation @ spin
+        speed = velocity + np.cross(omega, point - x)
+        power += sign * (np.asarray(found.force[0]) @ speed + np.asarray(found.moment[0]) @ omega)
+    np.testing.assert_allclose(power, -float(lam @ system.constraint_jacobian(q, t) @ v), rtol=1e-12)
+    if kind is Sheet:
+        np.testing.assert_allclose(point, q.position[1], rtol=1e-14)
+        assert found.coordinates == {}
+    else:
+        lifted = np.asarray(run.point("b", 2.0 * TIP).position - run.point("a", TIP).position)[0]
+        a = model.bodies["a"]
+        axes = np.asarray(q.orientation[0] @ a.orientation.T)
+        np.testing.assert_allclose(found.coordinates["climb"], [lifted @ axes[:, 2]], rtol=1e-12)
+
+
+class Chirp(lg.AbstractSignal):
+    """As the docstring of `AbstractSignal` has it."""
+
+    amplitude: jax.Array
+    rate: jax.Array
+
+    def __call__(self, t):
+        return self.amplitude * jnp.sin(jnp.pi * self.rate * t**2)
+
+
+class PushLoad(AbstractLoad):
+    """A force f of the inertial frame on a point X of b, and its opposite on the same place of a, as `AbstractForce`
+    says what a load returns."""
+
+    vector: jax.Array
+    point: jax.Array
+    signal: lg.AbstractSignal
+
+    def force(self, a, b, va, vb, t):
+        f = self.signal(t) * self.vector
+        place = b.point(self.point)
+        moments = [jnp.cross(frame.local_point(place), frame.local_axis(f)) for frame in (a, b)]
+        return jnp.concatenate([-f, -moments[0], f, moments[1]])
+
+
+class Push(lg.AbstractForce):
+    vector: jax.Array
+    signal: lg.AbstractSignal
+
+    @property
+    def bodies(self):
+        return ("a", "b")
+
+    def loads(self, bodies):
+        return (Attached(PushLoad(self.vector, bodies["b"].frame.local_point(TIP), self.signal), "a", "b"),)
+
+
+def test_order_and_frames_of_a_force_of_ones_own():
+    """Its power is f·(ẋ of the point on b − ẋ of the point on a), here with a signal of one's own."""
+    rng = np.random.default_rng(2)
+    bodies = {name: random_body(rng) for name in "ab"}
+    vector, chirp = jnp.array([1.0, -2.0, 0.5]), Chirp(jnp.asarray(3.0), jnp.asarray(0.7))
+    system = lg.Model(bodies, {}, {"push": Push(vector, chirp)}).system()
+    point = random_point(system, rng, t=0.4)
+    still = jnp.zeros_like(point.v)
+    power = -float(point.v @ system.residual(point.q, still, still, point.lam, point.t))
+    x, orientation, twist = (np.asarray(array) for array in (*point.q, point.v.reshape(2, 6)))
+    b = bodies["b"]
+    place = x[1] + orientation[1] @ np.asarray(b.orientation).T @ (np.asarray(TIP) - b.position)
+    speed = [v[:3] + np.cross(R @ v[3:], place - origin) for v, R, origin in zip(twist, orientation, x)]
+    f = 3.0 * np.sin(np.pi * 0.7 * 0.4**2) * np.asarray(vector)
+    np.testing.assert_allclose(power, f @ (speed[1] - speed[0]), rtol=1e-12)

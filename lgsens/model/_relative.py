@@ -1,0 +1,129 @@
+"""How the two bodies of a joint lie and move in each other.
+
+A joint has a frame on each of its bodies (`AbstractJoint.frames`), fixed to it: with the body at (x₀, R₀) and the frame
+at (p, C) in the reference configuration it is at x + R R₀ᵀ(p − x₀), with the axes R R₀ᵀC. Of the pose of the frame on b
+in that on a,
+
+    d = C_aᵀ(p_b − p_a),     D = C_aᵀ C_b,
+
+each relative coordinate s of a joint is a function. Along
+
+    x(τ) = x + τ ẋ + τ²/2 ẍ,     R(τ) = R (I + w̃ + w̃²/2),     w = τ Ω + τ²/2 Ω̇,
+
+bodies have their velocities and accelerations at τ = 0 (R exp(w̃) to O(τ³), and T(w) w' = Ω + τ Ω̇ + O(τ²)), so ṡ and s̈
+are the derivatives of s by τ.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens.liegroups import SO3, skew
+from lgsens.model._frames import Frame, normals
+
+
+class Coordinate(NamedTuple):
+    """A relative coordinate of a joint.
+
+    Attributes:
+        name, unit: what it is called, and "rad" or "m".
+        of: its value, given the pose of the joint's frame on b in that on a; a function of module level.
+        periodic: whether it is an angle that comes back after 2π, which a trajectory continues over many turns.
+    """
+
+    name: str
+    unit: str
+    of: Callable[[Frame], Float[Array, ""]]
+    periodic: bool = False
+
+
+def _about_x(seen: Frame) -> Float[Array, ""]:
+    return jnp.arctan2(seen.orientation[2, 1], seen.orientation[1, 1])
+
+
+def _rotation(axis: int) -> Callable[[Frame], Float[Array, ""]]:
+    return lambda seen: SO3().log(seen.orientation)[axis]
+
+
+ANGLE = Coordinate("angle", "rad", _about_x, True)
+DISPLACEMENT = Coordinate("displacement", "m", lambda seen: seen.position[0])
+LENGTH = Coordinate("length", "m", lambda seen: jnp.sqrt(jnp.sum(seen.position**2)))
+# of a cross from a, about its arm there, and of b from the cross, about the other arm: D = R_x(α) R_y(β)
+ARM_ANGLES = (
+    ANGLE._replace(name="angle_a"),
+    Coordinate("angle_b", "rad", lambda seen: jnp.arctan2(seen.orientation[0, 2], seen.orientation[0, 0]), True),
+)
+ROTATION_VECTOR = tuple(Coordinate(f"rotation_{name}", "rad", _rotation(i)) for i, name in enumerate("xyz"))
+
+
+def frames_along(at_a, at_b, axis) -> tuple[Frame, Frame]:
+    """The frames of a joint (`AbstractJoint.frames`) at these points, x along `axis`; None: with the ground's axes."""
+    axes = jnp.eye(3, dtype=at_a.dtype) if axis is None else jnp.stack(normals(axis), axis=1)
+    return Frame(at_a, axes), Frame(at_b, axes)
+
+
+# of a joint with one point, and an axis if it has one
+frames_at: Any = property(lambda joint: frames_along(joint.at, joint.at, getattr(joint, "axis", None)))
+
+
+class Relative(NamedTuple):
+    """What `relative_motion` finds, along a leading axis: s, ṡ, s̈ of each coordinate, (d, D), C_a and p_b."""
+
+    values: Float[Array, "n s"]
+    rates: Float[Array, "n s"]
+    accelerations: Float[Array, "n s"]
+    seen: Frame
+    axes: Float[Array, "n 3 3"]
+    point: Float[Array, "n 3"]
+
+
+@partial(jax.jit, static_argnums=0)
+def relative_motion(coordinates: tuple[Coordinate, ...], frames, references, motions) -> Relative:
+    """The formulas above of two bodies, a and b.
+
+    Arguments:
+        coordinates: s.
+        frames, references: of each the frame of the joint and its own in the reference configuration.
+        motions: of each x, R, ẋ, Ω, ẍ, Ω̇, with a leading axis.
+    """
+
+    def ends(tau, motions):
+        for frame, reference, (x, orientation, velocity, spin, acceleration, change) in zip(
+            frames, references, motions
+        ):
+            w = skew(tau * spin + tau**2 / 2 * change)
+            body = Frame(
+                x + tau * velocity + tau**2 / 2 * acceleration,
+                orientation @ (jnp.eye(3, dtype=x.dtype) + w + w @ w / 2),
+            )
+            axes = reference.orientation.T @ frame.orientation
+            yield Frame(body.point(reference.local_point(frame.position)), body.orientation @ axes)
+
+    def seen(tau, motions):
+        a, b = ends(tau, motions)
+        return Frame(a.local_point(b.position), a.orientation.T @ b.orientation)
+
+    def at_time(motions):
+        zero = jnp.zeros((), motions[0][0].dtype)
+        values = lambda tau: jnp.stack([of(seen(tau, motions)) for _, _, of, _ in coordinates] or [zero])
+        along = lambda function: lambda tau: jax.jvp(function, (tau,), (jnp.ones_like(tau),))
+        (s, rate), (_, acceleration) = along(along(values))(zero)
+        a, b = ends(zero, motions)
+        count = len(coordinates)
+        return Relative(s[:count], rate[:count], acceleration[:count], seen(zero, motions), a.orientation, b.position)
+
+    return jax.vmap(at_time)(motions)
+
+
+def continued(values: Float[Array, " n"], rates: Float[Array, " n"], t: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Angles between −π and π as an angle that grows on, the first one as it is.
+
+    Of θ + 2πk in each step that which is nearest to θ_n + h (θ̇_n + θ̇_{n+1})/2, whatever the turn in the step.
+    """
+    missing = jnp.diff(t) * (rates[1:] + rates[:-1]) / 2 - jnp.diff(values)
+    turns = jnp.cumsum(jax.lax.stop_gradient(jnp.round(missing / (2 * jnp.pi))))
+    return values.at[1:].add(2 * jnp.pi * turns)
