@@ -188,7 +188,7 @@ class Index3LinearizedStep(AbstractLinearizedStep):
 class Index3(AbstractEquations):
     """The equations of index 3."""
 
-    scheme: AbstractAlpha = eqx.field(static=True)
+    scheme: AbstractAlpha
     system: AbstractSystem
     mass: Matrix  # M, (k, k)
     scale: Float[Array, " k"]

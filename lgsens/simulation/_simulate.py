@@ -3,11 +3,14 @@
 import dataclasses
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any, overload
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
+from jax.core import Tracer
 
 from lgsens._validate import as_count, as_float, require
 from lgsens._xla import tracing
@@ -19,11 +22,18 @@ from lgsens.integrate import (
     IndexReducedODE,
     Laid,
     Stats,
+    Steps,
     singular_steps,
 )
 from lgsens.model import Model
-from lgsens.sensitivity import AbstractSensitivity, DirectDifferentiation, Parameters, saved_run
-from lgsens.simulation._errors import throw_if_failed
+from lgsens.sensitivity import (
+    AbstractSensitivity,
+    AdjointVariable,
+    DirectDifferentiation,
+    Parameters,
+    saved_run,
+)
+from lgsens.simulation._errors import primal_value, throw_if_failed
 from lgsens.simulation._index_reduced_ode import integrate_ode
 from lgsens.simulation._richardson import extrapolate_runs
 from lgsens.simulation._start import Begin, as_system, begin
@@ -133,8 +143,14 @@ def simulate(
     if save is not None and not callable(save):
         raise ValueError(f"`save` must be a function of an Instant, got {save!r}. Leave it out to have the trajectory.")
     t0, t1 = interval(t0, t1)
+    given = (num_steps, integrator)
+    if save is None and sensitivity in _EXACT and outside_of_jit((system, t0, t1 - t0, state0)):
+        given = as_data(num_steps, integrator, t0.dtype)
     with tracing():
-        found, details = _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, save)
+        found, details = _simulate_jit(system, t0, t1, *given, sensitivity, state0, save)
+        if isinstance(given[0], Steps):
+            states, t, stats = _cut(found.states, found.t, found.stats, num_steps)
+            found = dataclasses.replace(found, states=states, t=t, stats=stats)
     if throw:
         fields = ("states", "error", "stages") if save is None else ("values", "final")  # the others say what happened
         motion = {name: getattr(found, name) for name in fields}
@@ -160,6 +176,33 @@ def interval(t0, t1):
     t0, t1 = as_float(t0, (), "`t0`"), as_float(t1, (), "`t1`")
     require(lambda t0, t1: t1 > t0, f"`t1` must be later than `t0`, got t0 = {t0} s and t1 = {t1} s.", t0, t1)
     return t0, t1
+
+
+_EXACT = (DirectDifferentiation(), AdjointVariable())
+
+
+def outside_of_jit(arrays: Any) -> bool:
+    """Whether all arrays have values, at most with derivatives: no program is being made of what is done with them."""
+    return not any(isinstance(primal_value(leaf), Tracer) for leaf in jax.tree.leaves(arrays))
+
+
+def as_data(num_steps: int, integrator: AbstractIntegrator, dtype) -> tuple[int | Steps, AbstractIntegrator]:
+    """What one program serves for many values of it, as numbers of the program."""
+    if type(integrator).lay is not AbstractIntegrator.lay or integrator.extrapolated or integrator.scheme.has_stages:
+        return num_steps, integrator
+    return Steps.of(num_steps, dtype), integrator.as_data(dtype)
+
+
+@partial(jax.jit, static_argnums=3)
+def _cut(states: State, t, stats: Any, num_steps: int) -> tuple[State, Any, Any]:
+    """What a trajectory is made of, without the rows for which there was room.
+
+    The states pass through an equation of their own, x = states: so whatever a criterion looks at, all of them have
+    cotangents, and one program pulls these back.
+    """
+    states = lax.custom_linear_solve(lambda x: x, states, lambda _, b: b, lambda _, b: b)
+    rows = lambda tree, n: jax.tree.map(lambda leaf: leaf[:n], tree)
+    return rows(states, num_steps + 1), t[: num_steps + 1], rows(stats, num_steps)
 
 
 @eqx.filter_jit
@@ -189,7 +232,7 @@ def outcome(scheme: AbstractScheme, begun: Begin, stats: Stats, turns, t, laid: 
         "violation": begun.violation,
         "jacobian": begun.jacobian,
         "step": failed + 1,
-        "num_steps": jnp.asarray(stats.converged.shape[0]),
+        "num_steps": jnp.asarray(stats.converged.shape[0] if laid.grid.count is None else laid.grid.count),
         "time": time,
         "begin": t[failed],
         "iterations": stats.iterations[failed],
@@ -206,14 +249,14 @@ def run(
     begun: Begin,
     t0,
     t1,
-    num_steps: int,
+    num_steps: int | Steps,
     integrator: AbstractIntegrator,
     sensitivity: AbstractSensitivity,
     save: Save | None = None,
 ) -> tuple[Any, dict[str, Any]]:
     """`simulate` without its checks: the trajectory or what is saved of it, and what the message of a failure needs."""
     one = lambda num_steps: _single_run(system, begun, t0, t1, num_steps, integrator, sensitivity, save)
-    if not integrator.extrapolated:
+    if not integrator.extrapolated or isinstance(num_steps, Steps):
         return one(num_steps)
     (coarse, of_coarse), (fine, of_fine) = (one(n) for n in (num_steps, 2 * num_steps))
     failed = coarse.result != RESULTS.successful
@@ -221,7 +264,7 @@ def run(
     return extrapolate_runs(system, coarse, fine), details | {"run": jnp.where(failed, 1, 2)}
 
 
-def _single_run(system, begun: Begin, t0, t1, num_steps: int, integrator: AbstractIntegrator, sensitivity, save):
+def _single_run(system, begun: Begin, t0, t1, num_steps: int | Steps, integrator: AbstractIntegrator, sensitivity, save):
     scheme: Any = integrator.scheme
     laid = integrator.lay(system, begun.start, begun.jerk, t0, t1, num_steps)
     grid: Any = laid.grid
