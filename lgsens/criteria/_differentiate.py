@@ -14,10 +14,11 @@ from jaxtyping import Array, Float, Int, PyTree
 from lgsens._validate import as_count, as_float
 from lgsens._xla import tracing
 from lgsens.criteria._advice import direct_or_adjoint
+from lgsens.criteria._by_parts import Parts, adjoint_by_parts, unique
 from lgsens.criteria._criterion import Criterion
 from lgsens.criteria._criterion_use import Use, checked_for
 from lgsens.criteria._reference_methods import STENCIL, FiniteDifferences, IndexReduced
-from lgsens.dynamics import RESULTS, AbstractSystem, State, is_redundant, softness
+from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate import AbstractIntegrator, AdaptiveSteps, EqualGrid, GeneralizedAlpha, UnevenGrid
 from lgsens.model import Model
 from lgsens.sensitivity import (
@@ -119,8 +120,10 @@ def differentiate(
         value, gradient = _index_reduced(task, p, method)
         result = jnp.zeros((), jnp.int32)
     else:
+        by_parts = isinstance(method, AdjointVariable)
         with tracing():
-            value, gradient, result, details, labels, note = _differentiate_jit(task, p, names, method)
+            found = (adjoint_by_parts if by_parts else _differentiate_jit)(task, p, names, method)
+        value, gradient, result, details, labels, note = found
     values, gradients = (jax.tree.unflatten(structure, leaves) for leaves in (value, gradient))
     if throw and details is not None:
         values, gradients = throw_if_failed((values, gradients), result, details, labels, note)
@@ -195,7 +198,7 @@ class _Found(NamedTuple):
     value: Float[Array, " c"]
     gradient: Float[Array, "c p"]
     result: Int[Array, ""]
-    details: dict[str, Any] | None
+    details: dict[str, Any]
 
 
 @eqx.filter_jit
@@ -212,16 +215,10 @@ def _differentiate_jit(task: _Task, p, names: tuple[str, ...], method):
     elif isinstance(method, DirectDifferentiation) and not (integrator.extrapolated or integrator.scheme.has_stages):
         found = _on_the_fly(task, flat)
     else:
-        found = _through_the_trajectory(task, flat, method)
-    result, note = found.result, ""
-    of_multipliers = [name for name, use in zip(names, uses) if use.integrand.multipliers or use.terminal.multipliers]
-    if of_multipliers and found.details is not None:
-        note = f"{' and '.join(of_multipliers)}: multipliers are used."
-        # a given state0 has not been asked
-        redundant = softness(system) is None and is_redundant(system, found.details["jacobian"])
-        result = jnp.where(redundant, RESULTS.redundant_constraints, result).astype(jnp.int32)
+        found = _forwards(task, flat, method)
+    result, note = unique(found.result, system, found.details["jacobian"], names, uses)
     gradient = tuple(unravel(row) for row in found.gradient)
-    return tuple(found.value), gradient, result, found.details, system.constraint_names, note
+    return Parts(tuple(found.value), gradient, result, found.details, system.constraint_names, note)
 
 
 def _on_the_fly(task: _Task, p) -> _Found:
@@ -240,15 +237,14 @@ def _on_the_fly(task: _Task, p) -> _Found:
     return _Found(found.value, found.gradient, *ended)
 
 
-def _through_the_trajectory(task: _Task, p, method: AbstractSensitivity) -> _Found:
-    """The derivative of the trajectory, contracted by the criteria: all criteria or all parameters in one sweep."""
-    mode = jax.jacrev if isinstance(method, AdjointVariable) else jax.jacfwd
+def _forwards(task: _Task, p, method: AbstractSensitivity) -> _Found:
+    """The derivative of the trajectory in forward mode, contracted by the criteria."""
 
     def function(p):
         values, (trajectory, details) = task.simulate(p, method)
         return values, (values, trajectory.result, details)
 
-    gradient, (value, result, details) = mode(function, has_aux=True)(p)
+    gradient, (value, result, details) = jax.jacfwd(function, has_aux=True)(p)
     return _Found(value, gradient, result, details)
 
 

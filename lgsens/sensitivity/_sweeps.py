@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from lgsens.dynamics import State
-from lgsens.integrate import AbstractGrid, AbstractScheme, Variation, earlier, later, over_steps, with_first
+from lgsens.integrate import AbstractScheme, Variation, earlier, later, over_steps, with_first
 from lgsens.linear import tuned
 from lgsens.sensitivity._linearization import Parameters, Step, node_tangent, place_tangents, steps
 
@@ -39,17 +39,16 @@ class StepBlocks(NamedTuple):
     count: Any = None
 
     @classmethod
-    def of(cls, grid: AbstractGrid, numbers: int) -> "StepBlocks":
+    def of(cls, num_steps: int, numbers: int, count: Any = None) -> "StepBlocks":
         """Blocks for factors of `numbers` numbers; without padding where a divisor is near.
 
         Where steps are counted the last block is cut anywhere: shorter ones waste less in it.
         """
-        num_steps = grid.num_steps
-        least = num_steps if grid.count is None else num_steps // tuned.COUNTED_BLOCKS
-        longest = max(1, min(least, tuned.BLOCK_STEPS, tuned.BLOCK_NUMBERS // numbers))
+        most = num_steps if count is None else num_steps // tuned.COUNTED_BLOCKS
+        longest = max(1, min(most, tuned.BLOCK_STEPS, tuned.BLOCK_NUMBERS // numbers))
         divisors = [n for n in range((longest + 1) // 2, longest + 1) if num_steps % n == 0]
         length = divisors[-1] if divisors else longest
-        return cls(length, -num_steps % length, grid.count)
+        return cls(length, -num_steps % length, count)
 
     @property
     def blocks(self) -> Any:
@@ -96,7 +95,7 @@ def direct_sweep(scheme: AbstractScheme, states: State, parameters: Parameters, 
     The steps after the last, which fill its block, are computed and dropped.
     """
     system, grid = parameters
-    shared, blocks = scheme.shared(system), StepBlocks.of(grid, scheme.numbers(system))
+    shared, blocks = scheme.shared(system), StepBlocks.of(grid.num_steps, scheme.numbers(system), grid.count)
 
     def prepare(step: Step, d_place):
         node = grid.node(step.place)
@@ -125,7 +124,7 @@ def direct_sweep(scheme: AbstractScheme, states: State, parameters: Parameters, 
 def adjoint_sweep(scheme: AbstractScheme, states: State, parameters: Parameters, c: Variation, c_p: Parameters):
     """Solve Lᵀ (μ, p̄) = (c, c_p) backwards in time; returns μ stacked (row 0: the cotangent of δ_0), and p̄."""
     system, grid = parameters
-    shared, blocks = scheme.shared(system), StepBlocks.of(grid, scheme.numbers(system))
+    shared, blocks = scheme.shared(system), StepBlocks.of(grid.num_steps, scheme.numbers(system), grid.count)
 
     def prepare(step: Step):
         return scheme.linearized(system, shared, grid.node(step.place), step.begun, step.state)

@@ -143,14 +143,10 @@ def simulate(
     if save is not None and not callable(save):
         raise ValueError(f"`save` must be a function of an Instant, got {save!r}. Leave it out to have the trajectory.")
     t0, t1 = interval(t0, t1)
-    given = (num_steps, integrator)
-    if save is None and sensitivity in _EXACT and outside_of_jit((system, t0, t1 - t0, state0)):
-        given = as_data(num_steps, integrator, t0.dtype)
     with tracing():
+        given = for_any_number(num_steps, integrator, sensitivity, save, (system, t0, t1 - t0, state0))
         found, details = _simulate_jit(system, t0, t1, *given, sensitivity, state0, save)
-        if isinstance(given[0], Steps):
-            states, t, stats = _cut(found.states, found.t, found.stats, num_steps)
-            found = dataclasses.replace(found, states=states, t=t, stats=stats)
+        found = cut(found, num_steps) if isinstance(given[0], Steps) else found
     if throw:
         fields = ("states", "error", "stages") if save is None else ("values", "final")  # the others say what happened
         motion = {name: getattr(found, name) for name in fields}
@@ -178,26 +174,30 @@ def interval(t0, t1):
     return t0, t1
 
 
-_EXACT = (DirectDifferentiation(), AdjointVariable())
-
-
-def outside_of_jit(arrays: Any) -> bool:
-    """Whether all arrays have values, at most with derivatives: no program is being made of what is done with them."""
-    return not any(isinstance(primal_value(leaf), Tracer) for leaf in jax.tree.leaves(arrays))
-
-
-def as_data(num_steps: int, integrator: AbstractIntegrator, dtype) -> tuple[int | Steps, AbstractIntegrator]:
-    """What one program serves for many values of it, as numbers of the program."""
-    if type(integrator).lay is not AbstractIntegrator.lay or integrator.extrapolated or integrator.scheme.has_stages:
+def for_any_number(
+    num_steps: int, integrator: AbstractIntegrator, sensitivity: AbstractSensitivity, save: Save | None, arrays: Any
+) -> tuple[int | Steps, AbstractIntegrator]:
+    """Steps and integrator with their numbers as data, where a program of its own serves them: outside of `jit`, where
+    all `arrays` have values (and derivatives at most); else as they are."""
+    equal = type(integrator).lay is AbstractIntegrator.lay
+    if not equal or integrator.extrapolated or integrator.scheme.has_stages:
         return num_steps, integrator
-    return Steps.of(num_steps, dtype), integrator.as_data(dtype)
+    leaves = jax.tree.leaves(arrays)
+    traced = any(isinstance(primal_value(leaf), Tracer) for leaf in leaves)
+    if traced or save is not None or sensitivity not in (DirectDifferentiation(), AdjointVariable()):
+        return num_steps, integrator
+    return Steps.of(num_steps, leaves[0].dtype), integrator.as_data(leaves[0].dtype)
+
+
+def cut(found: Trajectory, num_steps: int) -> Trajectory:
+    """A trajectory without the rows for which there was room."""
+    states, t, stats = _cut(found.states, found.t, found.stats, num_steps)
+    return dataclasses.replace(found, states=states, t=t, stats=stats)
 
 
 @partial(jax.jit, static_argnums=3)
 def _cut(states: State, t, stats: Any, num_steps: int) -> tuple[State, Any, Any]:
-    """What a trajectory is made of, without the rows for which there was room.
-
-    The states pass through an equation of their own, x = states: so whatever a criterion looks at, all of them have
+    """The states pass through an equation of their own, x = states: so whatever a criterion looks at, all of them have
     cotangents, and one program pulls these back.
     """
     states = lax.custom_linear_solve(lambda x: x, states, lambda _, b: b, lambda _, b: b)
