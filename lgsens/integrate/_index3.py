@@ -53,7 +53,6 @@ accelerations and multipliers are unknowns here like the others.
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax

@@ -86,7 +86,7 @@ def matvec(scheme: AbstractScheme, states: State, parameters: Parameters, delta:
         """The rows of steps; those beyond the last one say δ = b."""
         if grid.count is None:
             return rows
-        beyond = jnp.arange(grid.num_steps) >= grid.count
+        beyond = jnp.arange(grid.num_steps, dtype=grid.count.dtype) >= grid.count
         where = lambda row, own: jnp.where(jnp.expand_dims(beyond, range(1, row.ndim)), own, row)
         return jax.tree.map(where, rows, later(delta))
 

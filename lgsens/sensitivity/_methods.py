@@ -196,7 +196,7 @@ def _linear_scheme(scheme: AbstractScheme) -> GeneralizedAlpha:
 
 
 # The custom rules see statistics as floats: an integer output of a `custom_vjp` reaches operations that have no
-# derivative (`jnp.all`) with a tangent, and JAX refuses. Numbers of the scheme, where they are data, have no derivative.
+# derivative (`jnp.all`) with a tangent, and JAX refuses. Numbers of the scheme have no derivative where they are data.
 
 
 @partial(jax.jit, inline=True)  # traced once for the trajectory and its rule

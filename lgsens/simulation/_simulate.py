@@ -264,7 +264,9 @@ def run(
     return extrapolate_runs(system, coarse, fine), details | {"run": jnp.where(failed, 1, 2)}
 
 
-def _single_run(system, begun: Begin, t0, t1, num_steps: int | Steps, integrator: AbstractIntegrator, sensitivity, save):
+def _single_run(
+    system, begun: Begin, t0, t1, num_steps: int | Steps, integrator: AbstractIntegrator, sensitivity, save
+):
     scheme: Any = integrator.scheme
     laid = integrator.lay(system, begun.start, begun.jerk, t0, t1, num_steps)
     grid: Any = laid.grid
