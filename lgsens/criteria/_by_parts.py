@@ -1,4 +1,4 @@
-"""The adjoint variable method for criteria of a trajectory, in programs that serve others as well.
+"""Criteria of a trajectory and their derivatives in reverse mode, by programs that serve others as well.
 
     scene p ↦ (system, y_0),     motion (system, y_0) ↦ y,     criteria (y, system, p) ↦ Ψ,
 
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from lgsens.criteria._criterion_use import Use
 from lgsens.dynamics import RESULTS, AbstractSystem, State, is_redundant, softness
-from lgsens.integrate import Steps
+from lgsens.integrate import AbstractIntegrator, Steps
 from lgsens.sensitivity import AbstractSensitivity
 from lgsens.simulation import Trajectory, as_system, begin, cut, for_any_number, run
 
@@ -33,16 +33,34 @@ class Parts(NamedTuple):
     note: str
 
 
-def adjoint_by_parts(task: Any, p, names: tuple[str, ...], method: AbstractSensitivity) -> Parts:
-    """Ψ and dΨ/dp of each criterion of a task of `differentiate`."""
-    (system, state0), of_p = _scene(task.build, task.start, p)
-    t0, t1, arrays = task.t0, task.t1, (system, state0, task.t0, task.t1 - task.t0)
-    steps, integrator = for_any_number(task.num_steps, task.integrator, method, None, arrays)
-    (found, details), of_scene = _motion(system, state0, t0, t1, steps, integrator, method)
-    count = task.num_steps if isinstance(steps, Steps) else None
-    value, rows, result, note = _values(task.criteria, names, found, details["jacobian"], p, count)
-    gradient = _pulled_to_p(of_p, _pulled_to_scene(of_scene, rows), rows)
-    return Parts(value, gradient, result, details, system.constraint_names, note)
+class Task(NamedTuple):
+    """Criteria, functions of (trajectory, p), and what they are criteria of; `start`: p ↦ state0, or None."""
+
+    criteria: tuple[Callable, ...]
+    build: Callable[[Any], Any]
+    start: Callable[[Any], State] | None
+    integrator: AbstractIntegrator
+    num_steps: int
+    t0: Any
+    t1: Any
+
+
+def reverse_by_parts(
+    task: Task, p, method: AbstractSensitivity, names: tuple[str, ...] = (), call: Callable = lambda f, *a: f(*a)
+) -> tuple[Parts, Trajectory]:
+    """Ψ and dΨ/dp of each criterion in reverse mode, and the motion.
+
+    `names`: of criteria that are asked what they use; `call`: makes the calls, and sees the programs.
+    """
+    t0, t1 = task.t0, task.t1
+    (system, state0), of_p = call(_scene, task.build, task.start, p)
+    given = for_any_number(task.num_steps, task.integrator, method, None, (system, state0, t0, t1 - t0))
+    (found, details), of_scene = call(_motion, system, state0, t0, t1, *given, method)
+    count = task.num_steps if isinstance(given[0], Steps) else None
+    value, rows, of_found = call(_values, task.criteria, names, found, details["jacobian"], p, count)
+    found, result, note = of_found
+    gradient = call(_pulled_to_p, of_p, call(_pulled_to_scene, of_scene, rows), rows)
+    return Parts(value, gradient, result, details, system.constraint_names, note), found
 
 
 @eqx.filter_jit
@@ -58,7 +76,7 @@ def _motion(system, state0, t0, t1, num_steps, integrator, method):
     def of(system, state0):
         begun = begin(integrator.scheme, system, t0, state0)
         found, details = run(system, begun, t0, t1, num_steps, integrator, method)
-        return (found.states, found.stages), (found, details)
+        return (found.states, found.stages, found.error), (found, details)
 
     _, pull_back, found = jax.vjp(of, system, state0, has_aux=True)
     return found, pull_back
@@ -67,7 +85,7 @@ def _motion(system, state0, t0, t1, num_steps, integrator, method):
 class _Rows(NamedTuple):
     """dΨ by what criteria depend on, one row for each criterion."""
 
-    motion: tuple[State, Any]
+    motion: tuple[State, Any, Any]
     system: Any
     p: Any
 
@@ -75,15 +93,17 @@ class _Rows(NamedTuple):
 @eqx.filter_jit
 def _values(criteria, names, found: Trajectory, jacobian, p, count: int | None):
     def of(motion, system, p):
-        states, stages = motion
-        trajectory = dataclasses.replace(found, states=states, stages=stages, system=system)
+        states, stages, error = motion
+        trajectory = dataclasses.replace(found, states=states, stages=stages, error=error, system=system)
         trajectory = trajectory if count is None else cut(trajectory, count)
-        return jnp.stack([criterion(trajectory, p) for criterion in criteria])
+        values = jnp.stack([criterion(trajectory, p) for criterion in criteria])
+        return values, (values, trajectory)
 
-    at = (found.states, found.stages), found.system, p
-    rows = _Rows(*jax.jacrev(of, argnums=(0, 1, 2))(*at))
-    uses = [Use.of(criterion, found.system, found.t[0], p) for criterion in criteria]
-    return tuple(of(*at)), rows, *unique(found.result, found.system, jacobian, names, uses)
+    at = (found.states, found.stages, found.error), found.system, p
+    rows, (values, trajectory) = jax.jacrev(of, argnums=(0, 1, 2), has_aux=True)(*at)
+    uses = [Use.of(criterion, found.system, found.t[0], p) for criterion in criteria if names]
+    result, note = unique(found.result, found.system, jacobian, names, uses)
+    return tuple(values), _Rows(*rows), (trajectory, result, note)
 
 
 def _each(pull_back: Callable, rows: Any) -> Any:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from lgsens._validate import as_count, as_float
 from lgsens._xla import tracing
 from lgsens.criteria._advice import direct_or_adjoint
-from lgsens.criteria._by_parts import Parts, adjoint_by_parts, unique
+from lgsens.criteria._by_parts import Parts, Task, reverse_by_parts, unique
 from lgsens.criteria._criterion import Criterion
 from lgsens.criteria._criterion_use import Use, checked_for
 from lgsens.criteria._reference_methods import STENCIL, FiniteDifferences, IndexReduced
@@ -120,9 +120,13 @@ def differentiate(
         value, gradient = _index_reduced(task, p, method)
         result = jnp.zeros((), jnp.int32)
     else:
-        by_parts = isinstance(method, AdjointVariable)
         with tracing():
-            found = (adjoint_by_parts if by_parts else _differentiate_jit)(task, p, names, method)
+            if isinstance(method, AdjointVariable):
+                found, _ = reverse_by_parts(
+                    Task(leaves, build, state0, integrator, num_steps, t0, t1), p, method, names
+                )
+            else:
+                found = _differentiate_jit(task, p, names, method)
         value, gradient, result, details, labels, note = found
     values, gradients = (jax.tree.unflatten(structure, leaves) for leaves in (value, gradient))
     if throw and details is not None:

@@ -66,5 +66,6 @@ LANE_CACHE = 2 * 2**20  # bytes
 LANES, LANES_ELSEWHERE = 256, 8192
 FREE_SHARE = 0.5  # of the memory that is free, what a batch may take
 
-# Programs that `accuracy` keeps at a time: Linux gives a process 65,530 memory maps, a large scene takes thousands.
-PROGRAMS_TOGETHER = 8
+# What `accuracy` times in turns, and how many memory maps its programs may take: Linux gives a process 65,530, and a
+# large scene takes thousands.
+SETTINGS_TOGETHER, MAPS = 8, 40_000

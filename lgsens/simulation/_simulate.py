@@ -125,11 +125,7 @@ def simulate(
     by_diffrax = _by_diffrax(integrator)
     if not by_diffrax:
         check_integrator(integrator, num_steps)
-    if not isinstance(sensitivity, AbstractSensitivity):
-        raise ValueError(
-            "`sensitivity` must be DirectDifferentiation(), AdjointVariable(), ContinuousDirect() or Autodiff(), got "
-            f"{sensitivity!r}; ContinuousAdjoint() needs a Criterion, see `differentiate`."
-        )
+    check_sensitivity(sensitivity)
     if by_diffrax and (sensitivity != DirectDifferentiation() or save is not None):
         raise ValueError(
             f"`sensitivity` = {sensitivity!r} and `save` need steps of the scheme. With `rtol` diffrax takes its own, "
@@ -163,6 +159,15 @@ def check_integrator(integrator: Any, num_steps: int) -> None:
     integrator.check(num_steps)
 
 
+def check_sensitivity(sensitivity: Any) -> None:
+    """Raise `ValueError` for what is no method to differentiate a trajectory."""
+    if not isinstance(sensitivity, AbstractSensitivity):
+        raise ValueError(
+            "`sensitivity` must be DirectDifferentiation(), AdjointVariable(), ContinuousDirect() or Autodiff(), got "
+            f"{sensitivity!r}; ContinuousAdjoint() needs a Criterion, see `differentiate`."
+        )
+
+
 def _by_diffrax(integrator: Any) -> bool:
     return isinstance(integrator, IndexReducedODE) and integrator.rtol is not None
 
@@ -180,7 +185,7 @@ def for_any_number(
     """Steps and integrator with their numbers as data, where a program of its own serves them: outside of `jit`, where
     all `arrays` have values (and derivatives at most); else as they are."""
     equal = type(integrator).lay is AbstractIntegrator.lay
-    if not equal or integrator.extrapolated or integrator.scheme.has_stages:
+    if not equal or integrator.extrapolated or _by_diffrax(integrator):
         return num_steps, integrator
     leaves = jax.tree.leaves(arrays)
     traced = any(isinstance(primal_value(leaf), Tracer) for leaf in leaves)
@@ -191,18 +196,21 @@ def for_any_number(
 
 def cut(found: Trajectory, num_steps: int) -> Trajectory:
     """A trajectory without the rows for which there was room."""
-    states, t, stats = _cut(found.states, found.t, found.stats, num_steps)
-    return dataclasses.replace(found, states=states, t=t, stats=stats)
+    motion, t, stats = _cut((found.states, found.stages), found.t, found.stats, num_steps)
+    return dataclasses.replace(found, states=motion[0], stages=motion[1], t=t, stats=stats)
 
 
 @partial(jax.jit, static_argnums=3)
-def _cut(states: State, t, stats: Any, num_steps: int) -> tuple[State, Any, Any]:
+def _cut(motion: tuple[State, Any], t, stats: Any, num_steps: int) -> tuple[tuple[State, Any], Any, Any]:
     """The states pass through an equation of their own, x = states: so whatever a criterion looks at, all of them have
     cotangents, and one program pulls these back.
     """
-    states = lax.custom_linear_solve(lambda x: x, states, lambda _, b: b, lambda _, b: b)
+    states, stages = motion
+    every = lax.custom_linear_solve(lambda x: x, states, lambda _, b: b, lambda _, b: b)
+    room = t.shape[0] - 1
     rows = lambda tree, n: jax.tree.map(lambda leaf: leaf[:n], tree)
-    return rows(states, num_steps + 1), t[: num_steps + 1], rows(stats, num_steps)
+    of_steps = lambda tree: jax.tree.map(lambda leaf: leaf[: num_steps * (leaf.shape[0] // room)], tree)
+    return (rows(every, num_steps + 1), of_steps(stages)), t[: num_steps + 1], of_steps(stats)
 
 
 @eqx.filter_jit
