@@ -4,9 +4,6 @@ Programs are counted, in JAX's own log, and the numbers of those with room for m
 programs made for one number of steps, inside of `jit`.
 """
 
-import logging
-import re
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -42,19 +39,6 @@ def build(p):
 def psi(p, criterion=HIGH, times=FIRST, numbers=None, **settings):
     run = lg.simulate(build(p), **(FIRST | times), integrator=lg.GeneralizedAlpha(**(numbers or {})), **settings)
     return criterion(run, p)
-
-
-@pytest.fixture
-def compiled(caplog):
-    """The names of the programs that a call compiles, and what it returns."""
-
-    def of(function, *arguments, **settings):
-        caplog.clear()
-        with jax.log_compiles(), caplog.at_level(logging.WARNING):
-            found = jax.block_until_ready(function(*arguments, **settings))
-        return re.findall(r"Compiling jit\((\w+)\)", caplog.text), found
-
-    return of
 
 
 def test_eager_gradients_share_their_programs(compiled):

@@ -57,8 +57,8 @@ def work_precision(
         known: a table of the same scene that was not finished: its rows and its reference are not measured again.
         keep: called with the table so far after each eight settings.
 
-    Settings that differ in their numbers only (steps, ρ∞, tolerance) share their programs. A setting that fails is a row
-    that says why. Raises `ValueError` for bad arguments, and where no reference is found.
+    Settings that differ in their numbers only (steps, ρ∞, tolerance) share their programs. A setting that fails is a
+    row that says why. Raises `ValueError` for bad arguments, and where no reference is found.
     """
     settings = tuple(ladder() if settings is None else settings)
     if not settings or not all(isinstance(setting, Setting) for setting in settings):
