@@ -46,11 +46,12 @@ class Task(NamedTuple):
 
 
 def reverse_by_parts(
-    task: Task, p, method: AbstractSensitivity, names: tuple[str, ...] = (), call: Callable = lambda f, *a: f(*a)
+    task: Any, p, method: AbstractSensitivity, names: tuple[str, ...] = (), call: Callable = lambda f, *a: f(*a)
 ) -> tuple[Parts, Trajectory]:
-    """Ψ and dΨ/dp of each criterion in reverse mode, and the motion.
+    """Ψ and dΨ/dp of each criterion of a task in reverse mode, and the motion.
 
-    `names`: of criteria that are asked what they use; `call`: makes the calls, and sees the programs.
+    `task`: a `Task`, or what has its fields; `names`: of criteria that are asked what they use; `call`: makes the
+    calls, and sees the programs.
     """
     t0, t1 = task.t0, task.t1
     (system, state0), of_p = call(_scene, task.build, task.start, p)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from lgsens._validate import as_count, as_float
 from lgsens._xla import tracing
 from lgsens.criteria._advice import direct_or_adjoint
-from lgsens.criteria._by_parts import Parts, Task, reverse_by_parts, unique
+from lgsens.criteria._by_parts import Parts, reverse_by_parts, unique
 from lgsens.criteria._criterion import Criterion
 from lgsens.criteria._criterion_use import Use, checked_for
 from lgsens.criteria._reference_methods import STENCIL, FiniteDifferences, IndexReduced
@@ -31,7 +31,17 @@ from lgsens.sensitivity import (
     configuration_cotangent,
     direct_on_the_fly,
 )
-from lgsens.simulation import Begin, as_system, begin, check_integrator, interval, outcome, run, throw_if_failed
+from lgsens.simulation import (
+    Begin,
+    as_system,
+    begin,
+    check_integrator,
+    for_any_number,
+    interval,
+    outcome,
+    run,
+    throw_if_failed,
+)
 
 Method = AbstractSensitivity | ContinuousAdjoint | FiniteDifferences | IndexReduced
 
@@ -122,16 +132,22 @@ def differentiate(
     else:
         with tracing():
             if isinstance(method, AdjointVariable):
-                found, _ = reverse_by_parts(
-                    Task(leaves, build, state0, integrator, num_steps, t0, t1), p, method, names
-                )
+                found, _ = reverse_by_parts(task, p, method, names)
             else:
+                if _flies(method, integrator):
+                    given = for_any_number(num_steps, integrator, method, None, (p, t0, t1 - t0))
+                    task = task._replace(num_steps=given[0], integrator=given[1])
                 found = _differentiate_jit(task, p, names, method)
         value, gradient, result, details, labels, note = found
     values, gradients = (jax.tree.unflatten(structure, leaves) for leaves in (value, gradient))
     if throw and details is not None:
         values, gradients = throw_if_failed((values, gradients), result, details, labels, note)
     return Sensitivities(values, gradients, method, result)
+
+
+def _flies(method: Method, integrator: AbstractIntegrator) -> bool:
+    """Whether criteria are differentiated on the fly."""
+    return isinstance(method, DirectDifferentiation) and not (integrator.extrapolated or integrator.scheme.has_stages)
 
 
 def _index_reduced(task: "_Task", p, method: IndexReduced):
@@ -175,7 +191,7 @@ class _Task(NamedTuple):
     start: Callable[[Any], State] | None
     unravel: Any  # set inside of `jit`, where it is no key of the cache
     integrator: AbstractIntegrator
-    num_steps: int
+    num_steps: Any  # an int or `Steps`
     t0: Float[Array, ""]
     t1: Float[Array, ""]
 
@@ -216,7 +232,7 @@ def _differentiate_jit(task: _Task, p, names: tuple[str, ...], method):
         found = _differences(task, flat, method)
     elif isinstance(method, ContinuousAdjoint):
         found = _continuous_adjoint(task, flat, method, uses)
-    elif isinstance(method, DirectDifferentiation) and not (integrator.extrapolated or integrator.scheme.has_stages):
+    elif _flies(method, integrator):
         found = _on_the_fly(task, flat)
     else:
         found = _forwards(task, flat, method)
