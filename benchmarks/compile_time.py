@@ -8,7 +8,11 @@ fills, then again with what the first has left. The gradient is that of Ψ, the 
 acceleration, by all numbers of the model. Processor time stands beside wall time: other load on the machine changes it
 least. "trace" is what no cache saves: Python that makes the program. With jaxlib 0.10 a third process
 compiles without the options that lgsens gives XLA (`lgsens._xla`), as JAX comes. "runs" is the median of 20 runs of 100
-steps. Writes compile_time.json.
+steps.
+
+"anew" is the processor time of a second call in one process, outside of `jit`, with one thing changed, relative to the
+first: another criterion, number of steps, tolerance or ρ∞, for `jax.value_and_grad` and for `differentiate`. Writes
+compile_time.json.
 """
 
 import importlib.metadata
@@ -25,7 +29,23 @@ from benchmark import AS_JAX_COMES, SINGLE_THREAD, circumstances, environment, i
 
 SCENES = ("top", "four_bar", "quarter_car", "chain_2", "chain_8", "chain_32")
 PROGRAMS = ("simulate", "value_and_grad")
+ANEW = ("top", "quarter_car")
 STEPS = 100  # a scan: compile time does not depend on it
+
+
+def model_of(scene: str):
+    """The model of a scene."""
+    from lgsens.examples import QuarterCar, four_bar, spatial_chain, spinning_top
+
+    if scene == "top":
+        return spinning_top(0.7)
+    if scene == "four_bar":
+        return four_bar()
+    if scene == "quarter_car":
+        return QuarterCar.load().model()
+    if scene == "reduced_car":
+        return QuarterCar.load().model(wheel="locked", chassis="heave", links="rods")
+    return spatial_chain(int(scene.removeprefix("chain_")))
 
 
 def compile_once(scene: str, program: str) -> dict:
@@ -34,19 +54,9 @@ def compile_once(scene: str, program: str) -> dict:
     import jax.numpy as jnp
 
     import lgsens as lg
-    from lgsens.examples import QuarterCar, four_bar, spatial_chain, spinning_top
 
     jax.config.update("jax_enable_x64", True)
-    if scene == "top":
-        model = spinning_top(0.7)
-    elif scene == "four_bar":
-        model = four_bar()
-    elif scene == "quarter_car":
-        model = QuarterCar.load().model()
-    elif scene == "reduced_car":
-        model = QuarterCar.load().model(wheel="locked", chassis="heave", links="rods")
-    else:
-        model = spatial_chain(int(scene.removeprefix("chain_")))
+    model = model_of(scene)
     observed = sorted(model.bodies)[0]
 
     def simulate(model):
@@ -69,6 +79,51 @@ def compile_once(scene: str, program: str) -> dict:
     jax.block_until_ready(compiled(model))
     times = interleaved({program: lambda: jax.block_until_ready(compiled(model))}, 20)[program]
     return found | {"run_seconds": statistics.median(times.cpu), "run_wall_seconds": statistics.median(times.wall)}
+
+
+CALLS = ("value_and_grad", "differentiate")
+CHANGES = {
+    "criterion": {"criterion": "velocity"},
+    "num_steps": {"num_steps": 3 * STEPS // 2},
+    "tolerance": {"tolerance": 1e-7},
+    "rho_inf": {"rho_inf": 0.6},
+}
+
+
+def compile_anew(scene: str, program: str) -> dict:
+    """Seconds of processor of value and gradient for the first time, and again with one thing changed."""
+    import jax
+    import jax.numpy as jnp
+
+    import lgsens as lg
+
+    jax.config.update("jax_enable_x64", True)
+    model = model_of(scene)
+    observed = sorted(model.bodies)[0]
+    criteria = {
+        name: lg.Criterion(integrand=lambda s, p, name=name: jnp.sum(getattr(s.body(observed), name) ** 2))
+        for name in ("acceleration", "velocity")
+    }
+
+    def call(criterion="acceleration", num_steps=STEPS, **numbers):
+        integrator = lg.GeneralizedAlpha(**numbers)
+        settings = {"t1": 0.1, "num_steps": num_steps, "integrator": integrator}
+        begin = time.process_time()
+        if program == "differentiate":
+            method = lg.AdjointVariable()
+            found = lg.differentiate(criteria[criterion], itself, model, method=method, **settings)[:2]
+        else:
+            found = jax.value_and_grad(lambda model: criteria[criterion](lg.simulate(model, **settings)))(model)
+        jax.block_until_ready(found)
+        return time.process_time() - begin
+
+    first = call()
+    return {"first": first, "anew": {name: call(**change) / first for name, change in CHANGES.items()}}
+
+
+def itself(model):
+    """The scene of `differentiate`: the same function in each call."""
+    return model
 
 
 def measure(scene: str) -> dict:
@@ -98,6 +153,20 @@ def measure(scene: str) -> dict:
     return found
 
 
+def measure_anew(scene: str) -> dict:
+    """What changes cost in one process, for each way to call."""
+    found = {}
+    for program in CALLS:
+        command = [sys.executable, __file__, "--anew", scene, program]
+        text = subprocess.run(
+            command, env=os.environ | SINGLE_THREAD, check=True, capture_output=True, text=True
+        ).stdout
+        found[program] = json.loads(text.splitlines()[-1])
+        ratios = ", ".join(f"{name} {ratio:.3f}" for name, ratio in found[program]["anew"].items())
+        print(f"{scene}, {program}: {found[program]['first']:.1f} s; anew {ratios}", flush=True)
+    return found
+
+
 def markdown(document: dict) -> str:
     kinds = {"as_jax_comes": "as JAX comes", "lean": "without fusion emitters"}  # the latter in older results
     third = next((key for key in kinds for found in document["scenes"].values() if key in found[PROGRAMS[0]]), "none")
@@ -124,6 +193,15 @@ def markdown(document: dict) -> str:
                 f"{1e3 * other['run_seconds']:.2f}" if other else "–",
             )
             lines.append("| " + " | ".join(cells) + " |")
+    lines += [
+        "",
+        f"| scene | outside of `jit` | first [s of CPU] | {' | '.join(CHANGES)} |",
+        "|---" * (3 + len(CHANGES)) + "|",
+    ]
+    for scene, programs in document.get("anew", {}).items():
+        for program, found in programs.items():
+            ratios = " | ".join(f"{found['anew'][name]:.3f}" for name in CHANGES)
+            lines.append(f"| {scene} | {program} | {found['first']:.1f} | {ratios} |")
     return "\n".join(lines)
 
 
@@ -131,14 +209,22 @@ def main() -> None:
     parser = options(__doc__, repeats=False)
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
     parser.add_argument("--table", action="store_true", help="print the table of compile_time.json, measure nothing")
+    parser.add_argument("--anew", nargs="*", metavar="SCENE", help="second calls only; with a program: in this process")
     parser.add_argument("--one", nargs=2, metavar=("SCENE", "PROGRAM"), help="one program in this process, as JSON")
     arguments = parser.parse_args()
     if arguments.one:
         print(json.dumps(compile_once(*arguments.one)))
         return
+    if arguments.anew and arguments.anew[-1] in CALLS:
+        print(json.dumps(compile_anew(*arguments.anew)))
+        return
     path = arguments.out / "compile_time.json"
     document = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"scenes": {}}
     if not arguments.table:
+        for scene in arguments.anew if arguments.anew is not None else ANEW:
+            document["anew"] = document.get("anew", {}) | {scene: measure_anew(scene)}
+            write(path, document)
+    if not (arguments.table or arguments.anew is not None):
         for scene in arguments.scenes:
             document["scenes"][scene] = measure(scene)
             document["environment"] = environment(SINGLE_THREAD)

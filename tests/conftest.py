@@ -7,7 +7,9 @@ compiled once in a run: JAX keeps them in a folder that ends with it.
 """
 
 import gc
+import logging
 import os
+import re
 import tempfile
 
 import jax
@@ -57,3 +59,16 @@ def forget_large_programs(request):
     yield
     if request.node.get_closest_marker("slow"):
         _forget_programs()
+
+
+@pytest.fixture
+def compiled(caplog):
+    """The names of the programs that a call compiles, as JAX logs them, and what it returns."""
+
+    def of(function, *arguments, **settings):
+        caplog.clear()
+        with jax.log_compiles(), caplog.at_level(logging.WARNING):
+            found = jax.block_until_ready(function(*arguments, **settings))
+        return re.findall(r"Compiling jit\((\w+)\)", caplog.text), found
+
+    return of

@@ -3,16 +3,15 @@
 import dataclasses
 import statistics
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any
 
-import jax
 import numpy as np
 
 from lgsens._progress import progress_bar
 from lgsens._validate import as_count
 from lgsens.accuracy._balance import quality
-from lgsens.accuracy._programs import Program, Study, failed
+from lgsens.accuracy._programs import Program, Study, crowded, failed, make_room
 from lgsens.accuracy._reference import Reference, converge
 from lgsens.accuracy._setting import Build, Function, Setting, ladder
 from lgsens.accuracy._table import Row, Table
@@ -58,8 +57,8 @@ def work_precision(
         known: a table of the same scene that was not finished: its rows and its reference are not measured again.
         keep: called with the table so far after each eight settings.
 
-    One program is compiled for every setting, and half a dozen for the reference. A setting that fails is a row that
-    says why. Raises `ValueError` for bad arguments, and where no reference is found.
+    Settings that differ in their numbers only (steps, ρ∞, tolerance) share their programs. A setting that fails is a
+    row that says why. Raises `ValueError` for bad arguments, and where no reference is found.
     """
     settings = tuple(ladder() if settings is None else settings)
     if not settings or not all(isinstance(setting, Setting) for setting in settings):
@@ -73,33 +72,28 @@ def work_precision(
             f"`reference`: its gradient must have shape {study.scale.shape}, got {np.shape(reference.gradient)}."
         )
     with progress_bar(len(settings) + (6 if reference is None else 0), "program", progress) as bar:
-
-        def done() -> None:
-            bar.update()
-            jax.clear_caches()
-
         if reference is None:
             bar.set_postfix({"compiling": "the reference"})
-            reference = converge(study, min(setting.num_steps for setting in settings), done)
+            reference = converge(study, min(setting.num_steps for setting in settings), bar.update)
         rows = {} if known is None else {(row.setting.label, row.setting.num_steps): row for row in known}
         of = lambda setting: (setting.label, setting.num_steps)
         found = lambda: Table(tuple(rows[of(each)] for each in settings if of(each) in rows), reference, rounds)
         rows = {of(each): dataclasses.replace(rows[of(each)], setting=each) for each in settings if of(each) in rows}
         bar.update(len(rows))
         missing = [setting for setting in settings if of(setting) not in rows]
-        for i in range(0, len(missing), tuned.PROGRAMS_TOGETHER):
-            some = missing[i : i + tuned.PROGRAMS_TOGETHER]
-            rows |= {of(row.setting): row for row in _measured(study, some, reference, rounds, bar)}
-            jax.clear_caches()
+        while missing:
+            rows |= {of(row.setting): row for row in _measured(study, missing, reference, rounds, bar)}
             if keep is not None:
                 keep(found())
     return found()
 
 
-def _measured(study: Study, settings: Sequence[Setting], reference: Reference, rounds: int, bar: Any) -> list[Row]:
-    """The rows of a few settings, that take turns."""
+def _measured(study: Study, settings: list[Setting], reference: Reference, rounds: int, bar: Any) -> list[Row]:
+    """The rows of a few settings, that take turns; they are taken from the list."""
     found = []
-    for setting in settings:
+    make_room()
+    while settings and len(found) < tuned.SETTINGS_TOGETHER and not (found and crowded()):
+        setting = settings.pop(0)
         bar.set_postfix({"compiling": f"{setting.label}, {setting.num_steps} steps"})
         found.append(_evaluated(study, setting, reference))
         bar.update()

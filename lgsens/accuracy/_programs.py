@@ -1,17 +1,23 @@
-"""Ψ and dΨ/dp of a setting as one compiled program, what it costs, and how far two such results are apart."""
+"""Ψ and dΨ/dp of a setting, compiled, what it costs, and how far two such results are apart."""
 
 import time
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jax.tree_util import Partial
 
 from lgsens._validate import as_float
+from lgsens._xla import tracing
 from lgsens.accuracy._setting import Build, Function, Setting
+from lgsens.criteria import Criterion, Task, reverse_by_parts
 from lgsens.dynamics import RESULTS
-from lgsens.simulation import Trajectory
+from lgsens.linear import tuned
+from lgsens.sensitivity import DirectDifferentiation
+from lgsens.simulation import Trajectory, check_integrator, check_sensitivity, richardson
 
 
 class Study(NamedTuple):
@@ -80,39 +86,94 @@ class Evaluated(NamedTuple):
         )
 
 
+def _called(function: Callable, *arguments):
+    return function(*arguments)
+
+
+def _constant(value, p):
+    return value
+
+
+def _of_trajectory(fn: Callable, trajectory: Trajectory, p):
+    return fn(trajectory)
+
+
 class Program:
-    """A setting of a study, compiled."""
+    """A setting of a study, compiled; what another one has compiled before serves it as well."""
 
     def __init__(self, study: Study, setting: Setting):
         self.study, self.setting = study, setting
+        options = {"sensitivity": DirectDifferentiation(), "state0": None} | dict(setting.options)
+        self._method, state0 = options.pop("sensitivity"), options.pop("state0")
+        if options.keys() - {"throw"}:
+            raise ValueError(f"Setting: `options` may be `sensitivity` and `state0`, got {sorted(options)}.")
+        check_sensitivity(self._method)
+        self._start = None if state0 is None else Partial(_constant, state0)
+        self._build = Partial(study.build, **dict(setting.model))
+        self._fn = study.fn if isinstance(study.fn, Criterion) else Partial(_of_trajectory, study.fn)
+        self.temporary_bytes = None
+        seconds = []
+        for call in (self._watched, _called):
+            started = time.perf_counter()
+            self(call)
+            seconds.append(time.perf_counter() - started)
+        self.compile_seconds = max(seconds[0] - seconds[1], 0.0)
 
-        def value(p):
-            return setting.value_and_trajectory(study.fn, study.build, p, t0=study.t0, t1=study.t1, throw=False)
+    def _watched(self, function, *arguments):
+        """A call, after which the memory of the program is known."""
+        found = function(*arguments)
+        memory = function.lower(*arguments).compile().compiled.memory_analysis()  # made already
+        if memory is not None:
+            self.temporary_bytes = max(self.temporary_bytes or 0, int(memory.temp_size_in_bytes))
+        return found
 
-        started = time.perf_counter()
-        self._executable = jax.jit(jax.value_and_grad(value, has_aux=True)).lower(study.p).compile()
-        self.compile_seconds = time.perf_counter() - started
-        memory = self._executable.memory_analysis()
-        self.temporary_bytes = None if memory is None else int(memory.temp_size_in_bytes)
+    def __call__(self, call: Callable = _called) -> tuple[Any, Any, list[Trajectory]]:
+        """Ψ, dΨ/dp, and the motions behind them."""
+        study, integrator, motions = self.study, self.setting.integrator, []
 
-    def __call__(self) -> Any:
-        return jax.block_until_ready(self._executable(self.study.p))
+        def run(num_steps: int):
+            check_integrator(integrator, num_steps)
+            task = Task((self._fn,), self._build, self._start, integrator, num_steps, study.t0, study.t1)
+            with tracing():
+                parts, motion = reverse_by_parts(task, study.p, self._method, call=call)
+            motions.append(motion)
+            return parts.value[0], parts.gradient[0]
+
+        runs, num_steps = self.setting.runs, self.setting.num_steps
+        value, gradient = run(num_steps) if runs == 1 else richardson(run, num_steps, runs).value
+        return *jax.block_until_ready((value, gradient)), motions
 
     def evaluate(self) -> tuple[Evaluated, Trajectory]:
-        (value, trajectory), gradient = self()
+        """Value and gradient, NaN after a failure, and the finest motion."""
+        value, gradient, motions = self()
         flat = np.asarray(ravel_pytree(gradient)[0]) * self.study.scale
-        failure = ""
-        if int(trajectory.result) != RESULTS.successful:
-            failure = RESULTS(int(trajectory.result)).message
-        elif not (np.isfinite(value) and np.isfinite(flat).all()):
+        failed = [int(run.result) for run in motions if int(run.result) != RESULTS.successful]
+        failure = RESULTS(failed[0]).message if failed else ""
+        if not failure and not (np.isfinite(value) and np.isfinite(flat).all()):
             failure = "Ψ or its gradient is not finite."
         if failure:
             value, flat = np.nan, np.full_like(flat, np.nan)
-        return Evaluated(float(value), flat, failure), trajectory
+        return Evaluated(float(value), flat, failure), motions[-1]
+
+
+def crowded() -> bool:
+    """Whether programs have taken most of the memory maps that Linux gives a process."""
+    try:
+        with open("/proc/self/maps", "rb") as maps:
+            return sum(1 for _ in maps) > tuned.MAPS
+    except OSError:  # other systems count none
+        return False
+
+
+def make_room() -> None:
+    """Forget programs, where that is needed for others."""
+    if crowded():
+        jax.clear_caches()
 
 
 def evaluate(study: Study, setting: Setting) -> Evaluated:
     """Value and gradient of a setting; a failure is data."""
+    make_room()
     try:
         return Program(study, setting).evaluate()[0]
     except Exception as error:  # whatever compiling and running the user's functions raises

@@ -1,6 +1,7 @@
 """Criteria of a trajectory (paper, §5), their derivatives by every method, and what these cost."""
 
 from lgsens.criteria._advice import Advice as Advice, Costs as Costs, direct_or_adjoint as direct_or_adjoint
+from lgsens.criteria._by_parts import Task as Task, reverse_by_parts as reverse_by_parts
 from lgsens.criteria._cost import measure_costs as measure_costs
 from lgsens.criteria._criterion import (
     Criterion as Criterion,

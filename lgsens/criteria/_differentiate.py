@@ -15,10 +15,11 @@ from lgsens._brief import brief
 from lgsens._validate import as_count, as_float
 from lgsens._xla import tracing
 from lgsens.criteria._advice import direct_or_adjoint
+from lgsens.criteria._by_parts import Parts, reverse_by_parts, unique
 from lgsens.criteria._criterion import Criterion
 from lgsens.criteria._criterion_use import Use, checked_for
 from lgsens.criteria._reference_methods import STENCIL, FiniteDifferences, IndexReduced
-from lgsens.dynamics import RESULTS, AbstractSystem, State, is_redundant, softness
+from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate import AbstractIntegrator, AdaptiveSteps, EqualGrid, GeneralizedAlpha, UnevenGrid
 from lgsens.model import Model
 from lgsens.sensitivity import (
@@ -31,7 +32,17 @@ from lgsens.sensitivity import (
     configuration_cotangent,
     direct_on_the_fly,
 )
-from lgsens.simulation import Begin, as_system, begin, check_integrator, interval, outcome, run, throw_if_failed
+from lgsens.simulation import (
+    Begin,
+    as_system,
+    begin,
+    check_integrator,
+    for_any_number,
+    interval,
+    outcome,
+    run,
+    throw_if_failed,
+)
 
 Method = AbstractSensitivity | ContinuousAdjoint | FiniteDifferences | IndexReduced
 
@@ -123,11 +134,23 @@ def differentiate(
         result = jnp.zeros((), jnp.int32)
     else:
         with tracing():
-            value, gradient, result, details, labels, note = _differentiate_jit(task, p, names, method)
+            if isinstance(method, AdjointVariable):
+                found, _ = reverse_by_parts(task, p, method, names)
+            else:
+                if _flies(method, integrator):
+                    given = for_any_number(num_steps, integrator, method, None, (p, t0, t1 - t0))
+                    task = task._replace(num_steps=given[0], integrator=given[1])
+                found = _differentiate_jit(task, p, names, method)
+        value, gradient, result, details, labels, note = found
     values, gradients = (jax.tree.unflatten(structure, leaves) for leaves in (value, gradient))
     if throw and details is not None:
         values, gradients = throw_if_failed((values, gradients), result, details, labels, note)
     return Sensitivities(values, gradients, method, result)
+
+
+def _flies(method: Method, integrator: AbstractIntegrator) -> bool:
+    """Whether criteria are differentiated on the fly."""
+    return isinstance(method, DirectDifferentiation) and not (integrator.extrapolated or integrator.scheme.has_stages)
 
 
 def _index_reduced(task: "_Task", p, method: IndexReduced):
@@ -171,7 +194,7 @@ class _Task(NamedTuple):
     start: Callable[[Any], State] | None
     unravel: Any  # set inside of `jit`, where it is no key of the cache
     integrator: AbstractIntegrator
-    num_steps: int
+    num_steps: Any  # an int or `Steps`
     t0: Float[Array, ""]
     t1: Float[Array, ""]
 
@@ -198,7 +221,7 @@ class _Found(NamedTuple):
     value: Float[Array, " c"]
     gradient: Float[Array, "c p"]
     result: Int[Array, ""]
-    details: dict[str, Any] | None
+    details: dict[str, Any]
 
 
 @eqx.filter_jit
@@ -212,19 +235,13 @@ def _differentiate_jit(task: _Task, p, names: tuple[str, ...], method):
         found = _differences(task, flat, method)
     elif isinstance(method, ContinuousAdjoint):
         found = _continuous_adjoint(task, flat, method, uses)
-    elif isinstance(method, DirectDifferentiation) and not (integrator.extrapolated or integrator.scheme.has_stages):
+    elif _flies(method, integrator):
         found = _on_the_fly(task, flat)
     else:
-        found = _through_the_trajectory(task, flat, method)
-    result, note = found.result, ""
-    of_multipliers = [name for name, use in zip(names, uses) if use.integrand.multipliers or use.terminal.multipliers]
-    if of_multipliers and found.details is not None:
-        note = f"{' and '.join(of_multipliers)}: multipliers are used."
-        # a given state0 has not been asked
-        redundant = softness(system) is None and is_redundant(system, found.details["jacobian"])
-        result = jnp.where(redundant, RESULTS.redundant_constraints, result).astype(jnp.int32)
+        found = _forwards(task, flat, method)
+    result, note = unique(found.result, system, found.details["jacobian"], names, uses)
     gradient = tuple(unravel(row) for row in found.gradient)
-    return tuple(found.value), gradient, result, found.details, system.constraint_names, note
+    return Parts(tuple(found.value), gradient, result, found.details, system.constraint_names, note)
 
 
 def _on_the_fly(task: _Task, p) -> _Found:
@@ -243,15 +260,14 @@ def _on_the_fly(task: _Task, p) -> _Found:
     return _Found(found.value, found.gradient, *ended)
 
 
-def _through_the_trajectory(task: _Task, p, method: AbstractSensitivity) -> _Found:
-    """The derivative of the trajectory, contracted by the criteria: all criteria or all parameters in one sweep."""
-    mode = jax.jacrev if isinstance(method, AdjointVariable) else jax.jacfwd
+def _forwards(task: _Task, p, method: AbstractSensitivity) -> _Found:
+    """The derivative of the trajectory in forward mode, contracted by the criteria."""
 
     def function(p):
         values, (trajectory, details) = task.simulate(p, method)
         return values, (values, trajectory.result, details)
 
-    gradient, (value, result, details) = mode(function, has_aux=True)(p)
+    gradient, (value, result, details) = jax.jacfwd(function, has_aux=True)(p)
     return _Found(value, gradient, result, details)
 
 

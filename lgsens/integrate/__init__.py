@@ -8,6 +8,7 @@ from lgsens.integrate._grid import (
     AbstractGrid as AbstractGrid,
     EqualGrid as EqualGrid,
     StepLink as StepLink,
+    Steps as Steps,
     UnevenGrid as UnevenGrid,
     earlier as earlier,
     later as later,
@@ -20,6 +21,7 @@ from lgsens.integrate._linearized import (
     Node as Node,
     Variation as Variation,
 )
+from lgsens.integrate._loops import over_steps as over_steps
 from lgsens.integrate._march import (
     Mark as Mark,
     Walk as Walk,

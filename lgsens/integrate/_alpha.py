@@ -25,36 +25,20 @@ class AbstractAlpha(AbstractScheme):
     α_m = (2ρ − 1)/(ρ + 1),  α_f = ρ/(ρ + 1),  γ = ½ + α_f − α_m,  β = (γ + ½)²/4
     """
 
-    rho_inf: eqx.AbstractVar[float]
+    alpha_m: eqx.AbstractVar[Any]
+    alpha_f: eqx.AbstractVar[Any]
+    gamma: eqx.AbstractVar[Any]
+    beta: eqx.AbstractVar[Any]
+    delta: eqx.AbstractVar[Any]  # Δ = α_m − α_f: a_n stands for the acceleration at t_n + Δ h
+    inertia_factor: eqx.AbstractVar[Any]  # c = ∂v̇⁺/∂u
     stabilized: eqx.AbstractVar[bool]
     factor_every: eqx.AbstractVar[int]
     iterations: eqx.AbstractVar[int | None]
 
-    @property
-    def alpha_m(self) -> float:
-        return (2.0 * self.rho_inf - 1.0) / (self.rho_inf + 1.0)
 
-    @property
-    def alpha_f(self) -> float:
-        return self.rho_inf / (self.rho_inf + 1.0)
-
-    @property
-    def gamma(self) -> float:
-        return 0.5 + self.alpha_f - self.alpha_m
-
-    @property
-    def beta(self) -> float:
-        return (self.gamma + 0.5) ** 2 / 4.0
-
-    @property
-    def delta(self) -> float:
-        """Δ = α_m − α_f: a_n stands for the acceleration at t_n + Δ h."""
-        return self.alpha_m - self.alpha_f
-
-    @property
-    def inertia_factor(self) -> float:
-        """c = ∂v̇⁺/∂u."""
-        return (1.0 - self.alpha_m) / (1.0 - self.alpha_f)
+def at_least(value, bound: float):
+    """The larger one: a Python float where `value` is a constant of the program."""
+    return max(value, bound) if isinstance(value, float | int) else jnp.maximum(value, bound)
 
 
 class Motion(NamedTuple):

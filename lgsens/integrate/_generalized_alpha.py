@@ -14,9 +14,10 @@ in `_index3.py`, does not degenerate as h → 0 (Bottasso, Bauchau & Cardona 200
 """
 
 import dataclasses
+import functools
 import math
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -42,66 +43,10 @@ class Past(NamedTuple):
     watch: Watch
 
 
-class GeneralizedAlpha(AbstractAlpha):
-    """The generalized-α integrator: numerical damping and the settings of its Newton iteration.
+class AbstractGeneralizedAlpha(AbstractAlpha):
+    """What the scheme is for the march and the sweeps."""
 
-        α_m = (2ρ − 1)/(ρ + 1),  α_f = ρ/(ρ + 1),  γ = ½ + α_f − α_m,  β = (γ + ½)²/4
-
-    Arguments:
-        rho_inf: spectral radius ρ∞ at infinite frequency, in [0, 1): 0 damps the fastest modes in one step,
-            values near 1 keep energy and let noise in the multipliers persist.
-        tolerance: the last Newton increment of a configuration, relative to 1 rad or the length of the
-            scene, at which a step has converged. The error left is its square; below 64 round-offs
-            it is raised to that (single precision).
-        max_iterations: full Newton iterations per step before the step has failed.
-        iterations: a fixed budget instead, so many iterations in every step and no test between them: of modified
-            Newton, with a matrix renewed every `factor_every` steps and at no other time, or of full Newton where that
-            is 0. Every step then costs the same, in each lane of a batch too. A step whose last increment is above
-            `tolerance` has failed all the same, and `Stats.increment` says what it was; with a larger tolerance the
-            motion is off by about the last increment times the contraction of one iteration, and so is its derivative,
-            which is that of converged steps. Too few feed their error to the steps that follow: at h = 1 ms a top
-            takes 2 full ones, or 4 with a matrix up to 20 steps old (with 3 it diverges). None: as many as it takes.
-        factor_every: the most steps that share one inverse of the iteration matrix (modified Newton); a new one is made
-            earlier where the iterations that it saves are worth it. Its iterations cost a tenth of a full one, and go
-            on until the error left is what full Newton would leave; a step that they do not bring there is finished by
-            full Newton. 0: full Newton always. The sensitivities do not depend on it: theirs is always the exact
-            matrix of the converged step.
-        second_order_start: start with a₀ = v̇₀ + (α_m − α_f) h v̈₀, because a_n stands for the acceleration at
-            t_n + (α_m − α_f) h, and with v₀ moved by O(h²) along the constraint directions, where the scheme keeps
-            it anyway: positions, velocities and multipliers are then second order from the first step.
-            False: a₀ = v̇₀ and v₀ as it is; multipliers are first order in the first steps (Arnold,
-            Brüls & Cardona, Numerische Mathematik 129, 2015, doi:10.1007/s00211-014-0633-1).
-        stabilized: satisfy B v = 0 in every step besides Φ = 0 (stabilized index 2, after Gear, Gupta & Leimkuhler),
-            at the price of m more unknowns in a step; see `_stabilized.py`. Dense. False: index 3, where B v is O(h²).
-
-    All static and hashable. Raises `ValueError` for ρ∞ outside [0, 1), a tolerance that is not positive, fewer than 1
-    iteration, a negative `factor_every`, or a `stabilized` that is not a bool. Source: Sonneville & Brüls (2014), §4;
-    Brüls, Cardona & Arnold (2012).
-    """
-
-    rho_inf: float = eqx.field(static=True, default=0.9)
-    tolerance: float = eqx.field(static=True, default=1e-10, kw_only=True)
-    max_iterations: int = eqx.field(static=True, default=10, kw_only=True)
-    factor_every: int = eqx.field(static=True, default=20, kw_only=True)
-    second_order_start: bool = eqx.field(static=True, default=True, kw_only=True)
-    iterations: int | None = eqx.field(static=True, default=None, kw_only=True)
-    stabilized: bool = eqx.field(static=True, default=False, kw_only=True)
-
-    def __check_init__(self):
-        number = lambda value: isinstance(value, int | float)
-        count = lambda value, least: isinstance(value, int) and value >= least
-        check = partial(require_setting, self)
-        valid = number(self.rho_inf) and 0.0 <= self.rho_inf < 1.0
-        check("rho_inf", valid, "a number in [0, 1)", "; 0.9 damps little, 0 most")
-        valid = number(self.tolerance) and 0.0 < self.tolerance < math.inf
-        check("tolerance", valid, "positive", "; 1e-10 is the default")
-        check("max_iterations", count(self.max_iterations, 1), "an int, at least 1")
-        check("factor_every", count(self.factor_every, 0), "an int, at least 0 (0: full Newton always)")
-        valid = self.iterations is None or count(self.iterations, 1)
-        check("iterations", valid, "an int, at least 1, or None (until they converge)")
-        check("stabilized", isinstance(self.stabilized, bool), "True (index 2) or False (index 3)")
-
-    # What the scheme is for the march and the sweeps.
+    second_order_start: eqx.AbstractVar[bool]
 
     def shared(self, system) -> AbstractEquations:
         return self._kind(system).of(self, system)
@@ -199,10 +144,122 @@ class GeneralizedAlpha(AbstractAlpha):
     def linearized(self, system, shared, node, previous, state):
         return shared.linearized(node, previous, state)
 
+    def _kind(self, system) -> type[AbstractEquations]:
+        """The equations of a step: those of index 3, or those with rows of velocity level."""
+        return Levels if self.stabilized or system.num_velocity_rows else Index3
+
+
+class GeneralizedAlpha(AbstractGeneralizedAlpha):
+    """The generalized-α integrator: numerical damping and the settings of its Newton iteration.
+
+        α_m = (2ρ − 1)/(ρ + 1),  α_f = ρ/(ρ + 1),  γ = ½ + α_f − α_m,  β = (γ + ½)²/4
+
+    Arguments:
+        rho_inf: spectral radius ρ∞ at infinite frequency, in [0, 1): 0 damps the fastest modes in one step,
+            values near 1 keep energy and let noise in the multipliers persist.
+        tolerance: the last Newton increment of a configuration, relative to 1 rad or the length of the
+            scene, at which a step has converged. The error left is its square; below 64 round-offs
+            it is raised to that (single precision).
+        max_iterations: full Newton iterations per step before the step has failed.
+        iterations: a fixed budget instead, so many iterations in every step and no test between them: of modified
+            Newton, with a matrix renewed every `factor_every` steps and at no other time, or of full Newton where that
+            is 0. Every step then costs the same, in each lane of a batch too. A step whose last increment is above
+            `tolerance` has failed all the same, and `Stats.increment` says what it was; with a larger tolerance the
+            motion is off by about the last increment times the contraction of one iteration, and so is its derivative,
+            which is that of converged steps. Too few feed their error to the steps that follow: at h = 1 ms a top
+            takes 2 full ones, or 4 with a matrix up to 20 steps old (with 3 it diverges). None: as many as it takes.
+        factor_every: the most steps that share one inverse of the iteration matrix (modified Newton); a new one is made
+            earlier where the iterations that it saves are worth it. Its iterations cost a tenth of a full one, and go
+            on until the error left is what full Newton would leave; a step that they do not bring there is finished by
+            full Newton. 0: full Newton always. The sensitivities do not depend on it: theirs is always the exact
+            matrix of the converged step.
+        second_order_start: start with a₀ = v̇₀ + (α_m − α_f) h v̈₀, because a_n stands for the acceleration at
+            t_n + (α_m − α_f) h, and with v₀ moved by O(h²) along the constraint directions, where the scheme keeps
+            it anyway: positions, velocities and multipliers are then second order from the first step.
+            False: a₀ = v̇₀ and v₀ as it is; multipliers are first order in the first steps (Arnold,
+            Brüls & Cardona, Numerische Mathematik 129, 2015, doi:10.1007/s00211-014-0633-1).
+        stabilized: satisfy B v = 0 in every step besides Φ = 0 (stabilized index 2, after Gear, Gupta & Leimkuhler),
+            at the price of m more unknowns in a step; see `_stabilized.py`. Dense. False: index 3, where B v is O(h²).
+
+    All static and hashable. Raises `ValueError` for ρ∞ outside [0, 1), a tolerance that is not positive, fewer than 1
+    iteration, a negative `factor_every`, or a `stabilized` that is not a bool. Source: Sonneville & Brüls (2014), §4;
+    Brüls, Cardona & Arnold (2012).
+    """
+
+    rho_inf: float = eqx.field(static=True, default=0.9)
+    tolerance: float = eqx.field(static=True, default=1e-10, kw_only=True)
+    max_iterations: int = eqx.field(static=True, default=10, kw_only=True)
+    factor_every: int = eqx.field(static=True, default=20, kw_only=True)
+    second_order_start: bool = eqx.field(static=True, default=True, kw_only=True)
+    iterations: int | None = eqx.field(static=True, default=None, kw_only=True)
+    stabilized: bool = eqx.field(static=True, default=False, kw_only=True)
+
+    def __check_init__(self):
+        number = lambda value: isinstance(value, int | float)
+        count = lambda value, least: isinstance(value, int) and value >= least
+        check = partial(require_setting, self)
+        valid = number(self.rho_inf) and 0.0 <= self.rho_inf < 1.0
+        check("rho_inf", valid, "a number in [0, 1)", "; 0.9 damps little, 0 most")
+        valid = number(self.tolerance) and 0.0 < self.tolerance < math.inf
+        check("tolerance", valid, "positive", "; 1e-10 is the default")
+        check("max_iterations", count(self.max_iterations, 1), "an int, at least 1")
+        check("factor_every", count(self.factor_every, 0), "an int, at least 0 (0: full Newton always)")
+        valid = self.iterations is None or count(self.iterations, 1)
+        check("iterations", valid, "an int, at least 1, or None (until they converge)")
+        check("stabilized", isinstance(self.stabilized, bool), "True (index 2) or False (index 3)")
+
+    @property
+    def alpha_m(self) -> float:
+        return (2.0 * self.rho_inf - 1.0) / (self.rho_inf + 1.0)
+
+    @property
+    def alpha_f(self) -> float:
+        return self.rho_inf / (self.rho_inf + 1.0)
+
+    @property
+    def gamma(self) -> float:
+        return 0.5 + self.alpha_f - self.alpha_m
+
+    @property
+    def beta(self) -> float:
+        return (self.gamma + 0.5) ** 2 / 4.0
+
+    @property
+    def delta(self) -> float:
+        return self.alpha_m - self.alpha_f
+
+    @property
+    def inertia_factor(self) -> float:
+        return (1.0 - self.alpha_m) / (1.0 - self.alpha_f)
+
     def for_autodiff(self):
         """Full Newton, which alone converges as fast in its derivative as in its value."""
         return dataclasses.replace(self, factor_every=0)
 
-    def _kind(self, system) -> type[AbstractEquations]:
-        """The equations of a step: those of index 3, or those with rows of velocity level."""
-        return Levels if self.stabilized or system.num_velocity_rows else Index3
+    def as_data(self, dtype):
+        return _as_data(self, jnp.dtype(dtype))
+
+
+class AlphaOfData(AbstractGeneralizedAlpha):
+    """A `GeneralizedAlpha` of which the numbers are data of a program, and not constants in it."""
+
+    alpha_m: Any
+    alpha_f: Any
+    gamma: Any
+    beta: Any
+    delta: Any
+    inertia_factor: Any
+    tolerance: Any
+    max_iterations: Any
+    factor_every: int = eqx.field(static=True)
+    second_order_start: bool = eqx.field(static=True)
+    iterations: int | None = eqx.field(static=True)
+    stabilized: bool = eqx.field(static=True)
+
+
+@functools.lru_cache(maxsize=64)
+def _as_data(scheme: GeneralizedAlpha, dtype) -> AlphaOfData:
+    values = {field.name: getattr(scheme, field.name) for field in dataclasses.fields(AlphaOfData)}
+    number = lambda value: jnp.asarray(value, dtype if isinstance(value, float) else jnp.int32)
+    static = [field.name for field in dataclasses.fields(AlphaOfData) if field.metadata.get("static")]
+    return AlphaOfData(**{name: value if name in static else number(value) for name, value in values.items()})

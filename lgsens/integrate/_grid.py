@@ -36,8 +36,8 @@ class Resizes(Protocol):
 class StepLink(eqx.Module):
     """How a step follows the one before, linearized; stacked, all of them. Between equal steps nothing changes."""
 
-    scheme: Resizes = eqx.field(static=True)
-    ratio: Any = None  # of the sizes, shape (); None, like the others: steps are equal
+    scheme: Resizes | None = eqx.field(static=True, default=None)  # None, like the others: steps are equal
+    ratio: Any = None  # of the sizes, shape ()
     by_ratio: Any = None  # ∂a*/∂r, shape (k,)
     empty: Any = None  # whether the step is, shape ()
 
@@ -71,6 +71,7 @@ class AbstractGrid(eqx.Module):
     t0: eqx.AbstractVar[Float[Array, ""]]
     h: eqx.AbstractVar[Float[Array, "*n"]]
     num_steps: eqx.AbstractVar[int]
+    count: eqx.AbstractVar[Float[Array, ""] | None]  # how many of the steps are taken; None: all
 
     @abc.abstractmethod
     def times(self) -> Float[Array, " n+1"]:
@@ -86,7 +87,7 @@ class AbstractGrid(eqx.Module):
 
     def link(self, scheme: Resizes, place: Any, previous: State) -> StepLink:
         """How the step at a place follows the state before it."""
-        return StepLink(scheme)
+        return StepLink()
 
     def begun(self, scheme: Resizes, place: Any, state: State) -> State:
         """What the step at a place begins with."""
@@ -106,18 +107,50 @@ class AbstractGrid(eqx.Module):
         """The grids of successive parts of `length` steps each, stacked; what they have too many are any steps."""
 
 
+class Steps(eqx.Module):
+    """A number of steps as a number of the program, which has room for some more."""
+
+    count: Float[Array, ""]
+    room: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, num_steps: int, dtype) -> "Steps":
+        """Room for 256, 1024, 4096, and from there on 6144, 8192, 12288, 16384, …: memory is all that it takes."""
+        room = 256
+        while room < num_steps:
+            power = room & (room - 1) == 0
+            room = 4 * room if room < 4096 else room + room // (2 if power else 3)
+        return cls(jnp.asarray(num_steps, dtype), room)
+
+
 class EqualGrid(AbstractGrid):
-    """Steps from t0 + n h to t0 + (n + 1) h."""
+    """Steps from t0 + n h to t0 + (n + 1) h, of which there may be fewer than there is room for.
+
+    With a `count` all arrays have rows for `num_steps` steps; those after the last one repeat its time, and loops over
+    steps end before them.
+    """
 
     t0: Float[Array, ""]
     h: Float[Array, ""]
     num_steps: int = eqx.field(static=True)
+    count: Float[Array, ""] | None = None  # of the steps taken; a float, like all leaves. None: all
+
+    @classmethod
+    def between(cls, t0, t1, num_steps: int | Steps) -> "EqualGrid":
+        """So many steps from t0 to t1."""
+        if isinstance(num_steps, int):
+            return cls(t0, (t1 - t0) / num_steps, num_steps)
+        return cls(t0, (t1 - t0) / num_steps.count, num_steps.room, num_steps.count)
 
     def times(self):
-        return self.t0 + jnp.arange(self.num_steps + 1, dtype=self.h.dtype) * self.h
+        return self.t0 + self._counted(self.num_steps + 1, 0) * self.h
 
     def places(self):
-        return jnp.arange(self.num_steps, dtype=self.h.dtype)
+        return self._counted(self.num_steps, 1)
+
+    def _counted(self, rows: int, less: int):
+        n = jnp.arange(rows, dtype=self.h.dtype)
+        return n if self.count is None else jnp.minimum(n, jax.lax.stop_gradient(self.count) - less)
 
     def node(self, place):
         return Node(self.t0 + place * self.h, self.t0 + (place + 1) * self.h, self.h)
@@ -147,6 +180,7 @@ class UnevenGrid(AbstractGrid):
     h: Float[Array, " n"]
     before: Float[Array, ""]  # the size of the step that led to t0, to which the a there belongs
     num_steps: ClassVar[Any] = property(lambda self: self.h.shape[-1])  # no argument, where the base has a field
+    count: ClassVar[None] = None
 
     @classmethod
     def first(cls, t0, h) -> "UnevenGrid":

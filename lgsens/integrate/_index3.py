@@ -53,7 +53,6 @@ accelerations and multipliers are unknowns here like the others.
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -188,7 +187,7 @@ class Index3LinearizedStep(AbstractLinearizedStep):
 class Index3(AbstractEquations):
     """The equations of index 3."""
 
-    scheme: AbstractAlpha = eqx.field(static=True)
+    scheme: AbstractAlpha
     system: AbstractSystem
     mass: Matrix  # M, (k, k)
     scale: Float[Array, " k"]

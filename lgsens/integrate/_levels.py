@@ -129,7 +129,7 @@ class LevelLinearizedStep(AbstractLinearizedStep):
 class Levels(AbstractEquations):
     """The equations of a step with rows of velocity level."""
 
-    scheme: AbstractAlpha = eqx.field(static=True)
+    scheme: AbstractAlpha
     counts: Counts = eqx.field(static=True)
     system: AbstractSystem
     mass: Float[Array, "k k"]

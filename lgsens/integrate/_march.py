@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from lgsens._xla import scan
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate._grid import AbstractGrid, with_first
 from lgsens.integrate._linearized import Node
+from lgsens.integrate._loops import over_steps
 from lgsens.integrate._scheme import AbstractScheme, Memory, Stats
 
 Output = Callable[[State, Any], Any]  # (state, t) ↦ pytree
@@ -20,7 +20,7 @@ Output = Callable[[State, Any], Any]  # (state, t) ↦ pytree
 class Walk(eqx.Module):
     """A scheme on a system, one step at a time."""
 
-    scheme: AbstractScheme = eqx.field(static=True)
+    scheme: AbstractScheme
     system: AbstractSystem
     shared: Any
 
@@ -93,8 +93,8 @@ def march(
     A step that does not converge ends the simulation: it and the steps after it are NaN, and `Stats` says so.
     """
     walk = Walk.of(scheme, system)
-    later, end, stats = _marched(walk, grid, walk.begin(grid, state0), output)
     first = jax.tree.map(jnp.asarray, output(state0, grid.t0))
+    later, end, stats = _marched(walk, grid, walk.begin(grid, state0), output, first)
     return with_first(first, later), end.state, stats
 
 
@@ -104,12 +104,15 @@ def states_of(scheme: AbstractScheme, system: AbstractSystem, grid: AbstractGrid
     return states, stats
 
 
-def _marched(walk: Walk, grid: AbstractGrid, progress: Progress, output: Output):
+def _marched(walk: Walk, grid: AbstractGrid, progress: Progress, output: Output, first: Any = None):
+    """`first`: what stands in rows beyond the last step: with it sweeps make matrices there that are regular."""
+
     def step(progress, place):
         progress, stats = walk.on(grid, progress, place)
         return progress, (output(progress.state, grid.node(place).t), stats)
 
-    end, (outputs, stats) = scan(step, progress, grid.places())
+    blank = None if grid.count is None else (first, Stats.none(grid.t0))
+    end, (outputs, stats) = over_steps(step, progress, grid.places(), grid.count, blank)
     return outputs, end, stats
 
 

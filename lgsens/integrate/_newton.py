@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._xla import fori_loop, while_loop
 from lgsens.dynamics import State
-from lgsens.integrate._alpha import AbstractStep, Matrix
+from lgsens.integrate._alpha import AbstractStep, Matrix, at_least
 from lgsens.integrate._guess import Guess
 from lgsens.integrate._lanes import in_any_lane, renewed_where
 from lgsens.integrate._scheme import Stats
@@ -63,9 +63,9 @@ def take_step(
     """
     scheme, scale, h = equations.shared.scheme, equations.shared.scale, equations.node.h
     eps = float(jnp.finfo(scale.dtype).eps)
-    tolerance = max(scheme.tolerance, 64 * eps)
+    tolerance = at_least(scheme.tolerance, 64 * eps)
     round_off = max(1.0, len(scale) / 12) * eps
-    target = max(tolerance**2, 0.04 * round_off)
+    target = at_least(tolerance**2, 0.04 * round_off)
     noise = max(_ROUGH, len(scale)) * eps
     weights = guess.weights(h, scheme.delta)
     u, lam = guess.extrapolated(previous, weights)

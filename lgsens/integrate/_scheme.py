@@ -41,6 +41,12 @@ class Stats(NamedTuple):
     converged: Bool[Array, " n"]
     margin: Float[Array, " n"]
 
+    @classmethod
+    def none(cls, like) -> "Stats":
+        """Of no step, with floats like one given."""
+        zero = jnp.zeros_like(like)
+        return cls(jnp.zeros((), jnp.int32), zero, zero, jnp.ones((), bool), jnp.full_like(like, jnp.nan))
+
 
 class Start(NamedTuple):
     """The initial state for a first step of any size h: q exp(h² q̃_2), v + h² v_2, a + h a_1; None: nothing."""
@@ -119,9 +125,13 @@ class AbstractIntegrator(eqx.Module):
         """Raise `ValueError` for a number of steps that these are not."""
         return
 
-    def lay(self, system: AbstractSystem, start: Start, jerk: Float[Array, " k"], t0, t1, num_steps: int) -> Laid:
-        """The grid of a run from t0 to t1: here equal steps."""
-        return Laid(EqualGrid(t0, (t1 - t0) / num_steps, num_steps))
+    def lay(self, system: AbstractSystem, start: Start, jerk: Float[Array, " k"], t0, t1, num_steps) -> Laid:
+        """The grid of a run from t0 to t1: here equal steps. `num_steps`: an int, or `Steps` where steps are equal."""
+        return Laid(EqualGrid.between(t0, t1, num_steps))
+
+    def as_data(self, dtype) -> "AbstractIntegrator":
+        """With its numbers as arrays, so that one program serves all of them; here as it is."""
+        return self
 
     def frozen(self, trajectory: Any) -> "AbstractIntegrator":
         """The steps of a trajectory, where they were chosen for it."""

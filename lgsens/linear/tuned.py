@@ -47,6 +47,7 @@ CHORD_ITERATIONS, CHORD_CONTRACTION = 12, 0.3
 # trajectories stay in a core's cache too. With 2**17, alone as fast, 16 quarter-cars at once took 149 instead of 110 µs
 # per step and gradient.
 BLOCK_NUMBERS, BLOCK_STEPS = 2**14, 64
+COUNTED_BLOCKS = 24  # at least, where the number of steps is not known when the program is compiled
 
 # What value and gradient cost in simulations (`criteria.direct_or_adjoint`): the top with four parameters and five
 # criteria, by benchmarks/methods.py; the four-bar differs by less than the noise.
@@ -65,5 +66,6 @@ LANE_CACHE = 2 * 2**20  # bytes
 LANES, LANES_ELSEWHERE = 256, 8192
 FREE_SHARE = 0.5  # of the memory that is free, what a batch may take
 
-# Programs that `accuracy` keeps at a time: Linux gives a process 65,530 memory maps, a large scene takes thousands.
-PROGRAMS_TOGETHER = 8
+# What `accuracy` times in turns, and how many memory maps its programs may take: Linux gives a process 65,530, and a
+# large scene takes thousands.
+SETTINGS_TOGETHER, MAPS = 8, 40_000

@@ -82,8 +82,16 @@ def matvec(scheme: AbstractScheme, states: State, parameters: Parameters, delta:
         link = grid.link(scheme, place, before)
         return link.unless_empty(found, jax.tree.map(jnp.subtract, current, previous))
 
+    def taken(rows: Variation) -> Variation:
+        """The rows of steps; those beyond the last one say δ = b."""
+        if grid.count is None:
+            return rows
+        beyond = jnp.arange(grid.num_steps, dtype=grid.count.dtype) >= grid.count
+        where = lambda row, own: jnp.where(jnp.expand_dims(beyond, range(1, row.ndim)), own, row)
+        return jax.tree.map(where, rows, later(delta))
+
     every = (grid.places(), place_tangents(grid, d.grid), earlier(states), later(states), earlier(delta), later(delta))
-    return with_first(jax.tree.map(lambda leaf: leaf[0], delta), jax.vmap(row)(*every)), d
+    return with_first(jax.tree.map(lambda leaf: leaf[0], delta), taken(jax.vmap(row)(*every))), d
 
 
 # Conversion between Lie-algebra coordinates and the arrays of q: the only place where it happens.

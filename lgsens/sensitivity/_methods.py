@@ -197,10 +197,10 @@ def _linear_scheme(scheme: AbstractScheme) -> GeneralizedAlpha:
 
 
 # The custom rules see statistics as floats: an integer output of a `custom_vjp` reaches operations that have no
-# derivative (`jnp.all`) with a tangent, and JAX refuses.
+# derivative (`jnp.all`) with a tangent, and JAX refuses. Numbers of the scheme have no derivative where they are data.
 
 
-@partial(jax.jit, static_argnums=0, inline=True)  # traced once for the trajectory and its rule
+@partial(jax.jit, inline=True)  # traced once for the trajectory and its rule
 def _marched(scheme, state0, parameters):
     return states_of(scheme, parameters.system, parameters.grid, state0)
 
@@ -245,16 +245,16 @@ def _raveled(tree):
 # and for second derivatives differentiates `matvec`, that is L itself, never the sweeps.
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
+@jax.custom_jvp
 def _direct_trajectory(scheme, state0, parameters, found):
     return _run(scheme, state0, parameters, found)
 
 
 @_direct_trajectory.defjvp
-def _direct_rule(scheme, primals, tangents):
-    state0, parameters, _ = primals
-    d_state0, d_parameters, _ = tangents
-    states, stats = _direct_trajectory(scheme, *primals)
+def _direct_rule(primals, tangents):
+    scheme, state0, parameters, _ = primals
+    _, d_state0, d_parameters, _ = tangents
+    states, stats = _direct_trajectory(*primals)
     group = parameters.system.group
     # `custom_linear_solve` is transposed only where no part of b is a constant, and the tangent of a parameter that is
     # not differentiated is one: a zero. Cut from one vector, all depend on all.
@@ -303,24 +303,24 @@ def _continuous_rule(scheme, primals, tangents):
 # Adjoint variable method.
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
+@jax.custom_vjp
 def _adjoint_trajectory(scheme, state0, parameters, found):
     return _run(scheme, state0, parameters, found)
 
 
 def _adjoint_forward(scheme, state0, parameters, found):
     states, stats = _run(scheme, state0, parameters, found)
-    return (states, stats), (states, parameters)
+    return (states, stats), (scheme, states, parameters)
 
 
-def _adjoint_backward(scheme, kept, cotangents):
-    states, parameters = kept
+def _adjoint_backward(kept, cotangents):
+    scheme, states, parameters = kept
     group = parameters.system.group
     c = jax.vmap(partial(cotangent_to_algebra, group))(states, cotangents[0])
     mu, bar = adjoint_sweep(scheme, states, parameters, c, jax.tree.map(jnp.zeros_like, parameters))
     state0 = jax.tree.map(lambda leaf: leaf[0], states)
     first = jax.tree.map(lambda leaf: leaf[0], mu)
-    return cotangent_to_ambient(group, state0, first), bar, None
+    return None, cotangent_to_ambient(group, state0, first), bar, None
 
 
 _adjoint_trajectory.defvjp(_adjoint_forward, _adjoint_backward)

@@ -15,9 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._xla import scan
 from lgsens.dynamics import State, unsteady_rate
-from lgsens.integrate import AbstractScheme, Stats, Variation, Walk
+from lgsens.integrate import AbstractScheme, Stats, Variation, Walk, over_steps
 from lgsens.sensitivity._criterion_terms import Functional
 from lgsens.sensitivity._linearization import (
     Parameters,
@@ -92,7 +91,8 @@ def direct_on_the_fly(
     start = (walk.begin(grid, state0, exact=True), delta0, first, jax.tree.map(jnp.zeros_like, first))
     # places are numbered along the first axis, parameters along the second
     d_places = jax.vmap(lambda d: place_tangents(grid, d), out_axes=1)(d.grid)
-    (end, delta, _, integral), (stats, rates) = scan(step, start, (grid.places(), d_places))
+    blank = Stats.none(grid.t0), jnp.zeros_like(grid.t0)
+    (end, delta, _, integral), (stats, rates) = over_steps(step, start, (grid.places(), d_places), grid.count, blank)
     final = with_derivative(functional.final, end.state, grid.times()[-1], delta)
     value, derivative = jax.tree.map(jnp.add, integral, final)
     return OnTheFly(value, derivative.T, stats, rates, begun)

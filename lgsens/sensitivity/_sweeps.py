@@ -22,27 +22,46 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from lgsens._xla import scan
 from lgsens.dynamics import State
-from lgsens.integrate import AbstractScheme, Variation, earlier, later, with_first
+from lgsens.integrate import AbstractScheme, Variation, earlier, later, over_steps, with_first
 from lgsens.linear import tuned
 from lgsens.sensitivity._linearization import Parameters, Step, node_tangent, place_tangents, steps
 
 
 class StepBlocks(NamedTuple):
-    """How `num_steps` steps are divided: `length` in a block, `padding` in the last one."""
+    """How `num_steps` steps are divided: `length` in a block, `padding` in the last one; blocks up to the `count`th
+    step are taken, None: all."""
 
     length: int
     padding: int
+    count: Any = None
 
     @classmethod
-    def of(cls, num_steps: int, numbers: int) -> "StepBlocks":
-        """Blocks for factors of `numbers` numbers; without padding where a divisor is near."""
-        longest = max(1, min(num_steps, tuned.BLOCK_STEPS, tuned.BLOCK_NUMBERS // numbers))
+    def of(cls, num_steps: int, numbers: int, count: Any = None) -> "StepBlocks":
+        """Blocks for factors of `numbers` numbers; without padding where a divisor is near.
+
+        Where steps are counted the last block is cut anywhere: shorter ones waste less in it.
+        """
+        most = num_steps if count is None else num_steps // tuned.COUNTED_BLOCKS
+        longest = max(1, min(most, tuned.BLOCK_STEPS, tuned.BLOCK_NUMBERS // numbers))
         divisors = [n for n in range((longest + 1) // 2, longest + 1) if num_steps % n == 0]
         length = divisors[-1] if divisors else longest
-        return cls(length, -num_steps % length)
+        return cls(length, -num_steps % length, count)
+
+    @property
+    def blocks(self) -> Any:
+        """How many are taken; None: all."""
+        return None if self.count is None else jnp.ceil(self.count / self.length)
+
+    def last(self, rows: Any) -> Any:
+        """The row at the end of the last block."""
+        if self.count is None:
+            return jax.tree.map(lambda leaf: leaf[-1], rows)
+        end = self.blocks.astype(jnp.int32) * self.length
+        return jax.tree.map(lambda leaf: lax.dynamic_index_in_dim(leaf, end, keepdims=False), rows)
 
     def padded(self, tree: Any, *, repeat: bool) -> Any:
         """What fills the last block along the leading axis: the last entry again, or zeros."""
@@ -56,13 +75,13 @@ class StepBlocks(NamedTuple):
         return jax.tree.map(longer, tree)
 
     def scan(self, sweep: Callable, carry: Any, inputs: Any, *, reverse: bool = False):
-        """`lax.scan` of `sweep(carry, block)` over blocks, where `block` and its outputs have a leading axis of steps.
+        """`over_steps` of `sweep(carry, block)`, where `block` and its outputs have a leading axis of steps.
 
         The leading axis of `inputs` is a multiple of the length of a block; the outputs are those of the steps alone.
         """
         # No −1 among the sizes: without constraints there are arrays of size 0.
         split = lambda leaf: leaf.reshape(leaf.shape[0] // self.length, self.length, *leaf.shape[1:])
-        carry, outputs = scan(sweep, carry, jax.tree.map(split, inputs), reverse=reverse)
+        carry, outputs = over_steps(sweep, carry, jax.tree.map(split, inputs), self.blocks, reverse=reverse)
 
         def joined(leaf):
             size = leaf.shape[0] * self.length
@@ -77,7 +96,7 @@ def direct_sweep(scheme: AbstractScheme, states: State, parameters: Parameters, 
     The steps after the last, which fill its block, are computed and dropped.
     """
     system, grid = parameters
-    shared, blocks = scheme.shared(system), StepBlocks.of(grid.num_steps, scheme.numbers(system))
+    shared, blocks = scheme.shared(system), StepBlocks.of(grid.num_steps, scheme.numbers(system), grid.count)
 
     def prepare(step: Step, d_place):
         node = grid.node(step.place)
@@ -106,7 +125,7 @@ def direct_sweep(scheme: AbstractScheme, states: State, parameters: Parameters, 
 def adjoint_sweep(scheme: AbstractScheme, states: State, parameters: Parameters, c: Variation, c_p: Parameters):
     """Solve Lᵀ (μ, p̄) = (c, c_p) backwards in time; returns μ stacked (row 0: the cotangent of δ_0), and p̄."""
     system, grid = parameters
-    shared, blocks = scheme.shared(system), StepBlocks.of(grid.num_steps, scheme.numbers(system))
+    shared, blocks = scheme.shared(system), StepBlocks.of(grid.num_steps, scheme.numbers(system), grid.count)
 
     def prepare(step: Step):
         return scheme.linearized(system, shared, grid.node(step.place), step.begun, step.state)
@@ -140,8 +159,7 @@ def adjoint_sweep(scheme: AbstractScheme, states: State, parameters: Parameters,
 
     # The steps that fill the last block come first, with zero cotangents, and leave them zero.
     c = blocks.padded(c, repeat=False)
-    last = jax.tree.map(lambda leaf: leaf[-1], c)
     inputs = (blocks.padded(steps(scheme, states, grid), repeat=True), earlier(c))
-    (first, bar), (rest, of_places) = blocks.scan(block, (last, c_p), inputs, reverse=True)
+    (first, bar), (rest, of_places) = blocks.scan(block, (blocks.last(c), c_p), inputs, reverse=True)
     (of_grid,) = jax.vjp(lambda grid: grid.places(), grid)[1](of_places)
     return with_first(first, rest), Parameters(bar.system, jax.tree.map(jnp.add, bar.grid, of_grid))

@@ -16,6 +16,9 @@ from lgsens.simulation._richardson import (
 )
 from lgsens.simulation._simulate import (
     check_integrator as check_integrator,
+    check_sensitivity as check_sensitivity,
+    cut as cut,
+    for_any_number as for_any_number,
     interval as interval,
     outcome as outcome,
     run as run,

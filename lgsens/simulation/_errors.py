@@ -136,7 +136,7 @@ def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tupl
     if not isinstance(result, Tracer):
         # Details may be traced (by grad) where the result is not; their values are all that is needed.
         if int(result) != RESULTS.successful:
-            values = jax.tree.map(lambda value: np.asarray(_value(value)), details)
+            values = jax.tree.map(lambda value: np.asarray(primal_value(value)), details)
             raise _exception(int(result), values, names, note)
         return tree
 
@@ -209,7 +209,7 @@ def _of_steps(code: int, t, stats: Any) -> dict[str, Any]:
     return known | {"run": run, "step": i + 1, "num_steps": len(times) - 1, "begin": times[i], "time": times[i + 1]}
 
 
-def _value(array: Any) -> Any:
+def primal_value(array: Any) -> Any:
     while isinstance(array, Tracer) and hasattr(array, "primal"):
         array = array.primal
     return array

@@ -3,11 +3,14 @@
 import dataclasses
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any, overload
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
+from jax.core import Tracer
 
 from lgsens._validate import as_count, as_float, require
 from lgsens._xla import alike, tracing
@@ -19,11 +22,18 @@ from lgsens.integrate import (
     IndexReducedODE,
     Laid,
     Stats,
+    Steps,
     singular_steps,
 )
 from lgsens.model import Model
-from lgsens.sensitivity import AbstractSensitivity, DirectDifferentiation, Parameters, saved_run
-from lgsens.simulation._errors import throw_if_failed
+from lgsens.sensitivity import (
+    AbstractSensitivity,
+    AdjointVariable,
+    DirectDifferentiation,
+    Parameters,
+    saved_run,
+)
+from lgsens.simulation._errors import primal_value, throw_if_failed
 from lgsens.simulation._index_reduced_ode import integrate_ode
 from lgsens.simulation._richardson import extrapolate_runs
 from lgsens.simulation._start import Begin, as_system, begin
@@ -115,11 +125,7 @@ def simulate(
     by_diffrax = _by_diffrax(integrator)
     if not by_diffrax:
         check_integrator(integrator, num_steps)
-    if not isinstance(sensitivity, AbstractSensitivity):
-        raise ValueError(
-            "`sensitivity` must be DirectDifferentiation(), AdjointVariable(), ContinuousDirect() or Autodiff(), got "
-            f"{sensitivity!r}; ContinuousAdjoint() needs a Criterion, see `differentiate`."
-        )
+    check_sensitivity(sensitivity)
     if by_diffrax and (sensitivity != DirectDifferentiation() or save is not None):
         raise ValueError(
             f"`sensitivity` = {sensitivity!r} and `save` need steps of the scheme. With `rtol` diffrax takes its own, "
@@ -135,7 +141,9 @@ def simulate(
     t0, t1 = interval(t0, t1)
     with tracing():
         system, t0, t1, state0 = alike((system, t0, t1, state0))
-        found, details = _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, save)
+        given = for_any_number(num_steps, integrator, sensitivity, save, (system, t0, t1 - t0, state0))
+        found, details = _simulate_jit(system, t0, t1, *given, sensitivity, state0, save)
+        found = cut(found, num_steps) if isinstance(given[0], Steps) else found
     if throw:
         fields = ("states", "error", "stages") if save is None else ("values", "final")  # the others say what happened
         motion = {name: getattr(found, name) for name in fields}
@@ -154,6 +162,15 @@ def check_integrator(integrator: Any, num_steps: int) -> None:
     integrator.check(num_steps)
 
 
+def check_sensitivity(sensitivity: Any) -> None:
+    """Raise `ValueError` for what is no method to differentiate a trajectory."""
+    if not isinstance(sensitivity, AbstractSensitivity):
+        raise ValueError(
+            "`sensitivity` must be DirectDifferentiation(), AdjointVariable(), ContinuousDirect() or Autodiff(), got "
+            f"{sensitivity!r}; ContinuousAdjoint() needs a Criterion, see `differentiate`."
+        )
+
+
 def _by_diffrax(integrator: Any) -> bool:
     return isinstance(integrator, IndexReducedODE) and integrator.rtol is not None
 
@@ -163,6 +180,40 @@ def interval(t0, t1):
     t0, t1 = as_float(t0, (), "`t0`"), as_float(t1, (), "`t1`")
     require(lambda t0, t1: t1 > t0, f"`t1` must be later than `t0`, got t0 = {t0} s and t1 = {t1} s.", t0, t1)
     return t0, t1
+
+
+def for_any_number(
+    num_steps: int, integrator: AbstractIntegrator, sensitivity: AbstractSensitivity, save: Save | None, arrays: Any
+) -> tuple[int | Steps, AbstractIntegrator]:
+    """Steps and integrator with their numbers as data, where a program of its own serves them: outside of `jit`, where
+    all `arrays` have values (and derivatives at most); else as they are."""
+    equal = type(integrator).lay is AbstractIntegrator.lay
+    if not equal or integrator.extrapolated or _by_diffrax(integrator):
+        return num_steps, integrator
+    leaves = jax.tree.leaves(arrays)
+    traced = any(isinstance(primal_value(leaf), Tracer) for leaf in leaves)
+    if traced or save is not None or sensitivity not in (DirectDifferentiation(), AdjointVariable()):
+        return num_steps, integrator
+    return Steps.of(num_steps, leaves[0].dtype), integrator.as_data(leaves[0].dtype)
+
+
+def cut(found: Trajectory, num_steps: int) -> Trajectory:
+    """A trajectory without the rows for which there was room."""
+    motion, t, stats = _cut((found.states, found.stages), found.t, found.stats, num_steps)
+    return dataclasses.replace(found, states=motion[0], stages=motion[1], t=t, stats=stats)
+
+
+@partial(jax.jit, static_argnums=3)
+def _cut(motion: tuple[State, Any], t, stats: Any, num_steps: int) -> tuple[tuple[State, Any], Any, Any]:
+    """The states pass through an equation of their own, x = states: so whatever a criterion looks at, all of them have
+    cotangents, and one program pulls these back.
+    """
+    states, stages = motion
+    every = lax.custom_linear_solve(lambda x: x, states, lambda _, b: b, lambda _, b: b)
+    room = t.shape[0] - 1
+    rows = lambda tree, n: jax.tree.map(lambda leaf: leaf[:n], tree)
+    of_steps = lambda tree: jax.tree.map(lambda leaf: leaf[: num_steps * (leaf.shape[0] // room)], tree)
+    return (rows(every, num_steps + 1), of_steps(stages)), t[: num_steps + 1], of_steps(stats)
 
 
 @eqx.filter_jit
@@ -192,7 +243,7 @@ def outcome(scheme: AbstractScheme, begun: Begin, stats: Stats, turns, t, laid: 
         "violation": begun.violation,
         "jacobian": begun.jacobian,
         "step": failed + 1,
-        "num_steps": jnp.asarray(stats.converged.shape[0]),
+        "num_steps": jnp.asarray(stats.converged.shape[0] if laid.grid.count is None else laid.grid.count),
         "time": time,
         "begin": t[failed],
         "iterations": stats.iterations[failed],
@@ -209,14 +260,14 @@ def run(
     begun: Begin,
     t0,
     t1,
-    num_steps: int,
+    num_steps: int | Steps,
     integrator: AbstractIntegrator,
     sensitivity: AbstractSensitivity,
     save: Save | None = None,
 ) -> tuple[Any, dict[str, Any]]:
     """`simulate` without its checks: the trajectory or what is saved of it, and what the message of a failure needs."""
     one = lambda num_steps: _single_run(system, begun, t0, t1, num_steps, integrator, sensitivity, save)
-    if not integrator.extrapolated:
+    if not integrator.extrapolated or isinstance(num_steps, Steps):
         return one(num_steps)
     (coarse, of_coarse), (fine, of_fine) = (one(n) for n in (num_steps, 2 * num_steps))
     failed = coarse.result != RESULTS.successful
@@ -224,7 +275,9 @@ def run(
     return extrapolate_runs(system, coarse, fine), details | {"run": jnp.where(failed, 1, 2)}
 
 
-def _single_run(system, begun: Begin, t0, t1, num_steps: int, integrator: AbstractIntegrator, sensitivity, save):
+def _single_run(
+    system, begun: Begin, t0, t1, num_steps: int | Steps, integrator: AbstractIntegrator, sensitivity, save
+):
     scheme: Any = integrator.scheme
     laid = integrator.lay(system, begun.start, begun.jerk, t0, t1, num_steps)
     grid: Any = laid.grid

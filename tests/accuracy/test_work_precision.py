@@ -63,6 +63,19 @@ def test_errors_are_those_of_the_closed_form(table):
     assert explicit.error < 1e-4 * fine.error
 
 
+def test_settings_that_differ_in_numbers_share_their_programs(table, compiled):
+    """Other steps, tolerances and damping, extrapolated or not: what the table has compiled serves them."""
+    loose = lg.GeneralizedAlpha(0.7, tolerance=1e-6)
+    settings = *grid((25, 50), loose), Setting(15, extrapolate=3), Setting(12, DOPRI8)
+    measure = lambda: (
+        work_precision(CRITERION, build, P, settings, t1=T1, reference=table.reference, progress=False).rows
+    )
+    names, rows = compiled(measure)
+    assert all(not row.failure and row.error < 0.1 for row in rows)
+    assert not {"_scene", "_motion", "_pulled_to_scene", "_pulled_to_p"} & set(names)
+    assert names.count("_values") == 6  # for each number of steps: 25, 50, 15, 30, 60, 12
+
+
 def test_what_else_a_row_says(table):
     coarse, fine, explicit, impatient, forbidden = table.rows
     for row in (coarse, fine, explicit):

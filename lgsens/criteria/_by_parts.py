@@ -1,0 +1,138 @@
+"""Criteria of a trajectory and their derivatives in reverse mode, by programs that serve others as well.
+
+    scene p ↦ (system, y_0),     motion (system, y_0) ↦ y,     criteria (y, system, p) ↦ Ψ,
+
+and the pull-back of each of them. Another criterion, another number of steps or other numbers of the scheme compile
+what depends on them and no more, another scene with elements of the same kinds its own program only. Inside of `jit`
+they are parts of the user's program.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from lgsens.criteria._criterion_use import Use
+from lgsens.dynamics import RESULTS, AbstractSystem, State, is_redundant, softness
+from lgsens.integrate import AbstractIntegrator, Steps
+from lgsens.sensitivity import AbstractSensitivity
+from lgsens.simulation import Trajectory, as_system, begin, cut, for_any_number, run
+
+
+class Parts(NamedTuple):
+    """Values and gradients, a tuple with one for each criterion, and how the simulation went."""
+
+    value: tuple[Any, ...]
+    gradient: tuple[Any, ...]
+    result: Any
+    details: dict[str, Any]
+    labels: tuple[str, ...]
+    note: str
+
+
+class Task(NamedTuple):
+    """Criteria, functions of (trajectory, p), and what they are criteria of; `start`: p ↦ state0, or None."""
+
+    criteria: tuple[Callable, ...]
+    build: Callable[[Any], Any]
+    start: Callable[[Any], State] | None
+    integrator: AbstractIntegrator
+    num_steps: int
+    t0: Any
+    t1: Any
+
+
+def reverse_by_parts(
+    task: Any, p, method: AbstractSensitivity, names: tuple[str, ...] = (), call: Callable = lambda f, *a: f(*a)
+) -> tuple[Parts, Trajectory]:
+    """Ψ and dΨ/dp of each criterion of a task in reverse mode, and the motion.
+
+    `task`: a `Task`, or what has its fields; `names`: of criteria that are asked what they use; `call`: makes the
+    calls, and sees the programs.
+    """
+    t0, t1 = task.t0, task.t1
+    (system, state0), of_p = call(_scene, task.build, task.start, p)
+    given = for_any_number(task.num_steps, task.integrator, method, None, (system, state0, t0, t1 - t0))
+    (found, details), of_scene = call(_motion, system, state0, t0, t1, *given, method)
+    count = task.num_steps if isinstance(given[0], Steps) else None
+    value, rows, of_found = call(_values, task.criteria, names, found, details["jacobian"], p, count)
+    found, result, note = of_found
+    gradient = call(_pulled_to_p, of_p, call(_pulled_to_scene, of_scene, rows), rows)
+    return Parts(value, gradient, result, details, system.constraint_names, note), found
+
+
+@eqx.filter_jit
+def _scene(build, start, p):
+    def of(p):
+        return as_system(build(p)), None if start is None else start(p)
+
+    return jax.vjp(of, p)
+
+
+@eqx.filter_jit
+def _motion(system, state0, t0, t1, num_steps, integrator, method):
+    def of(system, state0):
+        begun = begin(integrator.scheme, system, t0, state0)
+        found, details = run(system, begun, t0, t1, num_steps, integrator, method)
+        return (found.states, found.stages, found.error), (found, details)
+
+    _, pull_back, found = jax.vjp(of, system, state0, has_aux=True)
+    return found, pull_back
+
+
+class _Rows(NamedTuple):
+    """dΨ by what criteria depend on, one row for each criterion."""
+
+    motion: tuple[State, Any, Any]
+    system: Any
+    p: Any
+
+
+@eqx.filter_jit
+def _values(criteria, names, found: Trajectory, jacobian, p, count: int | None):
+    def of(motion, system, p):
+        states, stages, error = motion
+        trajectory = dataclasses.replace(found, states=states, stages=stages, error=error, system=system)
+        trajectory = trajectory if count is None else cut(trajectory, count)
+        values = jnp.stack([criterion(trajectory, p) for criterion in criteria])
+        return values, (values, trajectory)
+
+    at = (found.states, found.stages, found.error), found.system, p
+    rows, (values, trajectory) = jax.jacrev(of, argnums=(0, 1, 2), has_aux=True)(*at)
+    uses = [Use.of(criterion, found.system, found.t[0], p) for criterion in criteria if names]
+    result, note = unique(found.result, found.system, jacobian, names, uses)
+    return tuple(values), _Rows(*rows), (trajectory, result, note)
+
+
+def _each(pull_back: Callable, rows: Any) -> Any:
+    """The pull-back of each row; of one alone in a program without a batch."""
+    if jax.tree.leaves(rows)[0].shape[0] > 1:
+        return jax.vmap(pull_back)(rows)
+    return jax.tree.map(lambda leaf: leaf[None], pull_back(jax.tree.map(lambda leaf: leaf[0], rows)))
+
+
+@eqx.filter_jit
+def _pulled_to_scene(pull_back, rows: _Rows):
+    of_system, of_state0 = _each(pull_back, rows.motion)
+    return jax.tree.map(jnp.add, of_system, rows.system), of_state0
+
+
+@eqx.filter_jit
+def _pulled_to_p(pull_back, of_scene, rows: _Rows):
+    (of_p,) = _each(pull_back, of_scene)
+    total = jax.tree.map(jnp.add, of_p, rows.p)
+    return tuple(jax.tree.map(lambda leaf, i=i: leaf[i], total) for i in range(jax.tree.leaves(total)[0].shape[0]))
+
+
+def unique(result, system: AbstractSystem, jacobian, names: tuple[str, ...], uses: list[Use]):
+    """The result, a failure where criteria use multipliers that are not unique, and the note that says so."""
+    of_multipliers = [name for name, use in zip(names, uses) if use.integrand.multipliers or use.terminal.multipliers]
+    if not of_multipliers:
+        return result, ""
+    # a given state0 has not been asked
+    redundant = softness(system) is None and is_redundant(system, jacobian)
+    result = jnp.where(redundant, RESULTS.redundant_constraints, result).astype(jnp.int32)
+    return result, f"{' and '.join(of_multipliers)}: multipliers are used."

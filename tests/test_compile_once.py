@@ -1,0 +1,100 @@
+"""One program for a scene: what changes between two calls outside of `jit` is data of it, or in a small program.
+
+Programs are counted, in JAX's own log, and the numbers of those with room for more steps compared with those of
+programs made for one number of steps, inside of `jit`.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import says
+
+import lgsens as lg
+from lgsens.examples import spinning_top
+from lgsens.integrate import Steps
+
+P = jnp.array([0.7, 1.0])  # angle, length
+HIGH = lg.Criterion(integrand=lambda s, p: s.body("top").position[2] ** 2 * p[1])
+PUSHED = lg.Criterion(integrand=lambda s, p: s.multiplier("pivot")[0] ** 2, terminal=lambda s, p: s.t)
+FAST = lg.Criterion(terminal=lambda s, p: s.body("top").velocity[0])
+FIRST = {"t1": 0.1, "num_steps": 12}
+OTHERS = {
+    "criterion": (PUSHED, {}, {}),
+    "another": (FAST, {}, {}),
+    "steps": (HIGH, {"num_steps": 30}, {}),
+    "end": (HIGH, {"t1": 0.07}, {}),
+    "tolerance": (HIGH, {}, {"tolerance": 1e-7}),
+    "damping": (HIGH, {}, {"rho_inf": 0.6}),
+    "iterations": (HIGH, {}, {"max_iterations": 7}),
+}
+# Forward and transposed sweeps of 30 steps: round-off of λ, 150 N/h², in another order
+RTOL = 1e-9
+
+
+def build(p):
+    return spinning_top(p[0], length=p[1])
+
+
+def psi(p, criterion=HIGH, times=FIRST, numbers=None, **settings):
+    run = lg.simulate(build(p), **(FIRST | times), integrator=lg.GeneralizedAlpha(**(numbers or {})), **settings)
+    return criterion(run, p)
+
+
+def test_eager_gradients_share_their_programs(compiled):
+    """Forward and pull-back are compiled once, whatever a criterion looks at, and cut to the steps that there are."""
+    jax.clear_caches()
+    names, (value, gradient) = compiled(jax.value_and_grad(psi), P)
+    assert names.count("_simulate_jit") == 2
+    expected = jax.jit(jax.value_and_grad(psi))(P)
+    np.testing.assert_allclose(value, expected[0], rtol=RTOL)
+    np.testing.assert_allclose(gradient, expected[1], rtol=RTOL)
+    for name in ("criterion", "steps", "tolerance"):
+        criterion, times, numbers = OTHERS[name]
+        names, (value, gradient) = compiled(jax.value_and_grad(psi), P, criterion, times, numbers)
+        assert "_simulate_jit" not in names, name
+        assert np.isfinite(value) and np.all(np.isfinite(gradient))
+    run = lg.simulate(build(P), t1=0.1, num_steps=30)
+    assert run.t.shape == (31,) and run.states.v.shape[0] == 31 and run.stats.converged.shape == (30,)
+    np.testing.assert_allclose(run.t, np.linspace(0.0, 0.1, 31), rtol=0, atol=1e-16)
+
+
+def test_the_same_derivative_by_parts(compiled):
+    """`differentiate`, whose programs know the numbers of the call as data, against `jit`, where they are constants."""
+
+    def differentiate(criterion, times, numbers):
+        integrator = lg.GeneralizedAlpha(**numbers)
+        settings = FIRST | times | {"integrator": integrator, "method": lg.AdjointVariable()}
+        return lg.differentiate(criterion, build, P, **settings)[:2]
+
+    differentiate(HIGH, {}, {})
+    for name, changed in OTHERS.items():
+        names, _ = compiled(differentiate, *changed)
+        assert set(names) <= ({"_values"} if name in ("criterion", "another", "steps") else set()), name
+    changed = PUSHED, {"num_steps": 30, "t1": 0.07}, {"rho_inf": 0.6, "tolerance": 1e-9}
+    expected = jax.jit(jax.value_and_grad(lambda p: psi(p, *changed)))(P)
+    for found, exact in zip(differentiate(*changed), expected):
+        np.testing.assert_allclose(found, exact, rtol=RTOL)
+
+
+@pytest.mark.slow  # two programs of second derivatives
+def test_second_derivatives_with_room_for_more_steps():
+    """Rows beyond the last step are no equations of L."""
+    for transformed in (jax.jacfwd, jax.hessian):
+        exact = jax.jit(transformed(psi))(P)
+        np.testing.assert_allclose(transformed(psi)(P), exact, rtol=0, atol=1e-8 * float(jnp.abs(exact).max()))
+
+
+@pytest.mark.parametrize(("num_steps", "room"), [(1, 256), (256, 256), (257, 1024), (4097, 6144), (6145, 8192)])
+def test_room(num_steps, room):
+    steps = Steps.of(num_steps, jnp.float64)
+    assert (float(steps.count), steps.room) == (num_steps, room)
+
+
+def test_a_failure_is_told_as_without_room():
+    """A step that is much too long, the third of five."""
+    with pytest.raises(lg.SimulationError, match=says("step 3 of 5, t = 0.6 s")):
+        lg.simulate(build(P), t1=1.0, num_steps=5)
+    run = lg.simulate(build(P), t1=1.0, num_steps=5, throw=False)
+    assert np.all(np.isfinite(run.states.v[:3])) and np.all(np.isnan(run.states.v[3:]))
+    assert np.asarray(run.stats.converged).tolist() == [True, True, False, False, False]
