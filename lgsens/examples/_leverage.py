@@ -81,7 +81,7 @@ def motion_ratios(
             raise ValueError(
                 f"{name}, key {key!r}: its motion ratio at the design position, compression per wheel travel, is "
                 f"{ratio:.3g}; no car has one outside of {RATIOS[0]:g} to {RATIOS[1]:g}"
-                + (", and it would have to pull to hold one" if ratio < 0 else "")
+                + (", and it would have to pull to bear it" if ratio < 0 else "")
                 + f". Does it change its length as the wheel moves? Check its two points, that it acts on {a!r} and "
                 f"{b!r}, and their hinges and arms."
             )

@@ -64,7 +64,8 @@ class Connection(eqx.Module):
             return UniversalJoint(*self.between, at=self.at, axis_a=self.arms[0], axis_b=self.arms[1])
         if self.kind in AT_A_POINT:
             return AT_A_POINT[self.kind](*self.between, at=self.at)
-        return ALONG_A_LINE[self.kind](*self.between, at=self.at[0], axis=self.at[1] - self.at[0])
+        middle = (self.at[0] + self.at[1]) / 2  # between the bushes of a wishbone, also in pictures
+        return ALONG_A_LINE[self.kind](*self.between, at=middle, axis=self.at[1] - self.at[0])
 
     def blocked(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """A point, and the directions in which it lets b neither turn nor move in a there: in NumPy, for checks."""
