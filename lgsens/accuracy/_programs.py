@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jax.tree_util import Partial
 
 from lgsens._validate import as_float
 from lgsens._xla import tracing
@@ -17,7 +16,7 @@ from lgsens.criteria import Criterion, Task, reverse_by_parts
 from lgsens.dynamics import RESULTS
 from lgsens.linear import tuned
 from lgsens.sensitivity import DirectDifferentiation
-from lgsens.simulation import Trajectory, check_integrator, check_sensitivity, richardson
+from lgsens.simulation import Trajectory, check_integrator, check_sensitivity, cut, richardson
 
 
 class Study(NamedTuple):
@@ -90,12 +89,23 @@ def _called(function: Callable, *arguments):
     return function(*arguments)
 
 
-def _constant(value, p):
-    return value
+class _Given(NamedTuple):
+    """A builder with some of its arguments; equal, for one compilation, where all of these are."""
+
+    build: Build
+    options: tuple[tuple[str, Any], ...]
+
+    def __call__(self, p):
+        return self.build(p, **dict(self.options))
 
 
-def _of_trajectory(fn: Callable, trajectory: Trajectory, p):
-    return fn(trajectory)
+class _OfTrajectory(NamedTuple):
+    """A function of a trajectory as one of parameters, too."""
+
+    function: Callable
+
+    def __call__(self, trajectory: Trajectory, p):
+        return self.function(trajectory)
 
 
 class Program:
@@ -108,9 +118,9 @@ class Program:
         if options.keys() - {"throw"}:
             raise ValueError(f"Setting: `options` may be `sensitivity` and `state0`, got {sorted(options)}.")
         check_sensitivity(self._method)
-        self._start = None if state0 is None else Partial(_constant, state0)
-        self._build = Partial(study.build, **dict(setting.model))
-        self._fn = study.fn if isinstance(study.fn, Criterion) else Partial(_of_trajectory, study.fn)
+        self._start = None if state0 is None else lambda p: state0
+        self._build = _Given(study.build, setting.model)
+        self._fn = study.fn if isinstance(study.fn, Criterion) else _OfTrajectory(study.fn)
         self.temporary_bytes = None
         seconds = []
         for call in (self._watched, _called):
@@ -122,7 +132,8 @@ class Program:
     def _watched(self, function, *arguments):
         """A call, after which the memory of the program is known."""
         found = function(*arguments)
-        memory = function.lower(*arguments).compile().compiled.memory_analysis()  # made already
+        program = function.lower(*arguments).compile()  # made already
+        memory = getattr(program, "compiled", program).memory_analysis()
         if memory is not None:
             self.temporary_bytes = max(self.temporary_bytes or 0, int(memory.temp_size_in_bytes))
         return found
@@ -136,7 +147,7 @@ class Program:
             task = Task((self._fn,), self._build, self._start, integrator, num_steps, study.t0, study.t1)
             with tracing():
                 parts, motion = reverse_by_parts(task, study.p, self._method, call=call)
-            motions.append(motion)
+            motions.append(motion if motion.states.v.shape[0] == num_steps + 1 else cut(motion, num_steps))
             return parts.value[0], parts.gradient[0]
 
         runs, num_steps = self.setting.runs, self.setting.num_steps

@@ -9,6 +9,7 @@ they are parts of the user's program.
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -48,7 +49,7 @@ class Task(NamedTuple):
 def reverse_by_parts(
     task: Any, p, method: AbstractSensitivity, names: tuple[str, ...] = (), call: Callable = lambda f, *a: f(*a)
 ) -> tuple[Parts, Trajectory]:
-    """Ψ and dΨ/dp of each criterion of a task in reverse mode, and the motion.
+    """Ψ and dΨ/dp of each criterion of a task in reverse mode, and the motion (`cut` is to be).
 
     `task`: a `Task`, or what has its fields; `names`: of criteria that are asked what they use; `call`: makes the
     calls, and sees the programs.
@@ -56,15 +57,17 @@ def reverse_by_parts(
     t0, t1 = task.t0, task.t1
     (system, state0), of_p = call(_scene, task.build, task.start, p)
     given = for_any_number(task.num_steps, task.integrator, method, None, (system, state0, t0, t1 - t0))
-    (found, details), of_scene = call(_motion, system, state0, t0, t1, *given, method)
-    count = task.num_steps if isinstance(given[0], Steps) else None
-    value, rows, of_found = call(_values, task.criteria, names, found, details["jacobian"], p, count)
-    found, result, note = of_found
+    exact = given[0] if isinstance(given[0], int) else None
+    steps = None if exact else given[0]
+    (found, details), of_scene = call(_motion, system, state0, t0, t1, steps, given[1], method, exact)
+    count = None if exact else task.num_steps
+    value, rows, result, note = call(_values, task.criteria, names, found, system, details["jacobian"], p, count)
     gradient = call(_pulled_to_p, of_p, call(_pulled_to_scene, of_scene, rows), rows)
-    return Parts(value, gradient, result, details, system.constraint_names, note), found
+    parts = Parts(value, gradient, result, details, system.constraint_names, note)
+    return parts, dataclasses.replace(found, system=system)
 
 
-@eqx.filter_jit
+@partial(jax.jit, static_argnums=(0, 1))
 def _scene(build, start, p):
     def of(p):
         return as_system(build(p)), None if start is None else start(p)
@@ -72,12 +75,12 @@ def _scene(build, start, p):
     return jax.vjp(of, p)
 
 
-@eqx.filter_jit
-def _motion(system, state0, t0, t1, num_steps, integrator, method):
+@partial(jax.jit, static_argnums=7)
+def _motion(system, state0, t0, t1, steps: Steps | None, integrator, method, exact: int | None):
     def of(system, state0):
         begun = begin(integrator.scheme, system, t0, state0)
-        found, details = run(system, begun, t0, t1, num_steps, integrator, method)
-        return (found.states, found.stages, found.error), (found, details)
+        found, details = run(system, begun, t0, t1, exact or steps or 0, integrator, method)
+        return (found.states, found.stages, found.error), (dataclasses.replace(found, system=None), details)
 
     _, pull_back, found = jax.vjp(of, system, state0, has_aux=True)
     return found, pull_back
@@ -92,19 +95,18 @@ class _Rows(NamedTuple):
 
 
 @eqx.filter_jit
-def _values(criteria, names, found: Trajectory, jacobian, p, count: int | None):
+def _values(criteria, names, found: Trajectory, system, jacobian, p, count: int | None):
     def of(motion, system, p):
         states, stages, error = motion
         trajectory = dataclasses.replace(found, states=states, stages=stages, error=error, system=system)
         trajectory = trajectory if count is None else cut(trajectory, count)
         values = jnp.stack([criterion(trajectory, p) for criterion in criteria])
-        return values, (values, trajectory)
+        return values, values
 
-    at = (found.states, found.stages, found.error), found.system, p
-    rows, (values, trajectory) = jax.jacrev(of, argnums=(0, 1, 2), has_aux=True)(*at)
-    uses = [Use.of(criterion, found.system, found.t[0], p) for criterion in criteria if names]
-    result, note = unique(found.result, found.system, jacobian, names, uses)
-    return tuple(values), _Rows(*rows), (trajectory, result, note)
+    at = (found.states, found.stages, found.error), system, p
+    rows, values = jax.jacrev(of, argnums=(0, 1, 2), has_aux=True)(*at)
+    uses = [Use.of(criterion, system, found.t[0], p) for criterion in criteria if names]
+    return tuple(values), _Rows(*rows), *unique(found.result, system, jacobian, names, uses)
 
 
 def _each(pull_back: Callable, rows: Any) -> Any:
@@ -114,13 +116,13 @@ def _each(pull_back: Callable, rows: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[None], pull_back(jax.tree.map(lambda leaf: leaf[0], rows)))
 
 
-@eqx.filter_jit
+@jax.jit
 def _pulled_to_scene(pull_back, rows: _Rows):
     of_system, of_state0 = _each(pull_back, rows.motion)
     return jax.tree.map(jnp.add, of_system, rows.system), of_state0
 
 
-@eqx.filter_jit
+@jax.jit
 def _pulled_to_p(pull_back, of_scene, rows: _Rows):
     (of_p,) = _each(pull_back, of_scene)
     total = jax.tree.map(jnp.add, of_p, rows.p)

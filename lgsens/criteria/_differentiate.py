@@ -138,7 +138,7 @@ def differentiate(
                 found, _ = reverse_by_parts(task, p, method, names)
             else:
                 if _flies(method, integrator):
-                    given = for_any_number(num_steps, integrator, method, None, (p, t0, t1 - t0))
+                    given = for_any_number(num_steps, integrator, DirectDifferentiation(), None, (p, t0, t1 - t0))
                     task = task._replace(num_steps=given[0], integrator=given[1])
                 found = _differentiate_jit(task, p, names, method)
         value, gradient, result, details, labels, note = found

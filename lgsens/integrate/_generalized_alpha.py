@@ -17,7 +17,7 @@ import dataclasses
 import functools
 import math
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -208,29 +208,13 @@ class GeneralizedAlpha(AbstractGeneralizedAlpha):
         check("iterations", valid, "an int, at least 1, or None (until they converge)")
         check("stabilized", isinstance(self.stabilized, bool), "True (index 2) or False (index 3)")
 
-    @property
-    def alpha_m(self) -> float:
-        return (2.0 * self.rho_inf - 1.0) / (self.rho_inf + 1.0)
-
-    @property
-    def alpha_f(self) -> float:
-        return self.rho_inf / (self.rho_inf + 1.0)
-
-    @property
-    def gamma(self) -> float:
-        return 0.5 + self.alpha_f - self.alpha_m
-
-    @property
-    def beta(self) -> float:
-        return (self.gamma + 0.5) ** 2 / 4.0
-
-    @property
-    def delta(self) -> float:
-        return self.alpha_m - self.alpha_f
-
-    @property
-    def inertia_factor(self) -> float:
-        return (1.0 - self.alpha_m) / (1.0 - self.alpha_f)
+    # No arguments, where the base has fields.
+    alpha_m: ClassVar[Any] = property(lambda self: (2.0 * self.rho_inf - 1.0) / (self.rho_inf + 1.0))
+    alpha_f: ClassVar[Any] = property(lambda self: self.rho_inf / (self.rho_inf + 1.0))
+    gamma: ClassVar[Any] = property(lambda self: 0.5 + self.alpha_f - self.alpha_m)
+    beta: ClassVar[Any] = property(lambda self: (self.gamma + 0.5) ** 2 / 4.0)
+    delta: ClassVar[Any] = property(lambda self: self.alpha_m - self.alpha_f)
+    inertia_factor: ClassVar[Any] = property(lambda self: (1.0 - self.alpha_m) / (1.0 - self.alpha_f))
 
     def for_autodiff(self):
         """Full Newton, which alone converges as fast in its derivative as in its value."""
@@ -259,7 +243,8 @@ class AlphaOfData(AbstractGeneralizedAlpha):
 
 @functools.lru_cache(maxsize=64)
 def _as_data(scheme: GeneralizedAlpha, dtype) -> AlphaOfData:
-    values = {field.name: getattr(scheme, field.name) for field in dataclasses.fields(AlphaOfData)}
-    number = lambda value: jnp.asarray(value, dtype if isinstance(value, float) else jnp.int32)
-    static = [field.name for field in dataclasses.fields(AlphaOfData) if field.metadata.get("static")]
-    return AlphaOfData(**{name: value if name in static else number(value) for name, value in values.items()})
+    fields = dataclasses.fields(AlphaOfData)
+    values: dict[str, Any] = {field.name: getattr(scheme, field.name) for field in fields}
+    for name in (field.name for field in fields if not field.metadata.get("static")):
+        values[name] = jnp.asarray(values[name], jnp.int32 if name == "max_iterations" else dtype)
+    return AlphaOfData(**values)

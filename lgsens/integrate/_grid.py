@@ -15,6 +15,7 @@ its arrays have places ends with such. For its equations it has the size before 
 
 import abc
 import dataclasses
+import functools
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import equinox as eqx
@@ -36,7 +37,7 @@ class Resizes(Protocol):
 class StepLink(eqx.Module):
     """How a step follows the one before, linearized; stacked, all of them. Between equal steps nothing changes."""
 
-    scheme: Resizes | None = eqx.field(static=True, default=None)  # None, like the others: steps are equal
+    scheme: Any = eqx.field(static=True, default=None)  # None, like the others: steps are equal
     ratio: Any = None  # of the sizes, shape ()
     by_ratio: Any = None  # ∂a*/∂r, shape (k,)
     empty: Any = None  # whether the step is, shape ()
@@ -114,6 +115,7 @@ class Steps(eqx.Module):
     room: int = eqx.field(static=True)
 
     @classmethod
+    @functools.lru_cache(maxsize=64)
     def of(cls, num_steps: int, dtype) -> "Steps":
         """Room for 256, 1024, 4096, and from there on 6144, 8192, 12288, 16384, …: memory is all that it takes."""
         room = 256

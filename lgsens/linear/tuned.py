@@ -47,7 +47,7 @@ CHORD_ITERATIONS, CHORD_CONTRACTION = 12, 0.3
 # trajectories stay in a core's cache too. With 2**17, alone as fast, 16 quarter-cars at once took 149 instead of 110 µs
 # per step and gradient.
 BLOCK_NUMBERS, BLOCK_STEPS = 2**14, 64
-COUNTED_BLOCKS = 24  # at least, where the number of steps is not known when the program is compiled
+COUNTED_BLOCKS = 12  # at least, where the number of steps is not known when the program is compiled
 
 # What value and gradient cost in simulations (`criteria.direct_or_adjoint`): the top with four parameters and five
 # criteria, by benchmarks/methods.py; the four-bar differs by less than the noise.
