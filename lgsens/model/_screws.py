@@ -9,15 +9,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens._validate import axis_field, number_field, point_field, require
-from lgsens.model._constraints import AbstractConstraint, InPlane
+from lgsens.model._constraints import AbstractClosedFormConstraint, InPlane
 from lgsens.model._drivers import Angle
 from lgsens.model._elements import body_fixed
 from lgsens.model._frames import Frame
 from lgsens.model._free import TRANSLATIONS, single_rotation
 from lgsens.model._joints import AbstractJoint, CylindricalJoint, _normals
+from lgsens.model._stack import constraint_force, constraint_jacobian, constraint_stiffness
 
 
-class Advance(AbstractConstraint):
+class Advance(AbstractClosedFormConstraint):
     """b advances along an axis of a as it turns about another: Φ = s − ρ θ; λ is a force [N].
 
     s as in `InPlane`, and θ the angle about the normal of `first_a` and `second_a`, from the turn at which s = ρ θ.
@@ -41,10 +42,30 @@ class Advance(AbstractConstraint):
     def relative(self):
         return True
 
+    def _line(self) -> InPlane:
+        return InPlane(self.point_a, self.point_b, self.axis_a)
+
+    def _angle(self, from_angle) -> Angle:
+        return Angle(self.first_a, self.second_a, self.first_b, from_angle)
+
     def value(self, a, b, t):
-        s = InPlane(self.point_a, self.point_b, self.axis_a).value(a, b, t)[0]
-        angle = Angle(self.first_a, self.second_a, self.first_b, s / self.per_radian)
-        return -self.per_radian * angle.value(a, b, t)
+        s = self._line().value(a, b, t)[0]
+        return -self.per_radian * self._angle(s / self.per_radian).value(a, b, t)
+
+    def _tangent(self, of, *arguments):
+        """Φ is linear in s and θ: of each what is asked."""
+        return of(self._line(), *arguments) - self.per_radian * of(
+            self._angle(jnp.zeros_like(self.per_radian)), *arguments
+        )
+
+    def jacobian(self, a, b, t):
+        return self._tangent(constraint_jacobian, a, b, t)
+
+    def force(self, a, b, lam, t):
+        return self._tangent(constraint_force, a, b, lam, t)
+
+    def geometric_stiffness(self, a, b, lam, t):
+        return self._tangent(constraint_stiffness, a, b, lam, t)
 
 
 def _advance(a: Frame, b: Frame, at, along, axis, per_radian) -> Advance:
