@@ -86,3 +86,10 @@ from lgsens.model._surface_joints import (
 )
 from lgsens.model._system import MultibodySystem as MultibodySystem
 from lgsens.model._trim import static_preload as static_preload
+from lgsens.model._turning_loads import HingeMoment as HingeMoment
+from lgsens.model._vehicle_forces import (
+    AntiRollBar as AntiRollBar,
+    BumpStop as BumpStop,
+    Drag as Drag,
+    TorsionSpringDamper as TorsionSpringDamper,
+)
