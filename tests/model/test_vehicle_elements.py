@@ -134,12 +134,14 @@ def test_stop_has_two_derivatives_where_it_is_met():
 
 
 def test_bar_and_following_force():
-    """A bar of steel of 20 mm and 1 m has 1245.6 N m/rad; a force that follows is that of the body's frame."""
+    """A bar of steel of 20 mm and 1 m has 1245.641 N m/rad; a force that follows is that of the body's frame."""
     bar = lg.AntiRollBar("a", "b", axis=Y, diameter=0.02, length=1.0)
     load, a, b = load_of(bar, {name: lg.RigidBody(1.0, (1.0, 1.0, 1.0)) for name in "ab"})
     turned = b._replace(orientation=jnp.asarray(Rotation.from_rotvec([0.0, 0.1, 0.0]).as_matrix()))
     measured = load.measure(a, turned, REST, REST, 0.0)
-    np.testing.assert_allclose([measured.angle, measured.moment], [0.1, -124.56], rtol=1e-5)  # as many digits as given
+    np.testing.assert_allclose(
+        [measured.angle, measured.moment], [0.1, -124.5641], rtol=1e-6
+    )  # as many digits as given
     tube = lg.AntiRollBar("a", "b", axis=Y, diameter=0.02, bore=0.01, length=1.0)
     np.testing.assert_allclose(load_of(tube)[0].stiffness, 15 / 16 * load.stiffness, rtol=1e-14)
 
@@ -157,6 +159,7 @@ def test_bar_and_following_force():
 # One scene of all: a screw, a rack and its pinion, a planet on a sun, bent shafts, slides, a bushing and a stop.
 
 G, PITCH, RADIUS, RATIO, BEND = 9.81, 0.2, 0.1, -2.0, np.pi / 6
+ADVANCE = PITCH / (2 * np.pi)
 SHAFT_B = (float(np.cos(BEND)), 0.0, float(np.sin(BEND)))
 SLOPE, PLANE = (0.0, 0.6, 0.8), (0.6, 0.0, 0.8)
 C, C_R, M_0, SPIN = np.array([(1.0, 2.0, 3.0), (0.3, 0.2, 0.1), (0.5, -0.2, 0.1), (0.4, -0.5, 0.6)])
@@ -166,7 +169,7 @@ def workshop():
     body = lambda mass, at=ORIGIN, inertia=(0.1, 0.2, 0.3), **more: lg.RigidBody(mass, inertia, position=at, **more)
     middle = tuple(np.array([0.5, 3.0, 0.0]) + 0.5 * np.array(SHAFT_B))
     bodies = {
-        "nut": body(2.0),
+        "nut": body(2.0, velocity=(0.0, 0.0, 30.0 * ADVANCE), angular_velocity=(0.0, 0.0, 30.0)),
         "pinion": body(1.0, (2.0, 0.0, 0.0)),
         "rack": body(3.0, (2.0, 0.0, -0.1)),
         "arm": body(1.5, (4.2, 0.0, 0.0)),
@@ -216,16 +219,17 @@ def workshop():
 def test_accelerations_of_the_workshop():
     model = workshop()
     state = eqx.filter_jit(lg.initial_state)(model)
-    rates = dict(zip(model.system().body_names, np.asarray(state.vdot).reshape(-1, 6)))
+    system = model.system()
+    ends = np.cumsum([len(free) for free in system.free])[:-1]
+    rates = dict(zip(system.body_names, np.split(np.asarray(state.vdot), ends)))
     found, expected = [], []
 
     def compare(actual, wanted):
         found.extend(np.atleast_1d(actual))
         expected.extend(np.atleast_1d(wanted))
 
-    advance = PITCH / (2 * np.pi)
-    fall = -G / (1 + 0.3 / (2.0 * advance**2))  # energy ½ (m + J/ρ²) ṡ²
-    compare(rates["nut"][[2, 5]], [fall, fall / advance])
+    fall = -G / (1 + 0.3 / (2.0 * ADVANCE**2))  # energy ½ (m + J/ρ²) ṡ²
+    compare(rates["nut"][[2, 5]], [fall, fall / ADVANCE])
     slide = 5.0 / (3.0 + 0.2 / RADIUS**2)
     compare([rates["rack"][0], rates["pinion"][4]], [slide, -slide / RADIUS])
     turn = (0.6 + 3.0 * 0.3) / (0.3 + 1.5 * 0.2**2 + 0.7 * 0.5**2 + 0.3 * (1 - RATIO) ** 2)  # Willis: ω_p = (1 − ρ) ω
@@ -242,9 +246,12 @@ def test_accelerations_of_the_workshop():
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)  # condition of the scaled matrix: 1e5 round-offs
 
 
+@pytest.mark.slow  # a program of twelve bodies
 def test_shafts_turn_alike_and_gears_keep_their_ratio():
-    """After 5 steps: angular velocities along both shafts, of planet and arm, and the travel of nut and pinion."""
-    trajectory = eqx.filter_jit(lambda model: lg.simulate(model, t1=0.5, num_steps=5))(workshop())
+    """Travel of nut and pinion, angles of planet and arm, and with B v = 0 the angular velocities along both shafts."""
+    integrator = lg.GeneralizedAlpha(stabilized=True)
+    run = eqx.filter_jit(lambda model: lg.simulate(model, t1=0.5, num_steps=10, integrator=integrator))
+    trajectory = run(workshop())
     body = trajectory.body
     spin = lambda name: body(name).angular_velocity[-1]
     angle = lambda name, i, j: np.arctan2(body(name).orientation[-1, j, i], body(name).orientation[-1, i, i])
@@ -253,12 +260,11 @@ def test_shafts_turn_alike_and_gears_keep_their_ratio():
         (spin("planet")[2], (1 - RATIO) * spin("arm")[2]),
     ]
     places = [
-        (body("nut").position[-1, 2] % PITCH, PITCH / (2 * np.pi) * angle("nut", 0, 1) % PITCH),
+        (body("nut").position[-1, 2] % PITCH, ADVANCE * angle("nut", 0, 1) % PITCH),
         (2.0 - body("rack").position[-1, 0], RADIUS * angle("pinion", 2, 0)),
         (angle("planet", 0, 1), (1 - RATIO) * angle("arm", 0, 1)),
     ]
-    np.testing.assert_allclose(*np.transpose(places), atol=1e-9)  # position level: Newton's tolerance
-    np.testing.assert_allclose(*np.transpose(pairs), rtol=5e-2)
+    np.testing.assert_allclose(*np.transpose(places + pairs), atol=1e-8)  # Newton's tolerance
     assert abs(body("nut").position[-1, 2]) > 2 * PITCH  # turns
 
 
@@ -313,14 +319,14 @@ def test_bad_input(name):
 def test_planar_joint_of_a_body_with_few_freedoms(free, rows):
     body = lg.RigidBody(1.0, (1.0, 1.0, 1.0), free=free.split())
     model = lg.Model({"b": body}, {"plane": lg.PlanarJoint(None, "b", at=ORIGIN, axis=Z)})
-    assert model.system().num_constraints == rows
+    assert model.system().constraint_names == ("plane",) * rows
 
 
 def test_screw_of_a_body_with_few_freedoms():
-    """A body that turns about the screw and moves along it keeps the equation of the pitch, and falls as the full one."""
+    """A body that turns about the screw and moves along it keeps the equation of the pitch, and falls the same."""
     body = lg.RigidBody(2.0, (0.1, 0.2, 0.3), free=("z", "rz"))
     screw = lg.ScrewJoint(None, "nut", at=ORIGIN, axis=Z, pitch=PITCH)
     model = lg.Model({"nut": body}, {"screw": screw}, {"weight": lg.Gravity((0.0, 0.0, -G))})
-    assert model.system().num_constraints == 1
-    fall = -G / (1 + 0.3 / (2.0 * (PITCH / (2 * np.pi)) ** 2))
-    np.testing.assert_allclose(eqx.filter_jit(lg.initial_state)(model).vdot[2], fall, rtol=1e-12)
+    assert model.system().constraint_names == ("screw",)
+    fall = -G / (1 + 0.3 / (2.0 * ADVANCE**2))
+    np.testing.assert_allclose(eqx.filter_jit(lg.initial_state)(model).vdot[0], fall, rtol=1e-12)
