@@ -99,7 +99,8 @@ class GearJoint(AbstractJoint):
             second = cross(axis, d)
             first = cross(second, axis)
             marks += [frame.local_axis(mark / jnp.linalg.norm(mark)) for mark in (first, second)]
-        return (Gearing(a.local_point(self.at_a), b.local_point(self.at_b), *marks, self.ratio, self.teeth),)
+        centres = a.local_point(self.at_a), b.local_point(self.at_b)
+        return (Gearing(*centres, *marks, ratio=self.ratio, teeth=self.teeth),)
 
 
 class NoTwist(AbstractClosedFormConstraint):

@@ -186,9 +186,8 @@ class BumpStop(AbstractForce):
 
     def loads(self, bodies):
         curve = StopCurve(self.gap, self.stiffness, self.rounding, self.progression, self.rebound)
-        ends = zip((self.a, self.b), (self.at_a, self.at_b))
-        points = (_frame(bodies, name, self.gap.dtype).local_point(at) for name, at in ends)
-        length = _distance(self.at_a, self.at_b)
+        a, b = (_frame(bodies, name, self.gap.dtype) for name in (self.a, self.b))
+        points, length = (a.local_point(self.at_a), b.local_point(self.at_b)), _distance(self.at_a, self.at_b)
         return (Attached(CurveLoad(*points, curve, None, length, jnp.zeros_like(length)), self.a, self.b),)
 
 
