@@ -67,6 +67,8 @@ from lgsens.model._relative import (
 )
 from lgsens.model._roads import BumpRoad as BumpRoad, FlatRoad as FlatRoad, SampledRoad as SampledRoad
 from lgsens.model._rolling import Rolling as Rolling
+from lgsens.model._screws import RackAndPinionJoint as RackAndPinionJoint, ScrewJoint as ScrewJoint
+from lgsens.model._shafts import ConstantVelocityJoint as ConstantVelocityJoint, GearJoint as GearJoint
 from lgsens.model._signals import (
     AbstractSignal as AbstractSignal,
     Constant as Constant,
@@ -83,5 +85,17 @@ from lgsens.model._stack import (
     moved as moved,
 )
 from lgsens.model._summary import Summary as Summary
+from lgsens.model._surface_joints import (
+    PlanarJoint as PlanarJoint,
+    PointOnLineJoint as PointOnLineJoint,
+    PointOnPlaneJoint as PointOnPlaneJoint,
+)
 from lgsens.model._system import MultibodySystem as MultibodySystem
 from lgsens.model._trim import static_preload as static_preload
+from lgsens.model._turning_loads import HingeMoment as HingeMoment
+from lgsens.model._vehicle_forces import (
+    AntiRollBar as AntiRollBar,
+    BumpStop as BumpStop,
+    Drag as Drag,
+    TorsionSpringDamper as TorsionSpringDamper,
+)

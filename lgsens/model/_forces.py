@@ -23,6 +23,7 @@ from lgsens.model._loads import (
 )
 from lgsens.model._roads import FlatRoad
 from lgsens.model._signals import AbstractSignal, prepared, signal_field
+from lgsens.model._turning_loads import FollowingForce, FullBushingLoad, RotationLoad
 
 
 class Attached(NamedTuple):
@@ -166,9 +167,10 @@ class SpringDamper(AbstractForce):
 
 
 class Bushing(AbstractForce):
-    """A rubber bushing in place of a ball joint: a spring and damper along each of three axes fixed to body a.
+    """A rubber bushing in place of a joint: a spring and damper along, and about, each of three axes fixed to body a.
 
         g = g₀ + K u + C u̇,     u the vector from the point on a to the point on b, in the frame of a
+        m = m₀ + K_r φ + C_r φ̇,     φ the rotation vector of b in a, |φ| < π, along the same axes
 
     Arguments:
         a, b: names of the two bodies; None is the ground.
@@ -177,9 +179,13 @@ class Bushing(AbstractForce):
             configuration, shape (3,). The axes turn with a.
         damping: the damping along the same axes [N s/m], shape (3,).
         preload: the force g₀ that pulls b to a in the reference configuration [N], inertial frame, shape (3,).
+        rotational_stiffness, rotational_damping: K_r [N m/rad] and C_r [N m s/rad] about x, y and z of the inertial
+            frame in the reference configuration, shape (3,); None: 0.
+        rotational_preload: the moment m₀ that turns b back there [N m], inertial frame, shape (3,); None: 0.
 
-    It resists no rotation. A force between bodies that is stiffer by orders than the others makes explicit integrators
-    take as many more steps; generalized-α does not mind. Raises `ValueError` for wrong shapes.
+    With none of the last three it resists no rotation, and costs nothing for it. The moments do the work −m·φ̇: on b
+    acts −m but for terms of second order in φ. A force between bodies that is stiffer by orders than the others makes
+    explicit integrators take as many more steps; generalized-α does not mind. Raises `ValueError` for wrong shapes.
     """
 
     a: str | None = eqx.field(static=True)
@@ -188,6 +194,9 @@ class Bushing(AbstractForce):
     stiffness: Float[Array, "3"] = point_field("stiffness")
     damping: Float[Array, "3"] = point_field("damping", default=(0.0, 0.0, 0.0))
     preload: Float[Array, "3"] = point_field("preload", default=(0.0, 0.0, 0.0))
+    rotational_stiffness: Float[Array, "3"] | None = point_field("rotational_stiffness", default=None)
+    rotational_damping: Float[Array, "3"] | None = point_field("rotational_damping", default=None)
+    rotational_preload: Float[Array, "3"] | None = point_field("rotational_preload", default=None)
 
     @property
     def bodies(self):
@@ -205,6 +214,10 @@ class Bushing(AbstractForce):
             damping=(back * self.damping[None]) @ a.orientation,
             preload=a.local_axis(self.preload),
         )
+        about = self.rotational_stiffness, self.rotational_damping, self.rotational_preload
+        if any(numbers is not None for numbers in about):
+            about = (jnp.zeros_like(self.at) if numbers is None else numbers for numbers in about)
+            load = FullBushingLoad(load, RotationLoad(back, b.orientation.T, *about))
         return (Attached(load, self.a, self.b),)
 
 
@@ -273,6 +286,7 @@ class AppliedForce(AbstractForce):
         force: the force f [N], inertial frame, shape (3,).
         moment: the moment m [N m], body frame, shape (3,).
         signal: the factor s(t) [–], an `AbstractSignal` (default: 1).
+        follows: whether the force turns with the body; f is then that in the reference configuration.
 
     Raises `ValueError` for wrong shapes.
     """
@@ -282,6 +296,7 @@ class AppliedForce(AbstractForce):
     force: Float[Array, "3"] = point_field("force", default=(0.0, 0.0, 0.0))
     moment: Float[Array, "3"] = point_field("moment", default=(0.0, 0.0, 0.0))
     signal: AbstractSignal = signal_field("signal", default_factory=_one)
+    follows: bool = eqx.field(static=True, default=False, kw_only=True)
 
     @property
     def bodies(self):
@@ -289,9 +304,7 @@ class AppliedForce(AbstractForce):
 
     def loads(self, bodies):
         frame = bodies[self.body].frame
+        kind, force = (FollowingForce, frame.local_axis(self.force)) if self.follows else (PointForce, self.force)
         at = bodies[self.body].position if self.at is None else self.at
-        return (
-            Attached(
-                PointForce(frame.local_point(at), self.force, self.moment, prepared(self.signal)), None, self.body
-            ),
-        )
+        load = kind(frame.local_point(at), force, self.moment, prepared(self.signal))
+        return (Attached(load, None, self.body),)

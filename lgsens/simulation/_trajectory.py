@@ -185,8 +185,8 @@ class AbstractMotion(eqx.Module):
         """What a force element measures, every array with a leading axis n + 1 if this is a trajectory.
 
         A `SpringDamper` gives its `LineForce` (length [m], rate [m/s], tension [N]), a `TyreSpring` its normal
-        force [N], shape (n+1,); a `PIDController` its `ControlSignals`; other elements the generalized force
-        [F_a, M_a, F_b, M_b] that they apply.
+        force [N], shape (n+1,); a `TorsionSpringDamper` its `HingeMoment`, a `PIDController` its `ControlSignals`;
+        other elements the generalized force [F_a, M_a, F_b, M_b] that they apply.
         Raises `ValueError` for an unknown name, or one of several loads (gravity).
         """
         states, t = self._kinematics()

@@ -21,6 +21,8 @@ ACROSS = np.cross(UNIT, ARM_B) / np.linalg.norm(ARM_B)
 ROD = (AT_B - AT) / np.linalg.norm(AT_B - AT)
 ROD_NORMALS = np.linalg.svd(ROD[None])[2][1:]
 EYE = np.eye(3)
+ACROSS_UNIT = (ARM_B / np.linalg.norm(ARM_B), ACROSS)
+ADVANCE, RACK, BESIDE = 0.4, AXIS_B / np.linalg.norm(AXIS_B), AT + 0.9 * ACROSS_UNIT[0]
 
 
 class Displacement(NamedTuple):
@@ -57,6 +59,7 @@ class Case(NamedTuple):
     slides: tuple[np.ndarray, ...]
     allowed: Displacement
     forbidden: tuple[Displacement, ...]
+    twists: tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...] = ()  # more of them, which are neither: ω, point, u
 
 
 def about(*axes, at=AT):
@@ -120,6 +123,64 @@ CASES = {
         turn([0.5, -0.8, 1.5], at=AT_B).then(turn([1.0, 0.3, -0.6], at=AT)),
         (slide(0.3 * ROD),),
     ),
+    "planar": Case(
+        lambda a, b, axis=AXIS: lg.PlanarJoint(a, b, at=AT, axis=axis),
+        3,
+        about(UNIT),
+        ACROSS_UNIT,
+        turn(-2.1 * UNIT).then(slide(0.8 * ACROSS)),
+        (turn(0.3 * ARM_B), turn(0.3 * ACROSS), slide(0.3 * UNIT)),
+    ),
+    "point on plane": Case(
+        lambda a, b, axis=AXIS: lg.PointOnPlaneJoint(a, b, at=AT, axis=axis),
+        1,
+        about(*EYE),
+        ACROSS_UNIT,
+        turn([0.9, -1.2, 0.4]).then(slide(0.8 * ACROSS)),
+        (slide(0.3 * UNIT),),
+    ),
+    "point on line": Case(
+        lambda a, b, axis=AXIS: lg.PointOnLineJoint(a, b, at=AT, axis=axis),
+        2,
+        about(*EYE),
+        (UNIT,),
+        turn([0.9, -1.2, 0.4]).then(slide(0.8 * UNIT)),
+        tuple(slide(0.3 * across) for across in ACROSS_UNIT),
+    ),
+    "screw": Case(  # more than a turn
+        lambda a, b, axis=AXIS: lg.ScrewJoint(a, b, at=AT, axis=axis, pitch=2 * np.pi * ADVANCE),
+        5,
+        (),
+        (),
+        turn(7.5 * UNIT).then(slide(7.5 * ADVANCE * UNIT)),
+        (turn(0.3 * ARM_B), turn(0.3 * ACROSS), slide(0.3 * ACROSS), slide(0.3 * UNIT), turn(UNIT)),
+        ((UNIT, AT, ADVANCE * UNIT),),
+    ),
+    "rack and pinion": Case(
+        lambda a, b, axis=AXIS: lg.RackAndPinionJoint(a, b, at=AT, axis=axis, direction=AXIS_B, radius=ADVANCE),
+        1,
+        about(*ACROSS_UNIT),
+        tuple(np.linalg.svd(RACK[None])[2][1:]),
+        turn(-7.5 * UNIT).then(slide(-7.5 * ADVANCE * RACK + 0.4 * np.cross(RACK, UNIT))),
+        (turn(UNIT), slide(0.3 * RACK)),
+        ((UNIT, AT, ADVANCE * RACK),),
+    ),
+    "gears": Case(  # b rolls around a, which it touches at a third of the distance, and moves out of its plane
+        lambda a, b, axis=AXIS: lg.GearJoint(a, b, at_a=AT, at_b=BESIDE, axis_a=axis, axis_b=axis, ratio=-0.5, teeth=2),
+        1,
+        ((UNIT, AT + (BESIDE - AT) / 3), *about(*ACROSS_UNIT, at=BESIDE)),
+        (UNIT, ARM_B),
+        turn(0.5 * 7.5 * UNIT, at=BESIDE).then(turn(7.5 * UNIT)).then(slide(0.4 * UNIT)),
+        (turn(0.3 * UNIT, at=BESIDE), slide(0.3 * ACROSS)),
+    ),
+    "constant velocity": Case(
+        lambda a, b, axis=AXIS: lg.ConstantVelocityJoint(a, b, at=AT, axis_a=axis),
+        4,
+        about(*ACROSS_UNIT),
+        (),
+        turn(0.6 * ACROSS + 0.5 * ARM_B),
+        (turn(0.3 * UNIT), *(slide(0.3 * e) for e in EYE)),
+    ),
 }
 SIDES = {"two bodies": ("a", "b"), "ground first": (None, "b"), "ground last": ("a", None)}
 
@@ -161,6 +222,7 @@ def motions(model, name, side) -> np.ndarray:
     """The velocities [ẋ, Ω] that the joint allows at the reference, relative and together, in rows."""
     case = CASES[name]
     relative = [(axis, at, np.zeros(3)) for axis, at in case.turns] + [(np.zeros(3), AT, u) for u in case.slides]
+    relative += case.twists
     if side == "ground last" and name == "distance":
         relative = [(axis, AT if at is AT_B else at, u) for axis, at, u in relative]  # a turns about its own end
     movers = {"two bodies": "b", "ground first": "b", "ground last": "a"}[side]
@@ -250,7 +312,7 @@ AXES = {
 
 
 @pytest.mark.parametrize("axis", AXES)
-@pytest.mark.parametrize("name", ["revolute", "universal", "prismatic", "cylindrical"])
+@pytest.mark.parametrize("name", ["revolute", "universal", "prismatic", "cylindrical", "screw"])
 def test_length_of_the_axis_is_irrelevant(name, axis):
     model, scaled = (scene(name, "two bodies", axis=factor * AXES[axis]) for factor in (1.0, 7.0))
     q = configuration(model, "two bodies", CASES[name].forbidden[0])

@@ -1,0 +1,151 @@
+"""A screw, and a rack and pinion: a body that advances as it turns.
+
+Poses tell an angle but for whole turns. Where a body has advanced by s it should have turned by s/ρ, and only the angle
+from there to where it is needs to be known: it is small, whatever the number of turns (`Angle`).
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens._validate import axis_field, number_field, point_field, require
+from lgsens.model._constraints import AbstractClosedFormConstraint, InPlane
+from lgsens.model._drivers import Angle
+from lgsens.model._elements import body_fixed
+from lgsens.model._frames import Frame
+from lgsens.model._free import TRANSLATIONS, single_rotation
+from lgsens.model._joints import AbstractJoint, CylindricalJoint, _normals
+from lgsens.model._stack import constraint_force, constraint_jacobian, constraint_stiffness
+
+
+class Advance(AbstractClosedFormConstraint):
+    """b advances along an axis of a as it turns about another: Φ = s − ρ θ; λ is a force [N].
+
+    s as in `InPlane`, and θ the angle about the normal of `first_a` and `second_a`, from the turn at which s = ρ θ.
+    """
+
+    point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
+    axis_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
+    first_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
+    second_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
+    first_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
+    per_radian: Float[Array, ""]  # ρ [m/rad]
+
+    drawn = None
+
+    @property
+    def num_rows(self):
+        return 1
+
+    @property
+    def relative(self):
+        return True
+
+    def _line(self) -> InPlane:
+        return InPlane(self.point_a, self.point_b, self.axis_a)
+
+    def _angle(self, from_angle) -> Angle:
+        return Angle(self.first_a, self.second_a, self.first_b, from_angle)
+
+    def value(self, a, b, t):
+        s = self._line().value(a, b, t)[0]
+        return -self.per_radian * self._angle(s / self.per_radian).value(a, b, t)
+
+    def _tangent(self, of, *arguments):
+        """Φ is linear in s and θ: of each what is asked."""
+        return of(self._line(), *arguments) - self.per_radian * of(
+            self._angle(jnp.zeros_like(self.per_radian)), *arguments
+        )
+
+    def jacobian(self, a, b, t):
+        return self._tangent(constraint_jacobian, a, b, t)
+
+    def force(self, a, b, lam, t):
+        return self._tangent(constraint_force, a, b, lam, t)
+
+    def geometric_stiffness(self, a, b, lam, t):
+        return self._tangent(constraint_stiffness, a, b, lam, t)
+
+
+def _advance(a: Frame, b: Frame, at, along, axis, per_radian) -> Advance:
+    _, first, second = _normals(axis)
+    points = a.local_point(at), b.local_point(at)
+    axes = a.local_axis(along / jnp.linalg.norm(along)), a.local_axis(first), a.local_axis(second)
+    return Advance(*points, *axes, b.local_axis(first), per_radian)
+
+
+def require_nonzero(what: str, name: str, value, unit: str) -> None:
+    require(lambda value: value != 0, f"{what}: `{name}` must not be zero, got {value}{unit}.", value)
+
+
+class ScrewJoint(AbstractJoint):
+    """`b` turns about an axis of `a` and advances along it by a pitch in each turn, s = p θ/2π; 5 equations.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at: a point of the axis in the reference configuration [m], inertial frame, shape (3,).
+        axis: direction of the axis, inertial frame, shape (3,), any length > 0.
+        pitch: p [m per turn], shape (), right-handed if positive, not zero; any number of turns.
+
+    The multipliers are those of a `CylindricalJoint`, and the force of `b` on `a` along the axis [N]. Raises
+    `ValueError` for a wrong shape, a zero axis or a zero pitch, for which it is a RevoluteJoint. Source: Haug (1989),
+    §9.4.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at: Float[Array, "3"] = point_field("at")
+    axis: Float[Array, "3"] = axis_field("axis")
+    pitch: Float[Array, ""] = number_field("pitch")
+
+    def __check_init__(self):
+        require_nonzero("ScrewJoint", "pitch", self.pitch, " m; without advance it is a RevoluteJoint")
+
+    assembled = True
+
+    @property
+    def hinge(self):
+        return self.axis
+
+    def violable(self, constraints, free):
+        axis = single_rotation(free)  # about the screw's
+        aside = axis is None or any(name in free for i, name in enumerate(TRANSLATIONS) if i != axis)
+        return (False,), (False,), (aside,), (aside,), (True,)
+
+    def constraints(self, a, b):
+        sleeve = CylindricalJoint(self.a, self.b, at=self.at, axis=self.axis).constraints(a, b)
+        return (*sleeve, _advance(a, b, self.at, self.axis, self.axis, self.pitch / (2.0 * jnp.pi)))
+
+
+class RackAndPinionJoint(AbstractJoint):
+    """The pinion `b` rolls along the rack `a`: its centre advances by s = r θ along the rack; 1 equation.
+
+    θ is its angle about `axis`, seen from the rack. A rack that slides in a housing, in which the pinion turns, moves
+    by −s. Other joints hold the pinion's axis and the rack.
+
+    Arguments:
+        a, b: names of rack and pinion; None is the ground.
+        at: centre of the pinion in the reference configuration [m], inertial frame, shape (3,).
+        axis: direction of its axis, inertial frame, shape (3,), any length > 0.
+        direction: direction of the rack, inertial frame, shape (3,), any length > 0; at any angle to `axis`.
+        radius: r [m], shape (): travel per radian, negative for the other sense, not zero; any number of turns.
+
+    The multiplier is the force of `b` on `a` along the rack [N]. Raises `ValueError` for a wrong shape, a zero
+    direction or a zero radius.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at: Float[Array, "3"] = point_field("at")
+    axis: Float[Array, "3"] = axis_field("axis")
+    direction: Float[Array, "3"] = axis_field("direction")
+    radius: Float[Array, ""] = number_field("radius")
+
+    def __check_init__(self):
+        require_nonzero("RackAndPinionJoint", "radius", self.radius, " m; give the travel per radian")
+
+    assembled = True
+
+    def constraints(self, a, b):
+        return (_advance(a, b, self.at, self.direction, self.axis, self.radius),)

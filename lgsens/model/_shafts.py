@@ -1,0 +1,192 @@
+"""Joints between shafts: gears, and the constant-velocity joint."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lgsens._validate import as_count, axis_field, number_field, point_field, require
+from lgsens.liegroups import cross
+from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint, Orthogonality
+from lgsens.model._elements import body_fixed
+from lgsens.model._free import ROTATIONS
+from lgsens.model._joints import AbstractJoint, _coincidence, _normals
+from lgsens.model._screws import require_nonzero
+
+
+class Gearing(AbstractConstraint):
+    """Two gears have turned in the ratio ρ against the line d between them: Φ = φ_b − ρ φ_a; λ is a moment on b [N m].
+
+    With x along d in the reference configuration and orthogonal to the axis, and y = e × x, both fixed to a gear, that
+    gear has turned by φ = −atan2(y·d, x·d). Poses tell angles
+    but for whole turns, and Φ but for those of `teeth` times itself: these cancel if `teeth` times ρ is an integer.
+    """
+
+    point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
+    first_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
+    second_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
+    first_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
+    second_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
+    ratio: Float[Array, ""]
+    teeth: int = eqx.field(static=True)
+
+    drawn = None
+
+    @property
+    def num_rows(self):
+        return 1
+
+    @property
+    def relative(self):
+        return True
+
+    def value(self, a, b, t):
+        d = b.point(self.point_b) - a.point(self.point_a)
+        turned = lambda frame, x, y: -jnp.arctan2(jnp.sum(frame.axis(y) * d), jnp.sum(frame.axis(x) * d))
+        angle = turned(b, self.first_b, self.second_b) - self.ratio * turned(a, self.first_a, self.second_a)
+        return (jnp.arctan2(jnp.sin(self.teeth * angle), jnp.cos(self.teeth * angle)) / self.teeth)[None]
+
+
+class GearJoint(AbstractJoint):
+    """Two gears turn in a fixed ratio, φ_b = ρ φ_a; 1 equation.
+
+    Their angles are seen from the line between their centres, so from what carries both, which may move, too: sun and
+    planet roll on each other. Other joints hold the axes.
+
+    Arguments:
+        a, b: names of the two gears; None is the ground, on which a gear is fixed.
+        at_a, at_b: their centres in the reference configuration [m], inertial frame, shape (3,): points of their axes,
+            the line between which has any direction but those of the axes.
+        axis_a, axis_b: directions of their axes, inertial frame, shape (3,), any length > 0.
+        ratio: ρ, shape (): turns of `b` about `axis_b` for one of `a` about `axis_a`; of an external pair with
+            parallel axes −n_a/n_b for n_a and n_b teeth.
+        teeth: n_b or another count for which ratio · teeth is an integer: gears then turn any number of times. With
+            another ratio, and for the derivative by the ratio, `a` is within half a turn of the reference.
+
+    The multiplier is the moment of `b` on the mesh about its axis [N m]: its negative drives `b`. Raises `ValueError`
+    for a wrong shape, a zero axis, centres along an axis, a zero ratio, or a count below 1.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at_a: Float[Array, "3"] = point_field("at_a")
+    at_b: Float[Array, "3"] = point_field("at_b")
+    axis_a: Float[Array, "3"] = axis_field("axis_a")
+    axis_b: Float[Array, "3"] = axis_field("axis_b")
+    ratio: Float[Array, ""] = number_field("ratio")
+    teeth: int = eqx.field(static=True, default=1, kw_only=True)
+
+    def __check_init__(self):
+        require_nonzero("GearJoint", "ratio", self.ratio, "; a gear that does not turn is fixed by another joint")
+        as_count(self.teeth, "teeth")
+        for name, axis in (("axis_a", self.axis_a), ("axis_b", self.axis_b)):
+            require(
+                lambda a, b, e: np.linalg.norm(np.cross(b - a, e)) > 1e-6 * np.linalg.norm(b - a) * np.linalg.norm(e),
+                f"GearJoint: the line from `at_a` {self.at_a} to `at_b` {self.at_b} is along `{name}` {axis}; give the "
+                "centres of the gears, each on its own axis.",
+                self.at_a,
+                self.at_b,
+                axis,
+            )
+
+    assembled = True
+
+    def constraints(self, a, b):
+        d = self.at_b - self.at_a
+        marks = []
+        for frame, axis in ((a, self.axis_a), (b, self.axis_b)):
+            second = cross(axis, d)
+            first = cross(second, axis)
+            marks += [frame.local_axis(mark / jnp.linalg.norm(mark)) for mark in (first, second)]
+        centres = a.local_point(self.at_a), b.local_point(self.at_b)
+        return (Gearing(*centres, *marks, ratio=self.ratio, teeth=self.teeth),)
+
+
+class NoTwist(AbstractClosedFormConstraint):
+    """b is bent against a, and not twisted: Φ = (y_a·x_b − x_a·y_b)/2; λ is a moment [N m].
+
+    With x, y orthogonal to a shaft of each body, the rotation between both is exp(ñ) with n orthogonal to the shaft
+    where its skew part has no entry of x and y. `xy` is −x_a·y_b/2 and `yx` is y_a·x_b/2.
+    """
+
+    xy: Orthogonality
+    yx: Orthogonality
+
+    drawn = None
+
+    @property
+    def num_rows(self):
+        return 1
+
+    @property
+    def relative(self):
+        return True
+
+    @property
+    def acts_on(self):
+        return self.xy.acts_on
+
+    @property
+    def coupled(self):
+        return self.xy.coupled
+
+    def violable(self, free):
+        return (bool(free & {*ROTATIONS}),)
+
+    def value(self, a, b, t):
+        return self.xy.value(a, b, t) + self.yx.value(a, b, t)
+
+    def jacobian(self, a, b, t):
+        return self.xy.jacobian(a, b, t) + self.yx.jacobian(a, b, t)
+
+    def force(self, a, b, lam, t):
+        return self.xy.force(a, b, lam, t) + self.yx.force(a, b, lam, t)
+
+    def geometric_stiffness(self, a, b, lam, t):
+        return self.xy.geometric_stiffness(a, b, lam, t) + self.yx.geometric_stiffness(a, b, lam, t)
+
+
+class ConstantVelocityJoint(AbstractJoint):
+    """Two shafts meet in a point and turn alike whatever the angle between them; 4 equations.
+
+    One is turned into the direction of the other about an axis orthogonal to both, without twist: both see each other
+    mirrored in the plane between them, so their angular velocities along themselves are equal.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at: where the shafts meet in the reference configuration [m], inertial frame, shape (3,).
+        axis_a: direction of the shaft of `a`, inertial frame, shape (3,), any length > 0.
+        axis_b: direction of the shaft of `b` in the same sense, shape (3,); None: that of `a`, the joint is straight.
+
+    The multipliers are the force of `b` on `a` [N], and the moment about the shafts [N m] for a straight joint, 2/(1 +
+    cos β) of it at an angle β. Raises `ValueError` for a wrong shape, a zero axis, or shafts at a right angle or more.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at: Float[Array, "3"] = point_field("at")
+    axis_a: Float[Array, "3"] = axis_field("axis_a")
+    axis_b: Float[Array, "3"] | None = point_field("axis_b", default=None)
+
+    def __check_init__(self):
+        if self.axis_b is not None:
+            require(
+                lambda a, b: np.dot(a, b) > 0,
+                f"ConstantVelocityJoint: `axis_a` {self.axis_a} and `axis_b` {self.axis_b} are at a right angle or "
+                "more; give both in the same sense, from one shaft to the other.",
+                self.axis_a,
+                self.axis_b,
+            )
+
+    assembled = True
+
+    def constraints(self, a, b):
+        unit, *across_a = _normals(self.axis_a)
+        shaft_b = unit if self.axis_b is None else self.axis_b / jnp.linalg.norm(self.axis_b)
+        bend = cross(unit, shaft_b)  # the shortest rotation is v + w × v + w × (w × v)/(1 + c)
+        turned = lambda v: v + cross(bend, v) + cross(bend, cross(bend, v)) / (1.0 + jnp.sum(unit * shaft_b))
+        (x_a, y_a), (x_b, y_b) = across_a, map(turned, across_a)
+        pairs = ((-0.5 * x_a, y_b), (0.5 * y_a, x_b))
+        xy, yx = (Orthogonality(a.local_axis(of_a), b.local_axis(of_b)) for of_a, of_b in pairs)
+        return (_coincidence(a, b, self.at), NoTwist(xy, yx))

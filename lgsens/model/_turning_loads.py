@@ -1,0 +1,151 @@
+"""Loads that resist a rotation or turn with a body, as stacked numbers.
+
+A generalized force along s(q) is Q = −(∂s/∂q)ᵀ f, whose power is −f ṡ: with f = f(s) it has a potential.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens.liegroups import SO3, cross, skew, turn, turn_back
+from lgsens.model._drivers import Angle
+from lgsens.model._elements import body_fixed
+from lgsens.model._frames import BODY_B, ROTATION, ROTATION_B, TRANSLATION_B, TURNING_A, TURNING_B, embedded
+from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, BushingLoad, LoadTangents
+from lgsens.model._signals import AbstractSignal, Prescribed, at_time
+from lgsens.model._stack import constraint_jacobian, load_tangents
+
+
+class HingeMoment(NamedTuple):
+    """What is turned at one instant: angle [rad], rate [rad/s] and the moment on b about the axis [N m], shape ()."""
+
+    angle: Float[Array, ""]
+    rate: Float[Array, ""]
+    moment: Float[Array, ""]
+
+
+class TorsionLoad(AbstractLoad):
+    """M = motor(t) − M₀ − k (θ − θ₀) − c θ̇ on b about an axis of a, with θ of `Angle` within half a turn of θ₀."""
+
+    first_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
+    second_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
+    first_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
+    stiffness: Float[Array, ""]
+    damping: Float[Array, ""]
+    free_angle: Float[Array, ""]
+    preload: Float[Array, ""]
+    motor: Prescribed | None
+
+    balanced = True
+    drawn = None
+
+    @property
+    def acts_on(self):
+        return TURNING_A + TURNING_B
+
+    def _row(self, a, b, t):
+        """θ − θ₀ and ∂θ/∂q."""
+        twist = Angle(self.first_a, self.second_a, self.first_b, self.free_angle)
+        return twist.value(a, b, t)[0], constraint_jacobian(twist, a, b, t)[0]
+
+    def measure(self, a, b, va, vb, t) -> HingeMoment:
+        twist, row = self._row(a, b, t)
+        rate = jnp.sum(row * jnp.concatenate([va, vb]))
+        moment = -self.preload - self.stiffness * twist - self.damping * rate
+        if self.motor is not None:
+            moment += at_time(self.motor, t)
+        return HingeMoment(self.free_angle + twist, rate, moment)
+
+    def force(self, a, b, va, vb, t):
+        return self.measure(a, b, va, vb, t).moment * self._row(a, b, t)[1]
+
+
+class RotationLoad(AbstractLoad):
+    """Springs and dampers against the rotation φ of b in a, by its vector: m = m₀ + K φ + C φ̇, E = ½ φᵀKφ + m₀ᵀφ.
+
+    The columns of `triad_a` and `triad_b`, in the frames of the bodies, are three axes that coincide in the reference
+    configuration; φ = log S with S = (R_a T_a)ᵀ R_b T_b, whose angular velocity in `triad_b` is ω = T(φ) φ̇. So on b
+    acts −T(φ)⁻ᵀ m, in that triad, and its opposite on a. K and C are diagonal.
+    """
+
+    triad_a: Float[Array, "3 3"]
+    triad_b: Float[Array, "3 3"]
+    stiffness: Float[Array, "3"]
+    damping: Float[Array, "3"]
+    preload: Float[Array, "3"]
+
+    balanced = True
+    drawn = None
+
+    @property
+    def acts_on(self):
+        return TURNING_A + TURNING_B
+
+    def force(self, a, b, va, vb, t):
+        group = SO3()
+        to_b = group.compose(self.triad_b.T, group.compose(b.orientation.T, group.compose(a.orientation, self.triad_a)))
+        phi = group.log(to_b.T)
+        spin = turn_back(self.triad_b, vb[ROTATION]) - turn(to_b, turn_back(self.triad_a, va[ROTATION]))
+        m = self.preload + self.stiffness * phi + self.damping * group.tangent_inv_mv(phi, spin)
+        on_a = group.tangent_inv_mv(-phi, m)  # T(φ)ᵀ = T(−φ)
+        zero = jnp.zeros_like(m)
+        moment_a = turn(self.triad_a, turn_back(to_b, on_a))
+        return jnp.concatenate([zero, moment_a, zero, -turn(self.triad_b, on_a)])
+
+
+class FullBushingLoad(AbstractClosedFormLoad):
+    """A `BushingLoad` that resists rotations, too."""
+
+    translation: BushingLoad
+    rotation: RotationLoad
+
+    balanced = True
+    drawn = "joint"
+
+    def fixed(self, kind, bodies="ab"):
+        return self.translation.fixed(kind, bodies)
+
+    def force(self, a, b, va, vb, t):
+        return self.translation.force(a, b, va, vb, t) + self.rotation.force(a, b, va, vb, t)
+
+    def tangents(self, a, b, va, vb, t):
+        both = (load_tangents(load, a, b, va, vb, t) for load in (self.translation, self.rotation))
+        return LoadTangents(*(one + other for one, other in zip(*both)))
+
+
+class FollowingForce(AbstractClosedFormLoad):
+    """A force s(t) R f on a point of b that turns with it, and a moment s(t) m: Q_b = s [R f, X × f + m]."""
+
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
+    vector: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
+    moment: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
+    signal: AbstractSignal
+
+    def force(self, a, b, va, vb, t):
+        zero = jnp.zeros(BODY_B.start, self.vector.dtype)
+        moment = self.moment + cross(self.point_b, self.vector)
+        return self.signal(t) * jnp.concatenate([zero, b.axis(self.vector), moment])
+
+    def tangents(self, a, b, va, vb, t):
+        by_turns = -self.signal(t) * (b.orientation @ skew(self.vector))
+        return LoadTangents(embedded(by_turns, TRANSLATION_B, ROTATION_B), None)
+
+
+class DragLoad(AbstractLoad):
+    """F = −k |u| u on a point of b, u = its velocity − w; |u| u has one continuous derivative where u = 0."""
+
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
+    per_square: Float[Array, ""]
+    wind: Float[Array, "3"]
+
+    drawn = None
+
+    def force(self, a, b, va, vb, t):
+        u = vb[: ROTATION.start] + b.axis(cross(vb[ROTATION], self.point_b)) - self.wind
+        square = jnp.sum(u * u)
+        still = square == 0.0
+        speed = jnp.where(still, 0.0, jnp.sqrt(jnp.where(still, 1.0, square)))
+        f = -self.per_square * speed * u
+        return jnp.concatenate([jnp.zeros(BODY_B.start, f.dtype), f, cross(self.point_b, b.local_axis(f))])

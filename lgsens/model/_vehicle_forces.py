@@ -1,0 +1,220 @@
+"""Forces of hinges and vehicles: torsion springs and motors, anti-roll bars, stops, drag."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens._validate import axis_field, number_field, point_field, require
+from lgsens.model._curves import CurveLoad
+from lgsens.model._forces import AbstractForce, Attached, _distance, _frame
+from lgsens.model._joints import _normals
+from lgsens.model._signals import AbstractSignal, Prescribed, prepared, prescribed_field
+from lgsens.model._turning_loads import DragLoad, TorsionLoad
+
+
+def _torsion(bodies, force, stiffness, free_angle=None, preload=None, motor=None) -> tuple[Attached, ...]:
+    _, first, second = _normals(force.axis)
+    a, b = (_frame(bodies, name, first.dtype) for name in (force.a, force.b))
+    axes = a.local_axis(first), a.local_axis(second), b.local_axis(first)
+    angle, moment = (jnp.zeros((), first.dtype) if value is None else value for value in (free_angle, preload))
+    return (Attached(TorsionLoad(*axes, stiffness, force.damping, angle, moment, motor), force.a, force.b),)
+
+
+class TorsionSpringDamper(AbstractForce):
+    """Spring, damper and motor about a hinge axis: the moment M(t) − M₀ − k (θ − θ₀) − c θ̇ on b, its opposite on a.
+
+    θ is the angle by which `b` has turned about the axis, fixed in `a`, since the reference configuration; within half
+    a turn of θ₀, where the moment of the spring jumps. A hinge keeps the axes of both bodies aligned.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        axis: direction of the axis in the reference configuration, inertial frame, shape (3,), any length > 0.
+        stiffness: k [N m/rad], shape ().
+        damping: c [N m s/rad], shape ().
+        free_angle: θ₀, at which the spring is free [rad], shape ().
+        preload: the moment M₀ that turns b back in the reference configuration [N m], shape (). θ₀ is then 0.
+        motor: the moment M(t) on b [N m], a number, shape (), or a signal; None: no motor.
+
+    Give `free_angle` or `preload`, not both. `Trajectory.force` gives the angle [rad], its rate [rad/s] and the moment
+    on b [N m]. Raises `ValueError` for both, a zero axis, or wrong shapes.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    axis: Float[Array, "3"] = axis_field("axis")
+    stiffness: Float[Array, ""] = number_field("stiffness", default=0.0)
+    damping: Float[Array, ""] = number_field("damping", default=0.0)
+    free_angle: Float[Array, ""] | None = number_field("free_angle", default=None)
+    preload: Float[Array, ""] | None = number_field("preload", default=None)
+    motor: Prescribed | None = prescribed_field("motor")
+
+    def __check_init__(self):
+        if self.free_angle is not None and self.preload is not None:
+            raise ValueError(
+                "TorsionSpringDamper: give `free_angle` or `preload`, not both: each determines the other "
+                "(preload = −stiffness · free_angle)."
+            )
+
+    @property
+    def bodies(self):
+        return (self.a, self.b)
+
+    preload_shape = ()
+
+    def with_preload(self, preload):
+        return dataclasses.replace(self, preload=preload, free_angle=None)
+
+    def loads(self, bodies):
+        motor = None if self.motor is None else prepared(self.motor)
+        return _torsion(bodies, self, self.stiffness, self.free_angle, self.preload, motor)
+
+
+class AntiRollBar(AbstractForce):
+    """A round bar that is twisted between two bodies: the moment −k θ − c θ̇ on b, k = π G (d⁴ − d_i⁴)/(32 L).
+
+    θ is the angle by which `b` has turned about the bar, fixed in `a`, seen from `a` since the reference configuration;
+    within half a turn. The bodies are its two arms, or what turns with them. A bar of given rate, or preloaded, is a
+    `TorsionSpringDamper`.
+
+    Arguments:
+        a, b: names of the bodies at its two ends.
+        axis: direction of the bar in the reference configuration, inertial frame, shape (3,), any length > 0.
+        diameter: d [m], shape (), > bore.
+        length: L, what is twisted of it [m], shape (), > 0.
+        bore: d_i of a tube [m], shape (), ≥ 0.
+        shear_modulus: G [Pa], shape (), > 0; that of spring steel.
+        damping: c [N m s/rad], shape ().
+
+    `Trajectory.force` gives the angle [rad], its rate [rad/s] and the moment on b [N m]. Raises `ValueError` for a
+    wrong shape, a zero axis, or dimensions that no bar has.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    axis: Float[Array, "3"] = axis_field("axis")
+    diameter: Float[Array, ""] = number_field("diameter")
+    length: Float[Array, ""] = number_field("length")
+    bore: Float[Array, ""] = number_field("bore", default=0.0)
+    shear_modulus: Float[Array, ""] = number_field("shear_modulus", default=79.3e9)
+    damping: Float[Array, ""] = number_field("damping", default=0.0)
+
+    def __check_init__(self):
+        require(
+            lambda d, bore, length, modulus: d > bore >= 0 and length > 0 and modulus > 0,
+            f"AntiRollBar: need `diameter` > `bore` ≥ 0, `length` > 0 and `shear_modulus` > 0, got {self.diameter} m, "
+            f"{self.bore} m, {self.length} m and {self.shear_modulus} Pa.",
+            self.diameter,
+            self.bore,
+            self.length,
+            self.shear_modulus,
+        )
+
+    @property
+    def bodies(self):
+        return (self.a, self.b)
+
+    def loads(self, bodies):
+        section = jnp.pi * (self.diameter**4 - self.bore**4) / 32.0
+        return _torsion(bodies, self, self.shear_modulus * section / self.length)
+
+
+class StopCurve(AbstractSignal):
+    """Tension over extension: −F(x) of a stop in compression, F(x) of one in extension, x what it is squeezed by."""
+
+    gap: Float[Array, ""]
+    stiffness: Float[Array, ""]
+    rounding: Float[Array, ""]
+    progression: Float[Array, ""] | None
+    rebound: bool = eqx.field(static=True)
+
+    def __call__(self, t):
+        sign = 1.0 if self.rebound else -1.0
+        x = jnp.maximum(sign * t - self.gap, 0.0)
+        force = self.stiffness * x**3 / (x**2 + self.rounding**2)
+        if self.progression is not None:
+            force *= 1.0 + (x / self.progression) ** 2
+        return sign * force
+
+
+class BumpStop(AbstractForce):
+    """A stop between two points, which pushes them apart once they have come closer by a gap.
+
+        F = k x³/(x² + w²) (1 + x²/p²),     x = max(0, ℓ₀ − ℓ − gap)
+
+    with the distance ℓ of the points and ℓ₀ in the reference configuration. Two derivatives of F are continuous; the
+    rate grows from 0 to k within some w, and goes on growing over p.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at_a, at_b: the points in the reference configuration [m], inertial frame, shape (3,), apart.
+        gap: [m], shape (); negative where the stop is squeezed in the reference configuration.
+        stiffness: k [N/m], shape ().
+        rounding: w [m], shape (), > 0.
+        progression: p [m], shape (), > 0; None: not progressive, the second factor is 1.
+        rebound: whether it is a rebound stop, which pulls the points together: x = max(0, ℓ − ℓ₀ − gap).
+
+    `Trajectory.force` gives its `LineForce`, of negative tension where it pushes. Raises `ValueError` for wrong shapes,
+    a rounding or progression ≤ 0, or points that coincide.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at_a: Float[Array, "3"] = point_field("at_a")
+    at_b: Float[Array, "3"] = point_field("at_b")
+    gap: Float[Array, ""] = number_field("gap")
+    stiffness: Float[Array, ""] = number_field("stiffness")
+    rounding: Float[Array, ""] = number_field("rounding")
+    progression: Float[Array, ""] | None = number_field("progression", default=None)
+    rebound: bool = eqx.field(static=True, default=False, kw_only=True)
+
+    def __check_init__(self):
+        for name, value in (("rounding", self.rounding), ("progression", self.progression)):
+            if value is not None:
+                require(lambda x: x > 0, f"BumpStop: `{name}` must be positive, got {value} m.", value)
+        require(
+            lambda a, b: (a != b).any(),
+            f"BumpStop: `at_a` and `at_b` coincide at {self.at_a}, so the stop has no direction; move one end.",
+            self.at_a,
+            self.at_b,
+        )
+
+    @property
+    def bodies(self):
+        return (self.a, self.b)
+
+    def loads(self, bodies):
+        curve = StopCurve(self.gap, self.stiffness, self.rounding, self.progression, self.rebound)
+        a, b = (_frame(bodies, name, self.gap.dtype) for name in (self.a, self.b))
+        points, length = (a.local_point(self.at_a), b.local_point(self.at_b)), _distance(self.at_a, self.at_b)
+        return (Attached(CurveLoad(*points, curve, None, length, jnp.zeros_like(length)), self.a, self.b),)
+
+
+class Drag(AbstractForce):
+    """Drag of the air on a point of a body: F = −½ ρ A |u| u, u the velocity of the point less that of the wind.
+
+    Arguments:
+        body: name of the body.
+        at: the point in the reference configuration [m], inertial frame, shape (3,); None: the centre of mass.
+        drag_area: A = c_d · frontal area [m²], shape (), the same in all directions.
+        density: ρ [kg/m³], shape ().
+        wind: [m/s], inertial frame, shape (3,).
+
+    Its derivatives are continuous, its second ones but for u = 0. Raises `ValueError` for wrong shapes.
+    """
+
+    body: str = eqx.field(static=True)
+    at: Float[Array, "3"] | None = point_field("at", default=None)
+    drag_area: Float[Array, ""] = number_field("drag_area")
+    density: Float[Array, ""] = number_field("density", default=1.225)
+    wind: Float[Array, "3"] = point_field("wind", default=(0.0, 0.0, 0.0))
+
+    @property
+    def bodies(self):
+        return (self.body,)
+
+    def loads(self, bodies):
+        body = bodies[self.body]
+        point = body.frame.local_point(body.position if self.at is None else self.at)
+        return (Attached(DragLoad(point, 0.5 * self.density * self.drag_area, self.wind), None, self.body),)
