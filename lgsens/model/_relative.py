@@ -57,6 +57,11 @@ ARM_ANGLES = (
     ANGLE._replace(name="angle_a"),
     Coordinate("angle_b", "rad", lambda seen: jnp.arctan2(seen.orientation[0, 2], seen.orientation[0, 0]), True),
 )
+# in the plane whose normal is the x of the frame on a
+IN_PLANE = tuple(
+    Coordinate(f"displacement_{name}", "m", of)
+    for name, of in (("y", lambda seen: seen.position[1]), ("z", lambda seen: seen.position[2]))
+)
 ROTATION_VECTOR = tuple(Coordinate(f"rotation_{name}", "rad", _rotation(i)) for i, name in enumerate("xyz"))
 
 

@@ -12,9 +12,10 @@ from lgsens._validate import axis_field, number_field, point_field, require
 from lgsens.model._constraints import AbstractClosedFormConstraint, InPlane
 from lgsens.model._drivers import Angle
 from lgsens.model._elements import body_fixed
-from lgsens.model._frames import Frame
+from lgsens.model._frames import Frame, normals
 from lgsens.model._free import TRANSLATIONS, single_rotation
-from lgsens.model._joints import AbstractJoint, CylindricalJoint, _normals
+from lgsens.model._joints import AbstractJoint, CylindricalJoint
+from lgsens.model._relative import ANGLE, DISPLACEMENT, frames_at
 from lgsens.model._stack import constraint_force, constraint_jacobian, constraint_stiffness
 
 
@@ -69,7 +70,7 @@ class Advance(AbstractClosedFormConstraint):
 
 
 def _advance(a: Frame, b: Frame, at, along, axis, per_radian) -> Advance:
-    _, first, second = _normals(axis)
+    _, first, second = normals(axis)
     points = a.local_point(at), b.local_point(at)
     axes = a.local_axis(along / jnp.linalg.norm(along)), a.local_axis(first), a.local_axis(second)
     return Advance(*points, *axes, b.local_axis(first), per_radian)
@@ -103,6 +104,8 @@ class ScrewJoint(AbstractJoint):
         require_nonzero("ScrewJoint", "pitch", self.pitch, " m; without advance it is a RevoluteJoint")
 
     assembled = True
+    coordinates = (ANGLE, DISPLACEMENT)
+    frames = frames_at
 
     @property
     def hinge(self):
@@ -146,6 +149,8 @@ class RackAndPinionJoint(AbstractJoint):
         require_nonzero("RackAndPinionJoint", "radius", self.radius, " m; give the travel per radian")
 
     assembled = True
+    coordinates = (ANGLE,)
+    frames = frames_at
 
     def constraints(self, a, b):
         return (_advance(a, b, self.at, self.direction, self.axis, self.radius),)

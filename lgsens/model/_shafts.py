@@ -9,8 +9,10 @@ from lgsens._validate import as_count, axis_field, number_field, point_field, re
 from lgsens.liegroups import cross
 from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint, Orthogonality
 from lgsens.model._elements import body_fixed
+from lgsens.model._frames import normals
 from lgsens.model._free import ROTATIONS
-from lgsens.model._joints import AbstractJoint, _coincidence, _normals
+from lgsens.model._joints import AbstractJoint, _coincidence
+from lgsens.model._relative import ROTATION_VECTOR, frames_at
 from lgsens.model._screws import require_nonzero
 
 
@@ -180,9 +182,11 @@ class ConstantVelocityJoint(AbstractJoint):
             )
 
     assembled = True
+    coordinates = ROTATION_VECTOR
+    frames = frames_at
 
     def constraints(self, a, b):
-        unit, *across_a = _normals(self.axis_a)
+        unit, *across_a = normals(self.axis_a)
         shaft_b = unit if self.axis_b is None else self.axis_b / jnp.linalg.norm(self.axis_b)
         bend = cross(unit, shaft_b)  # the shortest rotation is v + w × v + w × (w × v)/(1 + c)
         turned = lambda v: v + cross(bend, v) + cross(bend, cross(bend, v)) / (1.0 + jnp.sum(unit * shaft_b))

@@ -4,8 +4,10 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from lgsens._validate import axis_field, point_field
+from lgsens.model._frames import normals
 from lgsens.model._free import TRANSLATIONS, single_rotation
-from lgsens.model._joints import AbstractJoint, _in_plane, _normals, _orthogonality
+from lgsens.model._joints import AbstractJoint, _in_plane, _orthogonality
+from lgsens.model._relative import ANGLE, DISPLACEMENT, IN_PLANE, ROTATION_VECTOR, frames_at
 
 
 class PlanarJoint(AbstractJoint):
@@ -30,6 +32,8 @@ class PlanarJoint(AbstractJoint):
     axis: Float[Array, "3"] = axis_field("axis")
 
     assembled = True
+    coordinates = (*IN_PLANE, ANGLE)
+    frames = frames_at
 
     @property
     def hinge(self):
@@ -40,7 +44,7 @@ class PlanarJoint(AbstractJoint):
         return (axis is None or TRANSLATIONS[axis] in free,), (False,), (False,)
 
     def constraints(self, a, b):
-        unit, first, second = _normals(self.axis)
+        unit, first, second = normals(self.axis)
         tilts = (_orthogonality(a, b, across, unit) for across in (first, second))
         return (_in_plane(a, b, self.at, unit), *tilts)
 
@@ -63,9 +67,11 @@ class PointOnPlaneJoint(AbstractJoint):
     axis: Float[Array, "3"] = axis_field("axis")
 
     assembled = True
+    coordinates = (*IN_PLANE, *ROTATION_VECTOR)
+    frames = frames_at
 
     def constraints(self, a, b):
-        return (_in_plane(a, b, self.at, _normals(self.axis)[0]),)
+        return (_in_plane(a, b, self.at, normals(self.axis)[0]),)
 
 
 class PointOnLineJoint(AbstractJoint):
@@ -87,6 +93,8 @@ class PointOnLineJoint(AbstractJoint):
     axis: Float[Array, "3"] = axis_field("axis")
 
     assembled = True
+    coordinates = (DISPLACEMENT, *ROTATION_VECTOR)
+    frames = frames_at
 
     def constraints(self, a, b):
-        return tuple(_in_plane(a, b, self.at, across) for across in _normals(self.axis)[1:])
+        return tuple(_in_plane(a, b, self.at, across) for across in normals(self.axis)[1:])

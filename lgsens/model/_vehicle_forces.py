@@ -9,13 +9,13 @@ from jaxtyping import Array, Float
 from lgsens._validate import axis_field, number_field, point_field, require
 from lgsens.model._curves import CurveLoad
 from lgsens.model._forces import AbstractForce, Attached, _distance, _frame
-from lgsens.model._joints import _normals
+from lgsens.model._frames import normals
 from lgsens.model._signals import AbstractSignal, Prescribed, prepared, prescribed_field
 from lgsens.model._turning_loads import DragLoad, TorsionLoad
 
 
 def _torsion(bodies, force, stiffness, free_angle=None, preload=None, motor=None) -> tuple[Attached, ...]:
-    _, first, second = _normals(force.axis)
+    _, first, second = normals(force.axis)
     a, b = (_frame(bodies, name, first.dtype) for name in (force.a, force.b))
     axes = a.local_axis(first), a.local_axis(second), b.local_axis(first)
     angle, moment = (jnp.zeros((), first.dtype) if value is None else value for value in (free_angle, preload))
