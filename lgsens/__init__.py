@@ -13,8 +13,10 @@ from lgsens.analysis import (
     ConstraintRank as ConstraintRank,
     Growth as Growth,
     Kinematics as Kinematics,
+    Linearization as Linearization,
     constraint_rank as constraint_rank,
     kinematics as kinematics,
+    linearize as linearize,
     sensitivity_growth as sensitivity_growth,
 )
 from lgsens.criteria import (
