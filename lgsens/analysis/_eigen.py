@@ -4,10 +4,10 @@ A X = X Λ. With G = X⁻¹ A' X, from (A X)' = (X Λ)' and X' = X F,
 
     λ_i' = G_ii,     F_ij = G_ij/(λ_j − λ_i)  (i ≠ j),     F_ii = 0, as the scale of a vector is anybody's choice.
 
-Where eigenvalues coincide, |λ_i − λ_j| ≤ 16 √ε max |λ|, each of them alone has no derivative (of the square of a small
-number ε a pair of them splits by ±ε, or by ±√ε where they share one vector). Their mean has, tr G over them divided by
-their number: it is what the rule gives each of them, and F is left out between them. All of it is finite, and `repeated`
-says where.
+Where eigenvalues coincide, |λ_i − λ_j| ≤ 16 √ε max |λ|, each of them alone has no derivative (a change ε of the matrix
+splits a pair of them by ±ε, or by ±√ε where they share one vector). Their mean has, tr G over them divided by their
+number: it is what the rule gives each of them, and F is left out between them. All of it is finite, and `repeated` says
+where.
 
 Source: Magnus, Econometric Theory 1 (1985) 179; Lancaster, Numer. Math. 6 (1964) 377.
 """

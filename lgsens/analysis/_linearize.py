@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from lgsens._validate import as_float, suggestion
+from lgsens._validate import as_float
 from lgsens.analysis._eigen import eigen, near, scaled
 from lgsens.analysis._inputs import check_inputs, with_inputs
 from lgsens.analysis._second_order import StateSpace, null_space, state_space
@@ -144,7 +144,8 @@ def linearize(
         M_r ẍ + C_r ẋ + K_r x + F_0 u + F_1 u̇ = 0,     w = Z x + S u,  J Z = 0,  Zᵀ M Z = I
 
     Arguments:
-        model: the scene, or an `AbstractSystem`. Joints without redundant equations, and none that constrain velocities.
+        model: the scene, or an `AbstractSystem`. Without redundant equations, and without joints that constrain
+            velocities.
         state: q and v of a steady motion, `initial_state(model)` say; v̇ and λ are those of the motion through it. None:
             the `equilibrium` near the reference configuration.
         inputs: names of joints and forces with a signal or a prescribed number: the displacement or angle of a driver,
@@ -157,10 +158,10 @@ def linearize(
         t0: the time at which time-dependent forces are taken and drivers are held [s], shape ().
         throw: raise if there is no equilibrium, or the motion is not steady.
 
-    Returns a `Linearization`, differentiable by every number of the model: matrices, eigenvalues, mode shapes, frequency
-    responses. Each matrix but the eigenvalues depends on Z, whose derivative is that of one choice of it. Eigenvalues
-    are computed on a CPU only. Raises `ValueError` for names of inputs or outputs that do not fit, constraints that are
-    redundant or of velocities, a mechanism without freedom, and a motion that is not steady; `SimulationError` where no
+    Returns a `Linearization`, differentiable by every number of the model: matrices, eigenvalues, mode shapes,
+    frequency responses. The matrices depend on Z, which is a smooth function of the numbers. Eigenvalues are computed
+    on a CPU only. Raises `ValueError` for names of inputs or outputs that do not fit, constraints that are redundant or
+    of velocities, a mechanism without freedom, and a motion that is not steady; `SimulationError` where no
     equilibrium is found; inside `jit` the numbers are NaN. Sources: `_second_order`, `_steady`.
     """
     system, t0 = as_system(model), as_float(t0, (), "`t0`")
@@ -203,14 +204,15 @@ def _linearize_jit(model, state: State | None, t0, rotation, names: tuple[str, .
         basis = null_space(system, full_jacobian(system, state.q, t0))
         space, steady = at(state, None, basis), accelerates_steadily(system, state, None)
     else:
-        vdot, lam = accelerations(system, state.q, state.v, t0)
-        state = State(q=state.q, v=state.v, vdot=vdot, lam=lam, a=vdot)
+        turning = turning_axes(system, state, rotation)
+        q, v, turn = later(system, state, rotation, turning)
+        twice = lambda now, then: jax.tree.map(lambda *leaves: jnp.stack(leaves), now, then)
+        (q, v), basis = twice((state.q, state.v), (q, v)), null_space(system, full_jacobian(system, state.q, t0))
+        vdot, lam = jax.vmap(lambda q, v: accelerations(system, q, v, t0))(q, v)
+        states = State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
+        spaces = jax.vmap(lambda state, basis: at(state, turning, basis))(states, twice(basis, turn @ basis))
+        (state, space), (_, again) = (jax.tree.map(lambda leaf, i=i: leaf[i], (states, spaces)) for i in (0, 1))
         result = jnp.where(system.is_valid() & finite(state), RESULTS.successful, RESULTS.invalid_numbers)
-        basis, turning = null_space(system, full_jacobian(system, state.q, t0)), turning_axes(system, state, rotation)
-        after, turn = later(system, state, rotation, turning)
-        now_and_later = jax.tree.map(lambda *leaves: jnp.stack(leaves), (state, basis), (after, turn @ basis))
-        spaces = jax.vmap(lambda state, basis: at(state, turning, basis))(*now_and_later)
-        space, again = (jax.tree.map(lambda leaf, i=i: leaf[i], spaces) for i in (0, 1))
         steady = accelerates_steadily(system, state, turning) & _alike(space, again)
     jacobian = full_jacobian(system, state.q, t0)
     redundant = is_redundant(system, constraint_jacobian(system, state.q, t0))

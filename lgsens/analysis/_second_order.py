@@ -5,13 +5,13 @@ the tangents of the system (§3.1 of the paper; K_t holds D_q(Bᵀλ), the geome
 
     M ẅ + C_t ẇ + K_t w + r_u u + r_u̇ u̇ + Jᵀ δλ = 0,     J w + Φ_u u = 0.                                      (a)
 
-Rows of J as equations for w are solved by a basis Z of the null space of J and the response S of the place to the inputs,
+The rows of J are solved by a basis Z of its null space and the response S of the place to the inputs,
 
     w = Z x + S u,     J Z = 0,   Zᵀ M Z = I,     J S = −Φ_u,   Zᵀ M S = 0,
 
-orthonormal in the metric of kinetic energy, in which metres and radians compare, and modes have their usual mass. Zᵀ (a)
-has no δλ and no ü. That constraints are curved is in K_t: a displacement along the constraint is Z x + O(x²) with
-normal part n(x), and the work of the joint forces on n(x) is that of xᵀ Zᵀ D_q(Bᵀλ) Z x / 2.
+orthonormal in the metric of kinetic energy, in which metres and radians compare. Zᵀ (a) has no δλ and no ü. That
+constraints are curved is in K_t: a displacement along them is Z x + n(x) with a normal part n = O(x²), and the joint
+forces do the work xᵀ Zᵀ D_q(Bᵀλ) Z x / 2 on that.
 
 In steady motion. Let the coordinates of displacements and velocities be seen in axes that turn with the motion,
 w = exp(Γ t) w_c, and such that all matrices are constant in them (`_steady`); w and δv without mark are those at one

@@ -1,4 +1,4 @@
-"""Steady motions: axes that turn with a motion, in which the equations of small motions about it have constant matrices.
+"""Steady motions, and axes that turn with them, in which the equations of small motions have constant matrices.
 
 Let the equations stay the same when the whole scene turns with the constant angular velocity W (gravity along W, joints
 and forces on the ground symmetric about it), and each body i by s_i about an axis of its own frame (a body of
@@ -13,9 +13,11 @@ is steady: every instant of it is the first one, turned. A displacement turned l
 and matrices of the equations for w_c are constant. W = 0 is a rotor in axes that do not turn, on any bearings; W = Ω
 a shaft of any section in axes that turn with it, on isotropic bearings; both together a top that precesses.
 
-Whether a motion is steady is checked: v̇ = Γ v, and the state-space matrices a while later, with the turned basis exp(Γ t) Z,
-are those of the beginning.
+Whether a motion is steady is checked: v̇ = Γ v, and the state-space matrices a while later, with the turned basis
+exp(Γ t) Z, are those of the beginning.
 """
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -65,8 +67,8 @@ def _seen(system: MultibodySystem, state: State, rotation) -> Float[Array, "N 3"
 
 def later(
     system: AbstractSystem, state: State, rotation: Float[Array, "3"], turning: Float[Array, "k k"]
-) -> tuple[State, Float[Array, "k k"]]:
-    """The state a while later in a motion that is steady, and exp(Γ t) until then."""
+) -> tuple[Any, Float[Array, " k"], Float[Array, "k k"]]:
+    """q and v a while later in a motion that is steady, and exp(Γ t) until then."""
     k, speed = system.group.dim, jnp.max(jnp.abs(state.v) / system.coordinate_scale())
     time = _ANGLE / jnp.where(speed > 0.0, speed, 1.0)
     augmented = jnp.zeros((k + 1, k + 1), state.v.dtype).at[:k, :k].set(turning).at[:k, k].set(state.v)
@@ -78,9 +80,7 @@ def later(
         q = system.group.retract(q, time * _coordinates(system, zero, _seen(system, state, rotation)))
         moves = system.twists(way)[:count, :3]
         way = _coordinates(system, moves, time * _own_spin(system, state, rotation))
-    q = system.group.retract(q, way)
-    v, vdot = turn @ state.v, turn @ state.vdot
-    return State(q=q, v=v, vdot=vdot, lam=state.lam, a=vdot), turn
+    return system.group.retract(q, way), turn @ state.v, turn
 
 
 def accelerates_steadily(system: AbstractSystem, state: State, turning: Float[Array, "k k"] | None) -> Bool[Array, ""]:

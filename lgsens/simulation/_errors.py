@@ -109,6 +109,7 @@ def _exception(result: int, details: dict[str, Any], names: tuple[str, ...], not
         RESULTS.redundant_constraints,
         RESULTS.position_failed,
         RESULTS.invalid_numbers,
+        RESULTS.not_steady,
     )
     kind = ValueError if result in bad_input else SimulationError
     note = note if result == RESULTS.redundant_constraints else ""
