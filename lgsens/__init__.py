@@ -17,6 +17,7 @@ from lgsens.analysis import (
     constraint_rank as constraint_rank,
     kinematics as kinematics,
     linearize as linearize,
+    random_road as random_road,
     sensitivity_growth as sensitivity_growth,
 )
 from lgsens.criteria import (

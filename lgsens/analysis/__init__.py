@@ -7,4 +7,5 @@ from lgsens.analysis._linearize import (
     ModeShape as ModeShape,
     linearize as linearize,
 )
+from lgsens.analysis._random_road import random_road as random_road
 from lgsens.analysis._rank import ConstraintRank as ConstraintRank, constraint_rank as constraint_rank

@@ -59,7 +59,7 @@ def check_inputs(model: Any, names: Sequence[str]) -> None:
         if name not in known:
             raise ValueError(
                 f"`inputs`: {suggestion(name, known)}, the joints and forces with a signal. A force of one's own as "
-                "input is an `AppliedForce` whose signal is FlatRoad(0)."
+                "input is an `AppliedForce` whose signal is FlatRoad()."
             )
         if name in model.joints and name in model.forces:
             raise ValueError(f"`inputs`: {name!r} is a joint and a force; rename one of them.")
