@@ -233,6 +233,17 @@ def test_free_body_about_a_principal_axis():
         lg.linearize(model, state)
 
 
+def test_a_failure_inside_jit_is_nan(car):
+    """And eigenvalues, which are complex, are NaN as matrices are."""
+    run = jax.jit(lambda: lg.linearize(lg.examples.free_rigid_body(), lg.initial_state(lg.examples.free_rigid_body())))
+    found = run()
+    assert np.all(np.isnan(found.A)) and np.all(np.isnan(found.eigenvalues)) and np.all(np.isnan(found.vectors))
+    assert found.result == lg.RESULTS.not_steady
+    with pytest.raises(ValueError, match=says("The motion is not steady")):
+        lg.raise_if_failed(found)
+    assert lg.raise_if_failed(car) is car
+
+
 def test_rotor_on_springs():
     """Whirl of a rotor of revolution, J_t φ'' − i J_p Ω φ' + k a² φ = 0, translation ω² = k/m apart from it.
 
@@ -398,6 +409,7 @@ def test_five_link_car_beside_its_simulation():
         np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_five_link_car_by_hardpoints():
     """Of eigenvalues along a random direction, by central differences of sixth order: 1e-3 m of arms of 0.3 m."""
     direction = np.random.default_rng(0).normal(size=(5, 3))

@@ -25,8 +25,8 @@ class _Beside(AbstractSignal):
         return more if own is None else own + more
 
 
-def _with(element: Any, more: Float[Array, "3"] | None, t0) -> tuple[Any, int]:
-    """The element with `more` beside each of its signals, and how many these are."""
+def _with(element: Any, more: Any, t0) -> tuple[Any, int]:
+    """The element with `more` beside each of its signals (None: as it is), and how many these are."""
     found, count = {}, 0
     for field in dataclasses.fields(element):
         own, number = getattr(element, field.name), 0

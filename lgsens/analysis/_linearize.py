@@ -186,7 +186,7 @@ def linearize(
 
 
 @eqx.filter_jit
-def _linearize_jit(model, state: State | None, t0, rotation, names: tuple[str, ...], outputs: Any):
+def _linearize_jit(model, given: State | None, t0, rotation, names: tuple[str, ...], outputs: Any):
     system = as_system(model)
 
     def built(inputs) -> AbstractSystem:
@@ -198,16 +198,16 @@ def _linearize_jit(model, state: State | None, t0, rotation, names: tuple[str, .
 
     at = lambda state, turning, basis: state_space(built, measured, len(names), state, t0, turning, basis)
     details: dict[str, Any] = {}
-    if state is None:
+    if given is None:
         initial = equilibrium(system, t0)
         state, result, details = initial.state, initial.result, {"violation": initial.violation}
         basis = null_space(system, full_jacobian(system, state.q, t0))
         space, steady = at(state, None, basis), accelerates_steadily(system, state, None)
     else:
-        turning = turning_axes(system, state, rotation)
-        q, v, turn = later(system, state, rotation, turning)
+        turning = turning_axes(system, given, rotation)
+        q, v, turn = later(system, given, rotation, turning)
         twice = lambda now, then: jax.tree.map(lambda *leaves: jnp.stack(leaves), now, then)
-        (q, v), basis = twice((state.q, state.v), (q, v)), null_space(system, full_jacobian(system, state.q, t0))
+        (q, v), basis = twice((given.q, given.v), (q, v)), null_space(system, full_jacobian(system, given.q, t0))
         vdot, lam = jax.vmap(lambda q, v: accelerations(system, q, v, t0))(q, v)
         states = State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
         spaces = jax.vmap(lambda state, basis: at(state, turning, basis))(states, twice(basis, turn @ basis))
