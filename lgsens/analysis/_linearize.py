@@ -177,7 +177,9 @@ def linearize(
             f"`model`: {rolling} constrain velocities only, which `linearize` cannot treat; leave them out."
         )
     if system.group.dim - system.num_states <= len(system.constraint_names):
-        raise ValueError("`model`: its joints leave it no freedom to move; `constraint_rank` tells which.")
+        raise ValueError(
+            "`model`: its joints have as many equations as it has coordinates, and leave no freedom: see `constraint_rank`."
+        )
     if rotation is not None and state is None:
         raise ValueError("`rotation` is that of a motion; give its `state` as well, `initial_state(model)` say.")
     rotation = as_float(jnp.zeros(3) if rotation is None else rotation, (3,), "`rotation`")
