@@ -13,8 +13,11 @@ from lgsens.analysis import (
     ConstraintRank as ConstraintRank,
     Growth as Growth,
     Kinematics as Kinematics,
+    Linearization as Linearization,
     constraint_rank as constraint_rank,
     kinematics as kinematics,
+    linearize as linearize,
+    random_road as random_road,
     sensitivity_growth as sensitivity_growth,
 )
 from lgsens.criteria import (

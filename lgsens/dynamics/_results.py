@@ -17,6 +17,7 @@ class RESULTS(IntEnum):
     singular_configuration = 8
     turn_not_resolved = 9
     invalid_numbers = 10
+    not_steady = 11
 
     @property
     def message(self) -> str:
@@ -67,6 +68,11 @@ _MESSAGES = {
         "A number of the scene is not finite, or one that no body has (a mass that is not positive, an inertia whose "
         "moments break the triangle inequality, an orientation far from a rotation), or `t1` is not later than `t0`. "
         "Bound what an optimizer may change; a model that is built outside of `jit` names the element."
+    ),
+    RESULTS.not_steady: (
+        "The motion is not steady: the equations of small motions about it change with time. Linearize at an "
+        "equilibrium, or name the `rotation` of axes in which it does not change (a body that turns about another axis "
+        "than that of its symmetry has none)."
     ),
     RESULTS.steps_exhausted: (
         "Error control needs more steps than `num_steps` allows. Try more `num_steps` or a looser `tolerance`."

@@ -305,4 +305,4 @@ def prescribed_field(name: str) -> Any:
             raise _no_signal(name, "a number or a signal", value)
         return value if value is None or isinstance(value, AbstractSignal) else as_float(value, (), f"`{name}`")
 
-    return eqx.field(converter=convert, kw_only=True, default=None)
+    return eqx.field(converter=convert, kw_only=True, default=None, metadata={"prescribed": True})

@@ -19,6 +19,7 @@ from lgsens.plotting._panels import (
     suspension_curves as suspension_curves,
     time_histories as time_histories,
 )
+from lgsens.plotting._root_locus import root_locus as root_locus
 from lgsens.plotting._sensitivities import sensitivities as sensitivities
 from lgsens.plotting._style import (
     COLOURS as COLOURS,

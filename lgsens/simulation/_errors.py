@@ -109,6 +109,7 @@ def _exception(result: int, details: dict[str, Any], names: tuple[str, ...], not
         RESULTS.redundant_constraints,
         RESULTS.position_failed,
         RESULTS.invalid_numbers,
+        RESULTS.not_steady,
     )
     kind = ValueError if result in bad_input else SimulationError
     note = note if result == RESULTS.redundant_constraints else ""
@@ -149,7 +150,7 @@ def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tupl
     # Leaves depend on the callback, which is therefore not removed. A product and no selection: the derivatives of a
     # failure are NaN too, where those of a selection would be zero.
     poison = lambda leaf: leaf * jnp.where(passed, 1.0, jnp.nan).astype(leaf.dtype)
-    return jax.tree.map(lambda leaf: poison(leaf) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, tree)
+    return jax.tree.map(lambda leaf: poison(leaf) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf, tree)
 
 
 def raise_if_failed(found: Any) -> Any:
@@ -178,7 +179,8 @@ def raise_if_failed(found: Any) -> Any:
     lane = tuple(failed[0])
     code = int(codes[lane])
     one = lambda name: jax.tree.map(lambda leaf: jnp.asarray(leaf)[lane], getattr(found, name, None))
-    system, t, stats = one("system"), one("t"), one("stats")
+    system, stats = one("system"), one("stats")
+    t: Any = jax.tree.map(jnp.atleast_1d, one("t"))
     details: dict[str, Any] = {}
     if system is not None and code in (RESULTS.assembly_failed, RESULTS.redundant_constraints):
         initial = initial_state(system, t[0])

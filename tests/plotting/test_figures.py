@@ -275,6 +275,19 @@ def test_sensitivities_along_a_trajectory():
         plotting.sensitivities(trajectory, derivative, bodies=[], joints=[])
 
 
+def test_root_locus():
+    """Of z'' + c z' + z = 0: one of each pair of conjugates, and its damped frequency over c."""
+    damping = np.linspace(0.0, 1.0, 5)
+    roots = -damping / 2 + 1j * np.sqrt(1 - damping**2 / 4)
+    fig = plotting.root_locus(damping, np.stack([roots, roots.conj()], axis=1), "damping [N s/m]")
+    points = np.asarray(fig.axes[0].collections[0].get_offsets())
+    np.testing.assert_array_equal(points, np.stack([roots.real, roots.imag], axis=1))
+    np.testing.assert_allclose(fig.axes[1].lines[0].get_ydata(), roots.imag / (2 * np.pi), rtol=1e-15)
+    assert fig.axes[1].get_xlabel() == "damping [N s/m]"
+    with pytest.raises(ValueError, match="shapes"):
+        plotting.root_locus(damping, roots)
+
+
 def test_suspension_curves():
     travel = np.linspace(-0.05, 0.05, 11)
     values = lambda factor: SuspensionCurves(travel, *(factor * i * travel for i in range(1, 9)))

@@ -1,0 +1,82 @@
+"""The stationary response to a random road, by the Lyapunov equation of the linearized car.
+
+The height z of an ISO 8608 road has the power spectral density G_d(n) = G_d(n_0) (n/n_0)⁻² over wave numbers n, so that
+at the speed V its rate ż is white noise, one-sided in Hz and as E[ż(t) ż(t + τ)] = S δ(τ)
+
+    G_ż = (2π n_0)² G_d(n_0) V = 2 S.
+
+z itself has no variance. With the static response y_s, A y_s + B = 0, and y = ỹ + y_s z, of ẏ = A y + B z remains
+
+    ỹ' = A ỹ − y_s ż,     A P + P Aᵀ + S y_s y_sᵀ = 0,     P = E[ỹ ỹᵀ],     E[f²] = C P Cᵀ
+
+for outputs f = C y + D z that do not follow the road, C y_s + D = 0: accelerations, travel, the load of a tyre.
+
+The gradient. P depends on its right-hand side linearly, and with the adjoint Lyapunov equation Aᵀ Λ + Λ A + P̄ = 0 of
+what a criterion asks, P̄ = ∂Ψ/∂P, it is Ψ' = Λ : (2 A' P + (S y_s y_sᵀ)'): one equation for all parameters, the
+transpose of the solution of the first one, as which it is written.
+
+Sources: ISO 8608:2016; Gobbi & Mastinu, J. Sound Vib. 245 (2001) 457.
+"""
+
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg as jsl
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from lgsens._validate import as_float, require
+from lgsens.analysis._linearize import Linearization
+
+
+def lyapunov(a: Float[Array, "n n"], load: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """P of A P + P Aᵀ + Q = 0."""
+    product = lambda p: a @ p + p @ a.T
+    solve = lambda _, rhs: jsl.solve_sylvester(a, a.T, rhs)
+    transposed = lambda _, rhs: jsl.solve_sylvester(a.T, a, rhs)
+    return lax.custom_linear_solve(product, -load, solve, transposed)
+
+
+@jax.jit
+def _deviations(linear: Linearization, intensity):
+    a, b, c = linear.A, linear.B, linear.C
+    rest = -jnp.linalg.solve(a, b)[:, 0]  # y_s
+    covariance = lyapunov(a, intensity * jnp.outer(rest, rest))
+    square = jnp.sum((c @ covariance) * c, axis=1)
+    follows, size = (c @ rest + linear.D[:, 0]), jnp.abs(c) @ jnp.abs(rest) + jnp.abs(linear.D[:, 0])
+    eps = jnp.finfo(a.dtype).eps
+    infinite = (jnp.abs(follows) > jnp.sqrt(eps) * size) | (linear.D1[:, 0] != 0.0) | (linear.D2[:, 0] != 0.0)
+    none = square <= 0.0
+    deviation = jnp.where(none, 0.0, jnp.sqrt(jnp.where(none, 1.0, square)))
+    settles = jnp.max(jnp.real(linear.eigenvalues)) < 0.0
+    return jnp.where(settles, jnp.where(infinite, jnp.inf, deviation), jnp.nan)
+
+
+def random_road(linear: Linearization, *, roughness, speed, wave_number=0.1) -> dict[str, Float[Array, ""]]:
+    """The standard deviation of each output of a car on a random road, ISO 8608, at constant speed.
+
+        A P + P Aᵀ + S y_s y_sᵀ = 0,     σ² = C P Cᵀ,     S = (2π n_0)² G_d(n_0) V/2,     y_s = −A⁻¹B
+
+    Arguments:
+        linear: the car, `linearize(model, inputs=("tyre",), outputs=…)`: its one input is the road's height.
+        roughness: G_d(n_0) [m³], shape (): 16e-6, 64e-6, 256e-6 for roads of class A, B, C.
+        speed: V [m/s], shape ().
+        wave_number: n_0 [cycles/m], shape ().
+
+    Returns by the name of the output its standard deviation (RMS about the equilibrium), shape (), in its unit; inf for
+    one that follows the road, as a height does, or sees its rate. Differentiable, by the adjoint Lyapunov equation.
+    Raises `ValueError` for another number of inputs, and a car that does not settle (a wheel that turns freely: lock
+    it); inside `jit` that is NaN. Source: `_random_road`.
+    """
+    if len(linear.inputs) != 1:
+        raise ValueError(f"`linear` must have one input, the road, got {linear.inputs}.")
+    numbers = {"roughness": roughness, "speed": speed, "wave_number": wave_number}
+    roughness, speed, wave_number = (as_float(value, (), f"`{name}`") for name, value in numbers.items())
+    require(
+        lambda values: np.max(values.real) < 0.0,
+        "`linear` must settle, all eigenvalues with Re λ < 0, and has one that does not. Lock what turns freely (a "
+        "wheel on its hinge), hold what floats.",
+        linear.eigenvalues,
+    )
+    intensity = (2.0 * jnp.pi * wave_number) ** 2 * roughness * speed / 2.0
+    return dict(zip(linear.outputs, _deviations(linear, intensity)))
