@@ -165,7 +165,7 @@ SLOPE, PLANE = (0.0, 0.6, 0.8), (0.6, 0.0, 0.8)
 C, C_R, M_0, SPIN = np.array([(1.0, 2.0, 3.0), (0.3, 0.2, 0.1), (0.5, -0.2, 0.1), (0.4, -0.5, 0.6)])
 
 
-def workshop():
+def workshop(solver=None):
     body = lambda mass, at=ORIGIN, inertia=(0.1, 0.2, 0.3), **more: lg.RigidBody(mass, inertia, position=at, **more)
     middle = tuple(np.array([0.5, 3.0, 0.0]) + 0.5 * np.array(SHAFT_B))
     bodies = {
@@ -213,11 +213,14 @@ def workshop():
             None, "stopped", at_a=(0.0, 12.0, 0.0), at_b=(0.0, 12.0, 1.0), gap=-0.02, stiffness=900.0, rounding=0.01
         ),
     }
-    return lg.Model(bodies, joints, forces)
+    return lg.Model(bodies, joints, forces, linear_solver=solver)
 
 
-def test_accelerations_of_the_workshop():
-    model = workshop()
+@pytest.mark.parametrize(
+    "solver", [None, *(pytest.param(solver, marks=pytest.mark.slow) for solver in (lg.DenseLU(), lg.BlockSparse()))]
+)
+def test_accelerations_of_the_workshop(solver):
+    model = workshop(solver)
     state = eqx.filter_jit(lg.initial_state)(model)
     system = model.system()
     ends = np.cumsum([len(free) for free in system.free])[:-1]
