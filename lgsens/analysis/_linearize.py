@@ -178,7 +178,8 @@ def linearize(
         )
     if system.group.dim - system.num_states <= len(system.constraint_names):
         raise ValueError(
-            "`model`: its joints have as many equations as it has coordinates, and leave no freedom: see `constraint_rank`."
+            "`model`: its joints have as many equations as it has coordinates, and leave no freedom: see "
+            "`constraint_rank`."
         )
     if rotation is not None and state is None:
         raise ValueError("`rotation` is that of a motion; give its `state` as well, `initial_state(model)` say.")
