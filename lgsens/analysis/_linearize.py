@@ -60,7 +60,8 @@ class Linearization(eqx.Module):
         eigenvalues: λ of A [1/s], shape (n,), by size, of conjugates that with Im λ > 0 first.
         vectors: eigenvectors of A by columns, shape (n, n), the part x of each with |x| = 1 and its largest entry real.
         repeated: whether an eigenvalue coincides with another one, to 2e-7 of the largest, shape (n,). Its derivative
-            is that of their mean, and those of `vectors` leave out what turns them into each other.
+            is that of their mean, and those of `vectors` leave out what turns them into each other. Beside a pair that
+            shares one vector (a wheel that turns freely) derivatives of the others are good to some √ε = 1e-8 … 1e-7.
         state: where the motion is linearized.
         t: the time there [s], shape ().
         result: a value of `RESULTS`, shape (), int32; 0 is success.
@@ -178,8 +179,8 @@ def linearize(
         )
     if system.group.dim - system.num_states <= len(system.constraint_names):
         raise ValueError(
-            "`model`: its joints have as many equations as it has coordinates, and leave no freedom: see "
-            "`constraint_rank`."
+            "`model`: its joints have as many equations as it has coordinates, and leave no freedom; `constraint_rank`"
+            " tells."
         )
     if rotation is not None and state is None:
         raise ValueError("`rotation` is that of a motion; give its `state` as well, `initial_state(model)` say.")

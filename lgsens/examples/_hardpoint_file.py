@@ -15,7 +15,8 @@ from lgsens._validate import as_float
 from lgsens.model import RigidBody
 
 DATA = resources.files("lgsens.examples") / "data"
-DEFAULT, DEFAULT_FILE = "quarter-car", "five_link_suspension"
+DEFAULT = "quarter-car"  # what the car that ships with lgsens is called, and its file
+DEFAULT_FILE = "five_link_suspension"
 
 
 def _is_number(value: Any) -> bool:
