@@ -115,3 +115,8 @@ def axis_field(name: str) -> Any:
         return axis
 
     return eqx.field(converter=convert, kw_only=True)
+
+
+def require_nonzero(what: str, name: str, value, advice: str) -> None:
+    """Raise `ValueError` for a number of `what` that is zero; `advice` follows it: its unit, or what to do."""
+    require(lambda value: value != 0, f"{what}: `{name}` must not be zero, got {value}{advice}.", value)

@@ -182,8 +182,7 @@ def console() -> NoReturn:
     try:
         status = _run(arguments)
     except KeyboardInterrupt:
-        status = _interrupted(arguments)
-        _leave(status)
+        _leave(_interrupted(arguments))  # here, where nothing has been destroyed yet
     if status == INTERRUPTED:
         _leave(status)
     sys.exit(status)

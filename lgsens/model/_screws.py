@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._validate import axis_field, number_field, point_field, require
+from lgsens._validate import axis_field, number_field, point_field, require_nonzero
 from lgsens.model._constraints import AbstractClosedFormConstraint, InPlane
 from lgsens.model._drivers import Angle
 from lgsens.model._elements import body_fixed
@@ -74,10 +74,6 @@ def _advance(a: Frame, b: Frame, at, along, axis, per_radian) -> Advance:
     points = a.local_point(at), b.local_point(at)
     axes = a.local_axis(along / jnp.linalg.norm(along)), a.local_axis(first), a.local_axis(second)
     return Advance(*points, *axes, b.local_axis(first), per_radian)
-
-
-def require_nonzero(what: str, name: str, value, unit: str) -> None:
-    require(lambda value: value != 0, f"{what}: `{name}` must not be zero, got {value}{unit}.", value)
 
 
 class ScrewJoint(AbstractJoint):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_count, axis_field, number_field, point_field, require
+from lgsens._validate import as_count, axis_field, number_field, point_field, require, require_nonzero
 from lgsens.liegroups import cross
 from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint, Orthogonality
 from lgsens.model._elements import body_fixed
@@ -13,7 +13,6 @@ from lgsens.model._frames import normals
 from lgsens.model._free import ROTATIONS
 from lgsens.model._joints import AbstractJoint, _coincidence
 from lgsens.model._relative import ROTATION_VECTOR, frames_at
-from lgsens.model._screws import require_nonzero
 
 
 class Gearing(AbstractConstraint):
