@@ -38,7 +38,6 @@ import gc
 import os
 import warnings
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -46,7 +45,6 @@ import jax
 import numpy as np
 from jax import lax
 from jax.experimental.compilation_cache import compilation_cache as jax_cache
-from jax.flatten_util import ravel_pytree
 from jaxlib.version import __version_info__ as _VERSION
 
 _SUMS = "--xla_cpu_experimental_ynn_fusion_type"
@@ -151,24 +149,6 @@ def scan(body: Callable[[Carry, Any], tuple[Carry, Y]], init: Carry, xs: Any, **
         init = alike(init, jax.eval_shape(body, init, jax.tree.map(lambda leaf: leaf[0], xs))[0])
         return lax.scan(same, init, xs, **options)
     return lax.scan(body, init, xs, **options)
-
-
-def linear_solve(matvec: Callable, b: Any, solve: Callable, transpose_solve: Callable | None = None, symmetric=False):
-    """`lax.custom_linear_solve`, which inside of `shard_map` has to be spared two things.
-
-    JAX makes the constants of these functions vary without telling the functions, so they are hidden in a `jit`; and
-    transposed it gives them zeros that do not vary, of several arrays those on which nothing depends, so b is one.
-    """
-    if not jax.sharding.get_abstract_mesh().manual_axes:
-        return lax.custom_linear_solve(matvec, b, solve, transpose_solve, symmetric)
-    flat, unravel = ravel_pytree(b)
-
-    def hidden(function: Callable) -> Callable:
-        inner = jax.jit(lambda flat: ravel_pytree(function(unravel(flat)))[0])
-        return lambda *args: inner(args[-1])
-
-    back = None if transpose_solve is None else hidden(partial(transpose_solve, matvec))
-    return unravel(lax.custom_linear_solve(hidden(matvec), flat, hidden(partial(solve, matvec)), back, symmetric))
 
 
 def compilation_cache(folder: str | os.PathLike | None = None) -> Path:

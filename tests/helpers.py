@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import jaxprs_in_params
 from scipy.spatial.transform import Rotation
 
 import lgsens as lg
 from lgsens.liegroups import Pose, R3xSO3
+from lgsens.linear import programs_in
 from lgsens.model import AbstractForce, AbstractLoad, Attached, Frame
 
 EPS = float(np.finfo(np.float64).eps)
@@ -176,7 +176,7 @@ def equations(jaxpr) -> Iterator[Any]:
     """The equations of a program, in all its parts."""
     for equation in jaxpr.eqns:
         yield equation
-        for inner in jaxprs_in_params(equation.params):
+        for inner in programs_in(equation):
             yield from equations(inner)
 
 

@@ -12,8 +12,9 @@ from helpers import says
 from jax import export
 
 import lgsens as lg
-from lgsens._xla import fori_loop, linear_solve, scan, while_loop
+from lgsens._xla import fori_loop, scan, while_loop
 from lgsens.examples import spinning_top
+from lgsens.linear import LinearEquations, linear_solve
 
 P = jnp.array([0.7, 1.0])  # angle, length
 
@@ -124,10 +125,12 @@ def test_constants_in_loops_and_solves_over_a_mesh():
     order = np.array([2, 0, 1])
 
     def of_solve(x):  # which can be transposed, as `while_loop` cannot
-        times = lambda parts: (x * parts[0][order], parts[1])
-        solve = lambda _, parts: (parts[0][np.argsort(order)] / x, parts[1])
-        back = lambda _, parts: (parts[0][order] / x, parts[1])
-        y, _ = linear_solve(times, (jnp.stack([x, x**2, x**3]), x), solve, back)  # [x, x², 1]
+        turned = LinearEquations(
+            lambda x, parts: (x * parts[0][order], parts[1]),
+            lambda x, parts: (parts[0][np.argsort(order)] / x, parts[1]),
+            lambda x, parts: (parts[0][order] / x, parts[1]),
+        )
+        y, _ = linear_solve(turned, x, (jnp.stack([x, x**2, x**3]), x))  # [x, x², 1]
         return jnp.sum(y * jnp.array([1.0, 10.0, 100.0]))
 
     np.testing.assert_allclose(over_mesh(jax.grad(of_solve))(designs), 1.0 + 20.0 * designs, rtol=1e-12)

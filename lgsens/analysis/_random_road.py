@@ -22,19 +22,22 @@ import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, require
 from lgsens.analysis._linearize import Linearization
+from lgsens.linear import LinearEquations, linear_solve
+
+_LYAPUNOV = LinearEquations(
+    lambda a, p: a @ p + p @ a.T,
+    lambda a, rhs: jsl.solve_sylvester(a, a.T, rhs),
+    lambda a, rhs: jsl.solve_sylvester(a.T, a, rhs),
+)
 
 
 def lyapunov(a: Float[Array, "n n"], load: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """P of A P + P Aᵀ + Q = 0."""
-    product = lambda p: a @ p + p @ a.T
-    solve = lambda _, rhs: jsl.solve_sylvester(a, a.T, rhs)
-    transposed = lambda _, rhs: jsl.solve_sylvester(a.T, a, rhs)
-    return lax.custom_linear_solve(product, -load, solve, transposed)
+    return linear_solve(_LYAPUNOV, a, -load)
 
 
 @jax.jit

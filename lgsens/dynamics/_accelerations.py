@@ -20,7 +20,6 @@ diagonal, since the rows of J have different units. Where constraints may be red
 solution refined (`_redundant`).
 """
 
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -30,11 +29,11 @@ import jax.scipy.linalg as jsl
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens._xla import linear_solve
 from lgsens.dynamics._constraints import constraint_acceleration, fixed_velocity_rate, full_jacobian
 from lgsens.dynamics._matrices import kkt_product
 from lgsens.dynamics._redundant import SOFTNESS, refined, softness
 from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem
+from lgsens.linear import LinearEquations, linear_solve
 
 
 class Inertia(eqx.Module):
@@ -81,25 +80,28 @@ class ConstrainedInertia(eqx.Module):
         factor = jnp.linalg.cholesky(unit, symmetrize_input=False)
         return cls(inertia, jacobian, factor, scale)
 
-    def _eliminate(self, rhs):
-        inverse, jacobian = lax.stop_gradient((self.inertia.inverse, self.jacobian))
-        f, c = rhs[: inverse.shape[0]], rhs[inverse.shape[0] :]
+    def product(self, unknown):
+        """A [x; μ], two parts."""
+        return kkt_product(self.inertia.mass, self.jacobian, *unknown)
+
+    def eliminated(self, rhs):
+        """x and μ."""
+        return refined(self.product, self._eliminated, rhs) if self.inertia.redundant else self._eliminated(rhs)
+
+    def _eliminated(self, rhs):
+        (f, c), inverse, jacobian = rhs, self.inertia.inverse, self.jacobian
         free = inverse @ f
         if c.shape[0] == 0:  # XLA compiles no triangular solve of size 0 where it cannot remove it
-            return free
+            return free, c
         mu = self.scale * jsl.cho_solve((self.factor, True), self.scale * (jacobian @ free - c))
-        return jnp.concatenate([free - inverse @ (mu @ jacobian), mu])
+        return free - inverse @ (mu @ jacobian), mu
 
     def solve(self, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
         """x and μ of A [x; μ] = [force; rate]; its own transpose, and differentiable through M and J."""
-        rhs = jnp.concatenate([force, rate])
-        product = partial(kkt_product, self.inertia.mass, self.jacobian)
+        return linear_solve(_BY_ELIMINATION, self, (force, rate))
 
-        def eliminate(product, rhs):
-            return refined(product, self._eliminate, rhs) if self.inertia.redundant else self._eliminate(rhs)
 
-        solution = linear_solve(product, rhs, eliminate, symmetric=True)
-        return solution[: force.shape[0]], solution[force.shape[0] :]
+_BY_ELIMINATION = LinearEquations(ConstrainedInertia.product, ConstrainedInertia.eliminated)
 
 
 def equations_of_motion(system: AbstractSystem, q, v, vdot, lam, t):

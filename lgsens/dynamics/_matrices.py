@@ -1,6 +1,5 @@
 """The matrices of a system as its linear solver wants them, sparse or dense, and the equations with M and B."""
 
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -9,11 +8,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens._xla import linear_solve
 from lgsens.dynamics._constraints import full_jacobian
 from lgsens.dynamics._redundant import refined, softness
 from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem, Tangents
-from lgsens.linear import LU, Factors, Matrix, SparseMatrix, tuned
+from lgsens.linear import LU, Factors, LinearEquations, Matrix, SparseMatrix, linear_solve, tuned
 
 
 def _sparse(system: AbstractSystem) -> AbstractSparseSystem | None:
@@ -102,10 +100,9 @@ def kkt_solve(mass, jacobian, force, rate) -> tuple[Float[Array, " k"], Float[Ar
     return solution[:k], scale * solution[k:]
 
 
-def kkt_product(mass: Matrix, jacobian: Matrix, unknown) -> Float[Array, " k+m"]:
+def kkt_product(mass: Matrix, jacobian: Matrix, x, mu) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
     """[[M, Bᵀ], [B, 0]] [x; μ]."""
-    x, mu = unknown[: mass.shape[0]], unknown[mass.shape[0] :]
-    return jnp.concatenate([mass @ x + mu @ jacobian, jacobian @ x])
+    return mass @ x + mu @ jacobian, jacobian @ x
 
 
 class ConstrainedMass(eqx.Module):
@@ -129,11 +126,18 @@ class ConstrainedMass(eqx.Module):
 
     def solve(self, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
         """x and μ of M x + Jᵀμ = force, J x = rate; differentiable through M and J, by one more solve."""
-        factors, k = self.factors, force.shape[0]
-        if factors is None:
+        if self.factors is None:
             return kkt_solve(self.mass, self.jacobian, force, rate)
-        product = partial(kkt_product, self.mass, self.jacobian)
-        once = lambda rhs: jnp.concatenate(factors.solve(rhs[:k], rhs[k:]))
-        solve = lambda product, rhs: refined(product, once, rhs) if self.soft else once(rhs)
-        solution = linear_solve(product, jnp.concatenate([force, rate]), solve, symmetric=True)
-        return solution[:k], solution[k:]
+        return linear_solve(_WITH_FACTORS, self, (force, rate))
+
+    def product(self, unknown):
+        """The two rows for x and μ."""
+        return kkt_product(self.mass, self.jacobian, *unknown)
+
+    def with_factors(self, rhs):
+        """x and μ by the factors."""
+        once = lambda rhs: self.factors.solve(*rhs)
+        return refined(self.product, once, rhs) if self.soft else once(rhs)
+
+
+_WITH_FACTORS = LinearEquations(ConstrainedMass.product, ConstrainedMass.with_factors)

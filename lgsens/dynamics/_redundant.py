@@ -80,7 +80,8 @@ def refined(product: Callable, solve: Callable, rhs):
     """The solution of K y = b by solves with K_c."""
     solution = solve(rhs)
     for _ in range(_ITERATIONS - 1):
-        solution = solution + solve(rhs - product(solution))
+        left = jax.tree.map(jnp.subtract, rhs, product(solution))
+        solution = jax.tree.map(jnp.add, solution, solve(left))
     return solution
 
 

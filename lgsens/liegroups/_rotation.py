@@ -1,5 +1,8 @@
 """The rotation group SO(3)."""
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -21,6 +24,7 @@ _QUATERNION[1:, 1:] = _EYE[:, None, :, None] * _EYE[None, :, None, :] + _EYE[:, 
 _QUATERNION[1:, 1:] -= _EYE[:, :, None, None] * _EYE[None, None, :, :]
 
 
+@partial(jax.jit, inline=True)  # else each scene that is made outside of `jit` compiles the loop again
 def nearest_rotation(R: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
     """The rotation matrix nearest to `R`, for a matrix that is one but for a small error (an optimizer's step, say).
 

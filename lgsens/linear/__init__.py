@@ -3,6 +3,11 @@
 from lgsens.linear._dense import LU as LU, Inverse as Inverse
 from lgsens.linear._elimination import Elimination as Elimination
 from lgsens.linear._factors import Factors as Factors, Matrix as Matrix, many_runs as many_runs
+from lgsens.linear._linear_solve import (
+    LinearEquations as LinearEquations,
+    linear_solve as linear_solve,
+    programs_in as programs_in,
+)
 from lgsens.linear._ordering import Graph as Graph, Joint as Joint
 from lgsens.linear._solvers import (
     AbstractLinearSolver as AbstractLinearSolver,

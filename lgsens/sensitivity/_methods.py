@@ -12,12 +12,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.flatten_util import ravel_pytree
 
 from lgsens._validate import require_setting
-from lgsens._xla import linear_solve
 from lgsens.dynamics import State, require_independent
 from lgsens.integrate import AbstractScheme, GeneralizedAlpha, Stats, Variation, earlier, states_of, with_first
+from lgsens.linear import LinearEquations, linear_solve
 from lgsens.sensitivity._continuous_adjoint import Cotangents, continuous_adjoint_sweep
 from lgsens.sensitivity._continuous_direct import continuous_direct_sweep
 from lgsens.sensitivity._criterion_terms import Functional, OfState, derivative_terms, plain_terms, points
@@ -224,25 +223,13 @@ def _decoded(run: tuple[State, Stats]) -> tuple[State, Stats]:
     return states, decoded(stats)
 
 
-def _raveled(tree):
-    """The leaves as one vector, and the function that makes the tree of it; every leaf depends on the vector.
+# Direct differentiation. The tangent of the trajectory solves L (δ, p') = (b, p'), b = (δ_0, 0, …, 0). `linear_solve`
+# carries the two sweeps side by side: JAX takes the first one forwards, the other one backwards, and for second
+# derivatives differentiates `matvec`, that is L itself, never the sweeps.
 
-    Empty leaves are not cut from it: in a program with the transpose of an empty slice (λ without joints, in reverse
-    mode) jaxlib 0.12 forgets which version of LAPACK's interface the calls around it have, and cannot compile them.
-    """
-    flat, unravel = ravel_pytree(tree)
-
-    def cut(vector):
-        return jax.tree.map(
-            lambda leaf: leaf if leaf.size else jnp.broadcast_to(vector[0], leaf.shape), unravel(vector)
-        )
-
-    return flat, cut
-
-
-# Direct differentiation. The tangent of the trajectory solves L (δ, p') = (b, p'), b = (δ_0, 0, …, 0).
-# `custom_linear_solve` carries the two sweeps side by side: JAX takes `solve` forwards, `transpose_solve` backwards,
-# and for second derivatives differentiates `matvec`, that is L itself, never the sweeps.
+_SWEEPS = LinearEquations(
+    lambda of, x: matvec(*of, *x), lambda of, b: direct_sweep(*of, *b), lambda of, c: adjoint_sweep(*of, *c)
+)
 
 
 @jax.custom_jvp
@@ -256,24 +243,8 @@ def _direct_rule(primals, tangents):
     _, d_state0, d_parameters, _ = tangents
     states, stats = _direct_trajectory(*primals)
     group = parameters.system.group
-    # `custom_linear_solve` is transposed only where no part of b is a constant, and the tangent of a parameter that is
-    # not differentiated is one: a zero. Cut from one vector, all depend on all.
-    flat, unravel = _raveled((to_algebra(group, state0, d_state0), d_parameters))
-    first, d_parameters = unravel(flat)
-    b = with_first(first, earlier(Variation.none(states)))
-
-    @partial(jax.jit, inline=True)  # traced once for L and for Lᵀ
-    def matrix(unknown):
-        """L (δ, p'), of which every part seems to depend on the states: so none is constant in second derivatives."""
-        nothing = 0.0 * states.v[0, 0]
-        return jax.tree.map(lambda leaf: leaf + nothing * leaf, matvec(scheme, states, parameters, *unknown))
-
-    delta, _ = linear_solve(
-        matrix,
-        (b, d_parameters),
-        solve=lambda _, rhs: direct_sweep(scheme, states, parameters, *rhs),
-        transpose_solve=lambda _, rhs: adjoint_sweep(scheme, states, parameters, *rhs),
-    )
+    b = with_first(to_algebra(group, state0, d_state0), earlier(Variation.none(states)))
+    delta, _ = linear_solve(_SWEEPS, (scheme, states, parameters), (b, d_parameters))
     d_states = jax.vmap(partial(to_ambient, group))(states, delta)
     return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
 

@@ -13,11 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.flatten_util import ravel_pytree
 
-from lgsens._xla import linear_solve
 from lgsens.dynamics import State
 from lgsens.integrate import AbstractScheme, Stats, march
+from lgsens.linear import LinearEquations, linear_solve
 from lgsens.sensitivity._linearization import Parameters
 from lgsens.sensitivity._methods import AbstractSensitivity, AdjointVariable, DirectDifferentiation, decoded, encoded
 from lgsens.sensitivity._segments import (
@@ -89,7 +88,7 @@ def _rule(output, scheme, primals, tangents):
 
 
 # With checkpoints the linear map from the tangents x of (state0, parameters) to those y of outputs and final state,
-# y = A x, is the solution of [[I, 0], [−A, I]] [x; y] = [b; 0]: so `custom_linear_solve` again carries both sweeps, and
+# y = A x, is the solution of [[I, 0], [−A, I]] [x; y] = [b; 0]: so `linear_solve` again carries both sweeps, and
 # takes second derivatives of A by the rule above, which keeps all states.
 
 
@@ -113,33 +112,47 @@ def _direct_segments(output, scheme, segments, state0, parameters) -> tuple[Save
     return _segmented(output, scheme, segments, state0, parameters)
 
 
+class _Kept(eqx.Module):
+    """The equations for (x, y), and what of a run solves them."""
+
+    output: Any = eqx.field(static=True)
+    scheme: Any = eqx.field(static=True)
+    segments: Segments = eqx.field(static=True)
+    marks: Any
+    final: State
+    primals: Any
+
+    def product(self, unknown):
+        x, y = unknown
+
+        def whole(state0, parameters):
+            found = _saved(self.output, self.scheme, state0, parameters)
+            return eqx.filter((found.outputs, found.final), eqx.is_inexact_array)
+
+        return x, jax.tree.map(jnp.subtract, y, jax.jvp(whole, self.primals, x)[1])
+
+    def solve(self, rhs):
+        b, y = rhs
+        run = self.output, self.scheme, self.segments
+        return b, jax.tree.map(jnp.add, y, direct_in_segments(*run, self.marks, self.primals[1], b))
+
+    def transposed(self, rhs):
+        c, bar = rhs
+        run = self.output, self.scheme, self.segments
+        found = adjoint_in_segments(*run, self.marks, self.final, self.primals[1], bar)
+        return jax.tree.map(jnp.add, c, found), bar
+
+
+_IN_SEGMENTS = LinearEquations(_Kept.product, _Kept.solve, _Kept.transposed)
+
+
 @_direct_segments.defjvp
 def _direct_segments_rule(output, scheme, segments, primals, tangents):
     run, marks = _direct_segments(output, scheme, segments, *primals)
-    kept = lax.stop_gradient((marks, run.final))
     floats = eqx.filter((run.outputs, run.final), eqx.is_inexact_array)
-    flat, unravel = ravel_pytree((tangents, jax.tree.map(jnp.zeros_like, floats)))
-
-    def whole(state0, parameters):
-        found = _saved(output, scheme, state0, parameters)
-        return eqx.filter((found.outputs, found.final), eqx.is_inexact_array)
-
-    def matvec(unknown):
-        x, y = unravel(unknown)
-        return ravel_pytree((x, jax.tree.map(jnp.subtract, y, jax.jvp(whole, primals, x)[1])))[0]
-
-    def solve(_, rhs):
-        b, y = unravel(rhs)
-        found = direct_in_segments(output, scheme, segments, kept[0], primals[1], b)
-        return ravel_pytree((b, jax.tree.map(jnp.add, y, found)))[0]
-
-    def transpose_solve(_, rhs):
-        c, c_outputs = unravel(rhs)
-        found = adjoint_in_segments(output, scheme, segments, *kept, primals[1], c_outputs)
-        return ravel_pytree((jax.tree.map(jnp.add, c, found), c_outputs))[0]
-
-    solution = linear_solve(matvec, flat, solve=solve, transpose_solve=transpose_solve)
-    d_outputs, d_final = eqx.combine(unravel(solution)[1], _without_derivative((run.outputs, run.final)))
+    kept = _Kept(output, scheme, segments, *lax.stop_gradient((marks, run.final)), primals)
+    _, found = linear_solve(_IN_SEGMENTS, kept, (tangents, jax.tree.map(jnp.zeros_like, floats)))
+    d_outputs, d_final = eqx.combine(found, _without_derivative((run.outputs, run.final)))
     return (run, marks), (SavedRun(d_outputs, d_final, _without_derivative(run.stats)), _without_derivative(marks))
 
 

@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
-from jax.extend.core import jaxpr_as_fun, jaxprs_in_params
+from jax.extend.core import jaxpr_as_fun
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
 from lgsens.dynamics import RESULTS
-from lgsens.linear import many_runs, tuned
+from lgsens.linear import many_runs, programs_in, tuned
 from lgsens.simulation import Saved, Trajectory, failures_by_callback
 
 AXIS = "designs"
@@ -70,7 +70,7 @@ def _bytes_per_turn(jaxpr: Any) -> int:
     """The bytes that a turn of the largest loop in a program reads: what it carries, and its share of what it scans."""
     largest = 0
     for equation in jaxpr.eqns:
-        inner: list[Any] = list(jaxprs_in_params(equation.params))
+        inner = list(programs_in(equation))
         if equation.primitive.name in ("scan", "while"):
             largest = max(largest, *(sum(v.aval.size * v.aval.dtype.itemsize for v in body.invars) for body in inner))
         largest = max([largest, *map(_bytes_per_turn, inner)])
