@@ -122,10 +122,14 @@ _NAMESPACES = (
     "testing",
 )  # imported when first used: optax and matplotlib take their time
 
+_OF_NAMESPACES = {"Certificate": "accuracy", "certify": "accuracy"}  # for the same reason
+
 set_options()
 
 
 def __getattr__(name: str):
     if name in _NAMESPACES:
         return importlib.import_module(f"lgsens.{name}")
+    if name in _OF_NAMESPACES:
+        return getattr(importlib.import_module(f"lgsens.{_OF_NAMESPACES[name]}"), name)
     raise AttributeError(f"module 'lgsens' has no attribute {name!r}")

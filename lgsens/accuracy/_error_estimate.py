@@ -58,7 +58,7 @@ from lgsens.integrate import (
     IndexReducedODE,
     Variation,
 )
-from lgsens.sensitivity import Parameters, direct_sweep
+from lgsens.sensitivity import Parameters, linearized_trajectory
 from lgsens.simulation import StateError, Trajectory
 
 _LEAST_STEPS = 3
@@ -162,7 +162,7 @@ def _estimated(scheme: GeneralizedAlpha, trajectory: Trajectory) -> StateError:
         a=none.at[0].set(h**2 * omega),
     )
     parameters = Parameters(system, EqualGrid(t[0], h, t.shape[0] - 1))
-    e, _ = direct_sweep(scheme, states, parameters, defects, jax.tree.map(jnp.zeros_like, parameters))
+    e = linearized_trajectory(scheme, states, parameters, defects, jax.tree.map(jnp.zeros_like, parameters))
     return StateError(-e.w, -e.v, -e.vdot, -e.lam)
 
 

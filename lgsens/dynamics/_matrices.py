@@ -136,7 +136,9 @@ class ConstrainedMass(eqx.Module):
 
     def with_factors(self, rhs):
         """x and μ by the factors."""
-        once = lambda rhs: self.factors.solve(*rhs)
+        assert self.factors is not None
+        solve = self.factors.solve
+        once = lambda rhs: solve(*rhs)
         return refined(self.product, once, rhs) if self.soft else once(rhs)
 
 

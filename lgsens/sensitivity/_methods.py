@@ -232,6 +232,11 @@ _SWEEPS = LinearEquations(
 )
 
 
+def linearized_trajectory(scheme: AbstractScheme, states: State, parameters: Parameters, b: Variation, d: Parameters):
+    """δ of L (δ, p') = (b, d) at the states of a run; by either sweep, and differentiable by products with L."""
+    return linear_solve(_SWEEPS, (scheme, states, parameters), (b, d))[0]
+
+
 @jax.custom_jvp
 def _direct_trajectory(scheme, state0, parameters, found):
     return _run(scheme, state0, parameters, found)
@@ -244,7 +249,7 @@ def _direct_rule(primals, tangents):
     states, stats = _direct_trajectory(*primals)
     group = parameters.system.group
     b = with_first(to_algebra(group, state0, d_state0), earlier(Variation.none(states)))
-    delta, _ = linear_solve(_SWEEPS, (scheme, states, parameters), (b, d_parameters))
+    delta = linearized_trajectory(scheme, states, parameters, b, d_parameters)
     d_states = jax.vmap(partial(to_ambient, group))(states, delta)
     return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
 

@@ -1,0 +1,114 @@
+"""What is known of the worth of a value and its gradient, in numbers and in words."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int, PyTree
+
+from lgsens.dynamics import RESULTS
+
+_DUALITY = 1e-6  # round-off of long runs is far below
+_NEAR = 1e-3  # margins to singular configurations, relative to the largest
+_UNRESOLVED = 0.1  # of the steps
+
+
+class Certificate(NamedTuple):
+    """What a value and its gradient are worth; `print` it.
+
+    Attributes:
+        value, gradient: Ψ, shape (), and dΨ/dp, like p: those of the numerical motion.
+        value_error, gradient_error: estimates of true less computed, in the same shapes.
+        tolerance: the relative error that was asked for, shape ().
+        duality: by how much the two sensitivity methods differ, relative to the largest terms, shape ().
+        newton: the change of Ψ that is left in Newton's iteration, shape (); NaN: not known of this scheme.
+        growth: how much the motion changes for a relative change of p of 1, in rad or lengths of the scene, shape ().
+        exponential: whether it grows exponentially, shape ().
+        margin: the least margin to a singular configuration of those looked at, relative to the largest, shape ().
+        kinks: times in whose step an acceleration has a kink or a jump [s], and names of the bodies.
+        unresolved: the share of steps in which accelerations change as much as they are large, shape ().
+        result: a value of `RESULTS`, shape (), int32.
+    """
+
+    value: Float[Array, ""]
+    gradient: PyTree
+    value_error: Float[Array, ""]
+    gradient_error: PyTree
+    tolerance: float
+    duality: Float[Array, ""]
+    newton: Float[Array, ""]
+    growth: Float[Array, ""]
+    exponential: Any
+    margin: Float[Array, ""]
+    kinks: tuple[tuple[float, str], ...]
+    unresolved: Float[Array, ""]
+    result: Int[Array, ""]
+
+    @property
+    def relative(self) -> tuple[float, float]:
+        """The estimated errors of value and gradient, relative to them (of the gradient by its norm)."""
+        norm = lambda tree: float(np.linalg.norm(np.asarray(ravel_pytree(tree)[0])))
+        ratio = lambda error, of: error / of if of > 0.0 else (np.inf if error > 0.0 else 0.0)
+        return ratio(norm(self.value_error), norm(self.value)), ratio(norm(self.gradient_error), norm(self.gradient))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What makes value or gradient worth less than the estimates say, or not worth anything, and what to do."""
+        said = []
+        if int(self.result) != RESULTS.successful:
+            said.append(f"the simulation failed: {RESULTS(int(self.result)).message}")
+        if self.duality > _DUALITY:
+            said.append(
+                f"direct and adjoint derivatives differ by {float(self.duality):.1e}, far above round-off: a rule of "
+                "an element is not linear in its tangents, or its equations are nearly singular"
+            )
+        if self.exponential:
+            said.append(
+                f"the motion is unstable or chaotic: a relative change of p of 1 moves it by {float(self.growth):.1e} "
+                f"lengths; the gradient holds for changes below {1.0 / float(self.growth):.0e}. Shorten the run, or "
+                "average over many"
+            )
+        if self.unresolved > _UNRESOLVED:
+            said.append(
+                f"in {100 * float(self.unresolved):.0f} % of the steps accelerations change as much as they are large: "
+                "the steps do not resolve the motion, take many more of them, or model what is fast as rigid"
+            )
+        elif self.kinks:
+            places = ", ".join(f"{name!r} at t = {t:.6g} s" for t, name in self.kinks[:4])
+            more = f" and {len(self.kinks) - 4} more" if len(self.kinks) > 4 else ""
+            said.append(
+                f"accelerations have a kink or a jump inside of a step: {places}{more}. Estimates do not see it; let "
+                "a step end there (an edge of a road), or make the force smooth over several steps"
+            )
+        if self.margin < _NEAR:
+            said.append(
+                f"a singular configuration is near: the margin falls to {float(self.margin):.1e} of its largest"
+            )
+        if abs(float(self.newton)) > 0.1 * self.tolerance * abs(float(self.value)):
+            said.append(f"Newton's iteration leaves {float(self.newton):.1e} of Ψ: ask for a smaller `tolerance`")
+        return tuple(said)
+
+    @property
+    def good(self) -> bool:
+        """Whether value and gradient have the tolerance by the estimates, and nothing speaks against these."""
+        return not self.warnings and max(self.relative) <= self.tolerance
+
+    def __str__(self) -> str:
+        of_value, of_gradient = self.relative
+        digits = lambda error: f"{max(0.0, -np.log10(max(error, 1e-16))):.1f} digits"
+        lines = [
+            f"Ψ = {float(self.value):.10g}, estimated error {float(self.value_error):+.1e}: {digits(of_value)}",
+            f"dΨ/dp: estimated error {of_gradient:.1e} of its norm: {digits(of_gradient)}",
+            *(f"But {warning}." for warning in self.warnings),
+        ]
+        asked = f"the tolerance of {self.tolerance:g}"
+        if self.good:
+            lines.append(f"Good to {asked}.")
+        elif self.warnings:
+            lines.append(f"Not good to {asked}: the estimates do not hold.")
+        else:
+            factor = np.ceil(np.sqrt(max(self.relative) / self.tolerance) * 10.0) / 10.0
+            lines.append(f"Not good to {asked}: take {factor:g} times as many steps.")
+        return "\n".join(lines)
+
+    __repr__ = __str__
