@@ -2,10 +2,10 @@
 
     python benchmarks/certificate.py [--problems NAME …] [--designs 12] [--out benchmarks/results]
 
-Each reference problem of `lgsens.examples.PROBLEMS` whose step the problem's file gives, with its own number of steps and a
-half of it, for random parameters within 10 % of their values. True errors are those against a run in 16 times as many
-steps, extrapolated with one in 8 times. A case counts where two digits are right. Costs: a certificate beside a value and
-gradient by `differentiate`, medians after a warm-up. Writes certificate.json and prints a table.
+Reference problems of `lgsens.examples.PROBLEMS` in their own number of steps and in a half of it, for random parameters
+within 10 % of theirs. True errors are those against a run in 16 times as many steps, extrapolated with one in 8 times.
+A case counts where two digits are right. Costs: a certificate beside a value and gradient by `differentiate`, medians
+after a warm-up. Writes certificate.json and prints a table.
 """
 
 import benchmark
@@ -112,9 +112,8 @@ def main() -> None:
     ratios = np.array([row["estimated"] / row["true"] for row in counted])
     total = float(np.mean((ratios < WITHIN) & (ratios > 1 / WITHIN)))
     wrong = sum(row["good_at_a_tenth"] for row in rows)
-    print(
-        f"{len(counted)} cases with two digits: {total:.3f} within a factor {WITHIN:g}; good at a tenth of the error: {wrong}"
-    )
+    print(f"{len(counted)} cases with two digits: {total:.3f} within a factor {WITHIN:g}")
+    print(f"called good at a tenth of the true error: {wrong}")
     record = {"rows": rows, "times": times, "within": total, "wrongly_good": wrong}
     benchmark.write(given.out / "certificate.json", record | {"environment": benchmark.environment()})
 
