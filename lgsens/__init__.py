@@ -39,6 +39,7 @@ from lgsens.integrate import (
     GeneralizedAlpha as GeneralizedAlpha,
     GivenSteps as GivenSteps,
     IndexReducedODE as IndexReducedODE,
+    RadauIIA as RadauIIA,
 )
 from lgsens.linear import BlockSparse as BlockSparse, DenseLU as DenseLU
 from lgsens.model import (

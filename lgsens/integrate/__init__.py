@@ -30,6 +30,7 @@ from lgsens.integrate._march import (
     march_on as march_on,
     states_of as states_of,
 )
+from lgsens.integrate._radau import RadauIIA as RadauIIA
 from lgsens.integrate._scheme import (
     AbstractIntegrator as AbstractIntegrator,
     AbstractScheme as AbstractScheme,

@@ -1,0 +1,119 @@
+"""Radau IIA against explicit schemes of order 8, its order, and its derivatives."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from differences import central
+from helpers import says
+
+import lgsens as lg
+from lgsens.examples import heavy_top, spinning_top
+
+RADAU = lg.RadauIIA()
+SQUARE = lg.Criterion(integrand=lambda s, p: s.body("top").position[0] ** 2)
+
+
+def stiff_pair(k=1e7):
+    """A pendulum on a hinge, and a body that a bushing of k N/m holds at its end: 3e3 rad/s beside 3 rad/s."""
+    arm = lg.RigidBody(mass=1.0, inertia=(0.01, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    end = lg.RigidBody(mass=1.0, inertia=(0.01, 0.01, 0.01), position=(1.0, 0.0, 0.1))
+    rates = {"stiffness": (k, k, k), "damping": (5e3, 5e3, 5e3)}
+    turning = {"rotational_stiffness": (1e5, 1e5, 1e5), "rotational_damping": (50.0, 50.0, 50.0)}
+    return lg.Model(
+        {"arm": arm, "end": end},
+        {"hinge": lg.RevoluteJoint(None, "arm", at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))},
+        {
+            "gravity": lg.Gravity((0.0, 0.0, -9.81)),
+            "bushing": lg.Bushing("arm", "end", at=(1.0, 0.0, 0.0), **rates, **turning),
+        },
+    )
+
+
+def ends(run):
+    """What the last state is made of, each part in units of the largest number that the reference has."""
+    q = run.states.q
+    return [
+        np.concatenate([np.ravel(q.position[-1]), np.ravel(q.orientation[-1])]),
+        run.states.v[-1],
+        run.states.lam[-1],
+    ]
+
+
+def errors(model, t1, num_steps, exact):
+    found = ends(lg.simulate(model, t1=t1, num_steps=num_steps, integrator=RADAU))
+    return np.array([np.abs(f - e).max() / np.abs(e).max() for f, e in zip(found, exact)])
+
+
+def test_order_five_in_motion_and_multipliers():
+    """On the heavy top; 3 × 40 stages leave 4e-6, generalized-α 6e-3 after as many steps."""
+    model = heavy_top()
+    exact = ends(lg.simulate(model, t1=0.2, num_steps=3000, integrator=lg.IndexReducedODE(diffrax.Dopri8())))
+    coarse, fine = (errors(model, 0.2, n, exact) for n in (20, 40))
+    assert np.log2(coarse / fine).min() > 4.8  # 5, less what the next power of h = 5 ms takes
+    assert fine[0] < 2e-5
+
+
+@pytest.mark.slow  # the reference has 6,500 stages
+def test_stiff_pair():
+    """3 × 40 stages over half a second, hω = 40, leave 2e-8 in positions; the order is that of the stages, 3.
+
+    The reference, Dopri8 in steps of 0.1 ms, is right to 1e-13 there.
+    """
+    model = stiff_pair()
+    exact = ends(lg.simulate(model, t1=0.5, num_steps=5000, integrator=lg.IndexReducedODE(diffrax.Dopri8())))
+    coarse, fine = (errors(model, 0.5, n, exact) for n in (20, 40))
+    assert fine[0] < 2e-7
+    assert np.log2(coarse / fine)[:2].min() > 2.5
+
+
+def test_joints_hold_at_both_levels():
+    """To Newton's tolerance, 1e-12, and round-off of a hundred steps."""
+    run = lg.simulate(spinning_top(0.7), t1=1.0, num_steps=100, integrator=RADAU)
+    system = run.system
+    violation = jax.vmap(system.constraint)(run.states.q, run.t)
+    rate = jax.vmap(lambda q, v, t: system.constraint_jacobian(q, t) @ v)(run.states.q, run.states.v, run.t)
+    assert np.abs(violation).max() < 1e-11
+    assert np.abs(rate).max() < 1e-10  # velocities of 10 rad/s
+
+
+P = jnp.array([0.7, 1.0, 0.3])  # angle, length, end
+
+
+def psi(p):
+    run = lg.simulate(spinning_top(p[0], length=p[1]), t1=p[2], num_steps=4, integrator=RADAU, throw=False)
+    return 1e3 * SQUARE(run) + run.multiplier("pivot")[-1, 2] * 1e-3
+
+
+def test_both_modes_are_differences():
+    """Of sixth order with a step of 1e-3: 1e-18 × derivatives of size 1e2, round-off 1e-15/1e-3 of Ψ."""
+    compiled = jax.jit(psi)
+    expected = np.array([central(lambda s, e=e: compiled(P + s * e), 1e-3) for e in jnp.eye(3)])
+    forward, reverse = jax.jit(lambda p: (jax.jacfwd(psi)(p), jax.grad(psi)(p)))(P)
+    np.testing.assert_allclose(forward, expected, rtol=1e-8)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-10)  # the same systems, other order of round-off
+
+
+@pytest.mark.slow  # three programs
+def test_criteria_are_of_its_order():
+    """By its own quadrature, against the explicit scheme's in small steps; value and gradient."""
+    build = lambda p: spinning_top(p[0], length=p[1])
+    of = lambda n, scheme: lg.differentiate(SQUARE, build, P[:2], t1=1.0, num_steps=n, integrator=scheme)
+    exact = of(2000, lg.IndexReducedODE(diffrax.Dopri8()))
+    off = lambda found: [
+        np.abs(found.value - exact.value) / exact.value,
+        np.abs(found.gradient - exact.gradient).max() / np.abs(exact.gradient).max(),
+    ]
+    coarse, fine = np.array(off(of(25, RADAU))), np.array(off(of(50, RADAU)))
+    assert np.log2(coarse / fine).min() > 4.5
+    assert fine.max() < 1e-6
+
+
+def test_what_it_cannot():
+    with pytest.raises(ValueError, match=says("RadauIIA", "`tolerance`", "between 0 and 0.01", "1.0")):
+        lg.RadauIIA(tolerance=1.0)
+    model = spinning_top(0.7)
+    soft = lg.Model(model.bodies, model.joints, model.forces, redundant="minimum_norm")
+    with pytest.raises(ValueError, match=says("RadauIIA", "independent constraints")):
+        lg.simulate(soft, t1=0.1, num_steps=2, integrator=RADAU)
