@@ -13,7 +13,7 @@ import numpy as np
 from lgsens._validate import optional
 from lgsens.importers._mjcf_elements import actuators, between_bodies, loops
 from lgsens.importers._mjcf_source import Source
-from lgsens.importers._report import Imported, Report
+from lgsens.importers._report import Imported, Report, built
 from lgsens.model import Gravity, Model, RigidBody
 
 
@@ -76,12 +76,11 @@ def _imported(source, kind: str, qpos, qvel, ctrl, keyframe) -> Imported:
     if gravity.any() and not read.disabled("GRAVITY"):
         forces["gravity"] = Gravity(gravity)
     joints = found.joints | closing
-    model = Model(bodies | found.rotors, joints, forces)
-    if closing and (missing := _redundant(model)):
-        model = Model(bodies | found.rotors, joints, forces, redundant="minimum_norm")
-        read.notes.append(
-            f"{missing} of the joints' equations repeat others: multipliers of minimum norm (constraint_rank)"
-        )
+    if closing:
+        model, notes = built(bodies | found.rotors, joints, forces)
+        read.notes += notes
+    else:
+        model = Model(bodies | found.rotors, joints, forces)
     types = lambda of: {name: type(each).__name__ for name, each in of.items()}
     dropped = (*read.dropped, *_dropped(read))
     return Imported(
@@ -121,14 +120,6 @@ def _body(read: Source, root: int, parts: list[int]) -> RigidBody:
         inertia = (inertia + inertia.T) / 2
     velocity, spin = read.velocity(root, centre)
     return RigidBody(total, inertia, centre, axes, velocity, axes.T @ spin)
-
-
-def _redundant(model: Model) -> int:
-    """How many equations repeat others in the reference configuration."""
-    system = model.system()
-    jacobian = np.asarray(system.constraint_jacobian(system.reference()[0], 0.0))
-    norms = np.linalg.norm(jacobian, axis=1, keepdims=True)
-    return jacobian.shape[0] - int(np.linalg.matrix_rank(jacobian / norms, tol=1e-8))
 
 
 class _Feature(NamedTuple):

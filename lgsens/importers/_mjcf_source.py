@@ -7,7 +7,14 @@ import numpy as np
 
 HINGE, SLIDE, BALL, FREE = "hinge", "slide", "ball", "free"
 # of MuJoCo's enumerations
-_CODES = {"EQ": "mjtEq", "TRN": "mjtTrn", "DYN": "mjtDyn", "GAIN": "mjtGain", "BIAS": "mjtBias", "CNSTR": "mjtConstraint"}
+_CODES = {
+    "EQ": "mjtEq",
+    "TRN": "mjtTrn",
+    "DYN": "mjtDyn",
+    "GAIN": "mjtGain",
+    "BIAS": "mjtBias",
+    "CNSTR": "mjtConstraint",
+}
 _WIDTH = {HINGE: 1, SLIDE: 1, BALL: 3, FREE: 6}
 
 

@@ -1,8 +1,11 @@
 """What an import gives: a model, and a report of what became of everything that the file says."""
 
 import dataclasses
+from collections.abc import Mapping
 
-from lgsens.model import Model
+import numpy as np
+
+from lgsens.model import AbstractForce, AbstractJoint, Model, RigidBody
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,3 +56,18 @@ class Imported:
 
     def __repr__(self) -> str:
         return f"{self.report}"
+
+
+def built(
+    bodies: Mapping[str, RigidBody], joints: Mapping[str, AbstractJoint], forces: Mapping[str, AbstractForce]
+) -> tuple[Model, list[str]]:
+    """The model, with minimum norm where equations repeat others in the reference configuration, and a note of that."""
+    model = Model(bodies, joints, forces)
+    system = model.system()
+    jacobian = np.asarray(system.constraint_jacobian(system.reference()[0], 0.0))
+    norms = np.linalg.norm(jacobian, axis=1, keepdims=True)
+    missing = jacobian.shape[0] - int(np.linalg.matrix_rank(jacobian / norms, tol=1e-8))
+    if not missing:
+        return model, []
+    note = f"{missing} of the joints' equations repeat others: multipliers of minimum norm (constraint_rank)"
+    return Model(bodies, joints, forces, redundant="minimum_norm"), [note]
