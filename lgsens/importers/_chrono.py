@@ -60,9 +60,10 @@ def chrono(
         chassis: the body that holds the suspension; None: the ground.
         wheels: "hinged": spindles turn; "locked": they are fixed to what carries them, for kinematics.
 
-    Where no body has the three moments of inertia, the smaller two are raised, to sum up to the largest. `report.dropped` lists all
-    entries of the file that were not used, but for those of pictures. Raises `ValueError` for a file that is no
-    suspension, an unknown type, and missing or wrong entries. Source: the format of Project Chrono's data/vehicle.
+    Where no body has the three moments of inertia, the smaller two are raised, to sum up to the largest.
+    `report.dropped` lists all entries of the file that were not used, but for those of pictures. Raises `ValueError`
+    for a file that is no suspension, an unknown type, and missing or wrong entries. Source: the format of Project
+    Chrono's data/vehicle.
     """
     if wheels not in ("hinged", "locked"):
         raise ValueError(f"`wheels` must be 'hinged' or 'locked', got {wheels!r}.")

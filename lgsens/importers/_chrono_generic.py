@@ -1,4 +1,4 @@
-"""Chrono's generic suspension, a list of bodies, joints, distances, springs and torsion springs, as rows of the table."""
+"""Chrono's generic suspension, bodies, joints, distances, springs and torsion springs in lists, as rows."""
 
 from typing import Any
 

@@ -34,9 +34,9 @@ class Report:
         kinds = lambda of: [f"  {name}: {kind}" for name, kind in of.items()]
         lines = [f"{self.source}", f"Bodies ({len(self.bodies)}): {', '.join(self.bodies)}"]
         for title, of in (("Joints", self.joints), ("Loops", self.loops), ("Forces", self.forces)):
-            lines += [f"{title} ({len(of)})" + (":" if of else "")] + kinds(of)
+            lines += [f"{title} ({len(of)})" + (":" if of else ""), *kinds(of)]
         for title, of in (("Carried over in another form", self.notes), ("Not carried over", self.dropped)):
-            lines += [f"{title} ({len(of)})" + (":" if of else "")] + [f"  {line}" for line in of]
+            lines += [f"{title} ({len(of)})" + (":" if of else ""), *(f"  {line}" for line in of)]
         return "\n".join(lines)
 
     __repr__ = __str__

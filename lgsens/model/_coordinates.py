@@ -131,7 +131,7 @@ class CoordinateForce(AbstractForce):
 class BallLoad(AbstractLoad):
     """The moment −k φ − c ω on b, its opposite on a: φ the rotation vector of b in a, ω their relative velocity.
 
-    With S = (R_a T_a)ᵀ R_b T_b = exp(φ̃), φ is along the same axis for both, and the moment −k φ has the energy ½ k |φ|².
+    With S = (R_a T_a)ᵀ R_b T_b = exp(φ̃), φ is along the same axis for both; the moment −k φ has the energy ½ k |φ|².
     """
 
     triad_a: Float[Array, "3 3"]
@@ -157,8 +157,8 @@ class BallLoad(AbstractLoad):
 class RotationalSpringDamper(AbstractForce):
     """Spring and damper against all rotations between two bodies, of a ball joint say: the moment −k φ − c ω on b.
 
-    φ is the rotation vector of `b` in `a`, |φ| < π, and ω their relative angular velocity. Stiffness along axes of their
-    own has a `Bushing`.
+    φ is the rotation vector of `b` in `a`, |φ| < π, and ω their relative angular velocity. A `Bushing` has a stiffness
+    about each of three axes.
 
     Arguments:
         a, b: names of the two bodies; None is the ground.

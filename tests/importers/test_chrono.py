@@ -1,4 +1,4 @@
-"""Chrono's suspensions: every type assembles; where wheels have one freedom each, curves are those of a position solver.
+"""Chrono's suspensions: every type assembles; with a freedom for each wheel, curves are those of a position solver.
 
 The solver here knows points, distances and rotations only: the equations of each type are written by hand on the
 numbers of the file, and SciPy solves them.
@@ -8,8 +8,6 @@ import json
 import re
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import fsolve
@@ -130,7 +128,7 @@ def independent(name, travel):
 
     def one(z):
         equations = lambda u: [*INDEPENDENT[name](at, Moved(u, centre)), Moved(u, centre)(centre)[2] - centre[2] - z]
-        u, _, found, _ = fsolve(equations, np.zeros(6), xtol=1e-14, full_output=True)
+        u, *_ = fsolve(equations, np.zeros(6), xtol=1e-14, full_output=True)
         assert np.abs(equations(u)).max() < 1e-13
         return Moved(u, centre)(centre), Moved(u, centre).axis(Y)
 
