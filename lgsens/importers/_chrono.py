@@ -9,7 +9,7 @@ import numpy as np
 from lgsens.importers._chrono_data import Data, prepare
 from lgsens.importers._chrono_generic import generic_rows
 from lgsens.importers._chrono_types import TYPES, Row
-from lgsens.importers._report import Imported, Report, built
+from lgsens.importers._report import Imported, Report, built, made
 from lgsens.model import (
     AbstractForce,
     AbstractJoint,
@@ -75,7 +75,7 @@ def chrono(
     rows, notes = generic_rows(data) if data.template == _GENERIC else (TYPES[data.template], [])
     for row in rows:
         assembly.add(row)
-    forces: dict[str, AbstractForce] = {"gravity": Gravity(gravity)} | assembly.forces
+    forces: dict[str, AbstractForce] = {"gravity": made(Gravity, gravity)} | assembly.forces
     model, more = built(assembly.bodies, assembly.joints, forces)
     types = lambda of: {name: type(each).__name__ for name, each in of.items()}
     notes = (*notes, *assembly.notes, *more)
@@ -174,8 +174,13 @@ class Assembly:
         self.place(body, mass, inertia, self.point(centre), flip @ axes @ flip)
 
     def _cross(self, a: str, b: str, at, arm_a, arm_b) -> None:
-        joint = UniversalJoint(
-            self.name(a), self.name(b), at=self.point(at), axis_a=self.axis(arm_a), axis_b=self.axis(arm_b)
+        joint = made(
+            UniversalJoint,
+            self.name(a),
+            self.name(b),
+            at=self.point(at),
+            axis_a=self.axis(arm_a),
+            axis_b=self.axis(arm_b),
         )
         self.join(f"{self.label(a)} – {self.label(b)}", joint)
 
@@ -185,7 +190,7 @@ class Assembly:
         z = np.cross(x, ball - b) * self.side
         z /= np.linalg.norm(z)
         self._body(body, front, back, at, axes=np.stack([x, np.cross(z, x), z], axis=1))
-        hinge = RevoluteJoint(self.name(""), self.name(body), at=(f + b) / 2, axis=f - b)
+        hinge = made(RevoluteJoint, self.name(""), self.name(body), at=(f + b) / 2, axis=f - b)
         self.join(f"{self.label(body)} hinge", hinge)
         self._ball(body, to, at)
 
@@ -212,33 +217,33 @@ class Assembly:
         across = _along(direction)
         arm_a = across[:, 0] if arm_a is None else arm_a
         arm_b = np.cross(direction, arm_a) if arm_b is None else arm_b
-        joint = UniversalJoint(self.name(a), self.name(b), at=self.point(at), axis_a=arm_a, axis_b=arm_b)
+        joint = made(UniversalJoint, self.name(a), self.name(b), at=self.point(at), axis_a=arm_a, axis_b=arm_b)
         self.join(f"{self.label(a)} – {self.label(b)}", joint)
 
     def _ball(self, a: str, b: str, at: str) -> None:
         place = self.point(at)
         ends = self.name(a, place), self.name(b, place)
-        self.join(" – ".join(end or "chassis" for end in ends), SphericalJoint(*ends, at=place))
+        self.join(" – ".join(end or "chassis" for end in ends), made(SphericalJoint, *ends, at=place))
 
     def _hinge(self, a: str, b: str, at: Any, along: Any) -> None:
-        joint = RevoluteJoint(self.name(a), self.name(b), at=self.point(at), axis=self.axis(along))
+        joint = made(RevoluteJoint, self.name(a), self.name(b), at=self.point(at), axis=self.axis(along))
         self.join(f"{self.label(a)} – {self.label(b)}", joint)
 
     def _slider(self, a: str, b: str, at: str, along: str) -> None:
-        joint = CylindricalJoint(self.name(a), self.name(b), at=self.point(at), axis=self.axis(along))
+        joint = made(CylindricalJoint, self.name(a), self.name(b), at=self.point(at), axis=self.axis(along))
         self.join(f"{self.label(a)} – {self.label(b)}", joint)
 
     def _face(self, a: str, b: str, at: str, along: str) -> None:
-        joint = PlanarJoint(self.name(a), self.name(b), at=self.point(at), axis=self.axis(along))
+        joint = made(PlanarJoint, self.name(a), self.name(b), at=self.point(at), axis=self.axis(along))
         self.join(f"{self.label(b)} guide {along}", joint)
 
     def _plane(self, a: str, b: str, at: str, along: str) -> None:
-        joint = PointOnPlaneJoint(self.name(a), self.name(b), at=self.point(at), axis=self.axis(along))
+        joint = made(PointOnPlaneJoint, self.name(a), self.name(b), at=self.point(at), axis=self.axis(along))
         self.join(f"{self.label(b)} guide {along}", joint)
 
     def _distance(self, label: str, a: str, at_a: Any, b: str, at_b: Any) -> None:
         begin, end = self.point(at_a), self.point(at_b)
-        joint = DistanceJoint(self.name(a), self.name(b), at_a=begin, at_b=end)
+        joint = made(DistanceJoint, self.name(a), self.name(b), at_a=begin, at_b=end)
         self.join(self.label(label), joint)
 
     def _spindle(self, carrier: str) -> None:
@@ -251,43 +256,42 @@ class Assembly:
         self._body("Spindle", axes=np.stack([x, y, np.cross(x, y)], axis=1))
         ends, at = (self.name(carrier), self.name("Spindle")), self.point("Spindle/COM")
         locked = self.wheels == "locked"
-        bearing = FixedJoint(*ends, at=at) if locked else RevoluteJoint(*ends, at=at, axis=y)
+        bearing = made(FixedJoint, *ends, at=at) if locked else made(RevoluteJoint, *ends, at=at, axis=y)
         self.join(f"{self.label('Spindle')} bearing", bearing)
 
     def _spring(self, section: str, a: str, at_a: Any, b: str, at_b: Any) -> None:
         ends = {"at_a": self.point(at_a), "at_b": self.point(at_b)}
         names = self.name(a), self.name(b)
-        curves = [self.data.get(section, key) for key in ("Spring Curve Data", "Damping Curve Data")]
-        stiffness, damping = (float(self.data.get(section, f"{of} Coefficient", 0.0)) for of in ("Spring", "Damping"))
-        free = self.data.get(section, "Free Length")
-        label = self.label(section)
-        if any(curves):
-            springs = [None if curve is None else Sampled(*np.transpose(curve), "monotone") for curve in curves]
-            given = (stiffness, damping)
-            springs = [
-                Sampled([-1.0, 1.0], [-rate, rate], "monotone") if curve is None and rate else curve
-                for curve, rate in zip(springs, given)
-            ]
-            self.forces[label] = CurveSpringDamper(
-                *names, **ends, spring=springs[0], damper=springs[1], free_length=free
+        free, label = self.data.get(section, "Free Length"), self.label(section)
+        curves, numbers = [], []
+        for of in ("Spring", "Damping"):
+            number, rows = (
+                float(self.data.get(section, f"{of} Coefficient", 0.0)),
+                self.data.get(section, f"{of} Curve Data"),
             )
-        elif stiffness or damping:
-            self.forces[label] = SpringDamper(*names, **ends, stiffness=stiffness, damping=damping, free_length=free)
+            curve = ([-1.0, 1.0], [-number, number]) if rows is None and number else rows and np.transpose(rows)
+            curves.append(None if curve is None else made(Sampled, curve[0], curve[1], "monotone"))
+            numbers.append(None if rows else number)
+        if None in numbers:
+            given = {"spring": curves[0], "damper": curves[1], "free_length": free}
+            self.forces[label] = made(CurveSpringDamper, *names, **ends, **given)
+        elif any(numbers):
+            given = {"stiffness": numbers[0], "damping": numbers[1], "free_length": free}
+            self.forces[label] = made(SpringDamper, *names, **ends, **given)
 
     def _torsion(
         self, a: str, b: str, along: Any, section: str, stiffness: str, damping: str, preload: str = ""
     ) -> None:
         """In Chrono a preload is the moment on b."""
         moment = -self.data.number(section, preload) if preload else None
-        self.forces[f"{self.label(b)} torsion {along}" if isinstance(along, str) else self.label(section)] = (
-            TorsionSpringDamper(
-                self.name(a),
-                self.name(b),
-                axis=self.axis(along),
-                stiffness=self.data.number(section, stiffness),
-                damping=self.data.number(section, damping),
-                preload=moment,
-            )
+        self.forces[f"{self.label(b)} torsion {along}" if isinstance(along, str) else self.label(section)] = made(
+            TorsionSpringDamper,
+            self.name(a),
+            self.name(b),
+            axis=self.axis(along),
+            stiffness=self.data.number(section, stiffness),
+            damping=self.data.number(section, damping),
+            preload=moment,
         )
 
 

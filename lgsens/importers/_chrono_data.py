@@ -125,7 +125,7 @@ def _leaves(data: Data) -> None:
     ends |= {"Clamp A": (ends["Frontleaf"][1], middle), "Clamp B": (ends["Rearleaf"][1], middle)}
     for name, both in ends.items():
         of = data.need("Leafspring", "Half Clamp" if name.startswith("Clamp") else name)
-        content[name] = {"Mass": of["Mass"], "Inertia": of["Inertia"], "COM": (sum(both) / 2).tolist()}
+        content[name] = {"Mass": of["Mass"], "Inertia": of["Inertia"], "COM": np.mean(both, axis=0).tolist()}
     vertical, lateral, load, bias = (
         data.number("Leafspring", key)
         for key in ("Vertical Stiffness", "Lateral Stiffness", "Vertical Preload Force", "Stiffness Bias")

@@ -13,7 +13,7 @@ import numpy as np
 from lgsens._validate import optional
 from lgsens.importers._mjcf_elements import actuators, between_bodies, loops
 from lgsens.importers._mjcf_source import Source
-from lgsens.importers._report import Imported, Report, built
+from lgsens.importers._report import Imported, Report, built, made
 from lgsens.model import Gravity, Model, RigidBody
 
 
@@ -74,7 +74,7 @@ def _imported(source, kind: str, qpos, qvel, ctrl, keyframe) -> Imported:
     forces = found.forces | actuators(read, found)
     gravity = read.model.opt.gravity
     if gravity.any() and not read.disabled("GRAVITY"):
-        forces["gravity"] = Gravity(gravity)
+        forces["gravity"] = made(Gravity, gravity)
     joints = found.joints | closing
     if closing:
         model, notes = built(bodies | found.rotors, joints, forces)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lgsens.importers._mjcf_source import BALL, FREE, HINGE, SLIDE, Source
+from lgsens.importers._report import made
 from lgsens.importers._serial import ANGLES, Gimbal, SerialJoint, rotation
 from lgsens.model import (
     AbstractForce,
@@ -75,7 +76,7 @@ def between_bodies(read: Source, groups: dict[int, list[int]]) -> Found:
         for part, share in weightless if not read.disabled("GRAVITY") else ():
             lift = -share * model.body_mass[part] * model.opt.gravity
             name = f"{read.body_name(part)} gravity compensation"
-            found.forces[name] = AppliedForce(child, at=read.data.xipos[part], force=lift)
+            found.forces[name] = made(AppliedForce, child, at=read.data.xipos[part], force=lift)
     for joint, axis in found.axes.items():
         _spring(read, found, joint, axis)
         _rotor(read, found, joint, axis)
@@ -92,11 +93,11 @@ def _in_a_row(read: Source, found: Found, own: list[int], a: str | None, b: str)
     for i in own:
         kind, (first, second) = read.kind(i), (a, b)
         if kind == SLIDE and kinds == "h" * len(hinges) + "s" * len(slides) and hinges:  # its axis turns with b
-            joint = PrismaticJoint(b, a, at=at, axis=-axis[i])
+            joint = made(PrismaticJoint, b, a, at=at, axis=-axis[i])
         elif kind == SLIDE:
-            joint = PrismaticJoint(first, second, at=at, axis=axis[i])
+            joint = made(PrismaticJoint, first, second, at=at, axis=axis[i])
         else:
-            joint = RevoluteJoint(first, second, at=at, axis=axis[i])
+            joint = made(RevoluteJoint, first, second, at=at, axis=axis[i])
         found.axes[i] = Axis(joint, None, read.turned(i) + read.zero(i))
     if len(hinges) > 1:
         _angles(read, found, hinges, axis, at, a, b)
@@ -108,9 +109,9 @@ def _in_a_row(read: Source, found: Found, own: list[int], a: str | None, b: str)
         _refuse(read, b, "its slides are not orthogonal")
     directions = lambda some: np.array([axis[i] for i in some]).reshape(-1, 3)
     if kinds == "s" * len(slides) + "h" * len(hinges):
-        serial = SerialJoint(a, b, at=at, slides=directions(slides), hinges=directions(hinges))
+        serial = made(SerialJoint, a, b, at=at, slides=directions(slides), hinges=directions(hinges))
     elif kinds == "h" * len(hinges) + "s" * len(slides):
-        serial = SerialJoint(b, a, at=at, slides=directions(slides), hinges=directions(hinges[::-1]))
+        serial = made(SerialJoint, b, a, at=at, slides=directions(slides), hinges=directions(hinges[::-1]))
     else:
         _refuse(read, b, "it has slides before and after hinges")
     if len(own) < 6:
@@ -152,7 +153,7 @@ def _angles(read: Source, found: Found, hinges: list[int], axis, at, a, b: str) 
         seen = seen @ rotation((0, 0, 1), sign * turned[2])
     for i, coordinate, own in zip(hinges, ANGLES, (1.0, 1.0, sign)):
         if own > 0:
-            joint = Gimbal(a, b, at=at, axes_a=axes_a, axes_b=axes_a @ seen)
+            joint = made(Gimbal, a, b, at=at, axes_a=axes_a, axes_b=axes_a @ seen)
         else:  # −γ about the opposite axis: the same rotation seen with x and z reversed
             joint = _reversed(a, b, at, axes_a, seen)
         found.axes[i] = Axis(joint, coordinate.name, read.zero(i))
@@ -161,21 +162,26 @@ def _angles(read: Source, found: Found, hinges: list[int], axis, at, a, b: str) 
 def _reversed(a, b, at, axes_a, seen) -> Gimbal:
     """Turned by π about y: R_x(α) R_y(β) R_z(γ) becomes R_x(−α) R_y(β) R_z(−γ)."""
     flip = np.diag([-1.0, 1.0, -1.0])
-    return Gimbal(a, b, at=at, axes_a=axes_a @ flip, axes_b=axes_a @ seen @ flip)
+    return made(Gimbal, a, b, at=at, axes_a=axes_a @ flip, axes_b=axes_a @ seen @ flip)
 
 
 def _ball(read: Source, found: Found, joint: int, a: str | None, b: str) -> None:
     """A ball joint with its spring ½ k |φ|², φ the rotation vector from the springs' configuration."""
     model, name, at = read.model, read.joint_name(joint), read.data.xanchor[joint]
-    found.joints[name] = ball = SphericalJoint(a, b, at=at)
+    found.joints[name] = ball = made(SphericalJoint, a, b, at=at)
     stiffness, damping = float(model.jnt_stiffness[joint]), read.of_dofs("dof_damping", joint)
     stiffness, damping = stiffness * (not read.disabled("SPRING")), damping * (not read.disabled("DAMPER"))
     if stiffness or damping:
         start, rest = (of[model.jnt_qposadr[joint] :][:4].copy() for of in (read.qpos, model.qpos_spring))
         phi, body = np.zeros(3), int(model.jnt_bodyid[joint])
         read.mujoco.mju_subQuat(phi, start, rest)  # in the axes of the body
-        found.forces[f"{name} spring"] = RotationalSpringDamper(
-            a, b, stiffness=stiffness, damping=damping, turned=read.data.xmat[body].reshape(3, 3) @ phi
+        found.forces[f"{name} spring"] = made(
+            RotationalSpringDamper,
+            a,
+            b,
+            stiffness=stiffness,
+            damping=damping,
+            turned=read.data.xmat[body].reshape(3, 3) @ phi,
         )
     if armature := read.of_dofs("dof_armature", joint):
         rotor = f"{name} rotor"
@@ -184,7 +190,7 @@ def _ball(read: Source, found: Found, joint: int, a: str | None, b: str) -> None
         # R_c = R_aᵀR_b from the reference on, so that Ω_c is ω_b − ω_a in the axes of the ground
         found.rotors[rotor] = RigidBody(1.0, np.full(3, armature), at, angular_velocity=spin - base, free="rx ry rz")
         for axis in ball.coordinates:
-            follows = CoordinateCoupling(ball, SphericalJoint(None, rotor, at=at), names=(axis.name, axis.name))
+            follows = CoordinateCoupling(ball, made(SphericalJoint, None, rotor, at=at), names=(axis.name, axis.name))
             found.joints[f"{name} armature {axis.name[-1]}"] = follows
 
 
@@ -194,7 +200,7 @@ def _spring(read: Source, found: Found, joint: int, axis: Axis) -> None:
     damping = 0.0 if read.disabled("DAMPER") else read.of_dofs("dof_damping", joint)
     if stiffness or damping:
         free = float(model.qpos_spring[model.jnt_qposadr[joint]]) - axis.origin
-        spring = CoordinateForce(axis.joint, axis.name, stiffness=stiffness, damping=damping, free=free)
+        spring = made(CoordinateForce, axis.joint, axis.name, stiffness=stiffness, damping=damping, free=free)
         found.forces[f"{name} spring"] = spring
 
 
@@ -218,7 +224,7 @@ def _rotor(read: Source, found: Found, joint: int, axis: Axis) -> None:
         angular_velocity=np.multiply(rate, along),
         free="rx",
     )
-    turn = Gimbal(None, rotor, at=at, axes_a=np.eye(3), axes_b=rotation(along, start))
+    turn = made(Gimbal, None, rotor, at=at, axes_a=np.eye(3), axes_b=rotation(along, start))
     found.joints[f"{name} armature"] = CoordinateCoupling(axis.joint, turn, names=(axis.name, ANGLES[0].name))
 
 
@@ -245,7 +251,7 @@ def loops(read: Source, found: Found) -> dict[str, AbstractJoint]:
             closing[name] = _coupled(read, found, i)
         elif kind in (read.code("mjEQ_CONNECT"), read.code("mjEQ_WELD")):
             a, b, at = _ends(read, i)
-            closing[name] = (SphericalJoint if kind == read.code("mjEQ_CONNECT") else FixedJoint)(a, b, at=at)
+            closing[name] = made(SphericalJoint if kind == read.code("mjEQ_CONNECT") else FixedJoint, a, b, at=at)
         else:
             kind = read.mujoco.mjtEq(kind).name.removeprefix("mjEQ_").lower()
             read.dropped.append(f"{name}: an equality of type {kind}")
@@ -273,9 +279,9 @@ def _coupled(read: Source, found: Found, i: int) -> AbstractJoint:
     first, second = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
     axis = found.axes[first]
     if second < 0:
-        driver = TranslationDriver if read.kind(first) == SLIDE else RotationDriver
-        at = {"at": axis.joint.at} if read.kind(first) == SLIDE else {}
-        return driver(axis.joint.a, axis.joint.b, axis=axis.joint.axis, **at)
+        place = {"at": read.data.xanchor[first]} if read.kind(first) == SLIDE else {}
+        driver = TranslationDriver if place else RotationDriver
+        return made(driver, axis.joint.a, axis.joint.b, axis=read.data.xaxis[first], **place)
     shift = read.turned(second) - joint_start(read, second, found.axes[second])
     moved = np.polynomial.Polynomial(model.eq_data[i, :5])(np.polynomial.Polynomial([shift, 1.0])).coef
     last = max(np.flatnonzero(np.abs(moved) > 0), default=0)
@@ -307,7 +313,8 @@ def actuators(read: Source, found: Found) -> dict[str, AbstractForce]:
             b0, b1, b2 = model.actuator_biasprm[i, :3] if bias == read.code("mjBIAS_AFFINE") else np.zeros(3)
             drag = 0.0 if read.disabled("DAMPER") else float(model.actuator_damping[i])
             push = gear * (float(model.actuator_gainprm[i, 0]) * _control(read, i) + b0)
-            motors[f"{name} motor"] = CoordinateForce(
+            motors[f"{name} motor"] = made(
+                CoordinateForce,
                 axis.joint,
                 axis.name,
                 stiffness=-(gear**2) * b1,

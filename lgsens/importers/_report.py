@@ -1,11 +1,19 @@
 """What an import gives: a model, and a report of what became of everything that the file says."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
 
 import numpy as np
 
 from lgsens.model import AbstractForce, AbstractJoint, Model, RigidBody
+
+Element = TypeVar("Element")
+
+
+def made(kind: Callable[..., Element], *arguments: Any, **numbers: Any) -> Element:
+    """An element from Python's and NumPy's numbers, which constructors convert; their fields are declared as arrays."""
+    return kind(*arguments, **numbers)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -93,11 +93,12 @@ def _assemble(
         a, b, *others = (number[places[end].body] for end in ends_of(joint))
         if None in others or len({a, b, *others}) < 2 + len(others):
             raise ValueError(f"Joint {name!r} couples bodies that `merge_fixed` makes one, or ground; leave it out.")
+        more = tuple(other for other in others if other is not None)
         own = [moving[body] for end in ends_of(joint) if (body := places[end].body) is not None]
         single = [jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), of) for of in row.of]
         for i, (of, kept) in enumerate(zip(row.of, violable_rows(name, joint, single, own))):
             if any(kept):
-                constraints.append(Placed(StackRow(of, row.index), a, b, name, kept, i, tuple(others)))
+                constraints.append(Placed(StackRow(of, row.index), a, b, name, kept, i, more))
     loads, free = [], [body.coordinates for body in ordered]
     for name, force in sorted(forces.items()):
         for load, *ends in force.loads(moving if force.on_merged else bodies):

@@ -3,7 +3,7 @@
 A joint's coordinate s is a function of the pose of its frame on b in that on a (`_relative`), whatever the joint is.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -190,8 +190,8 @@ class Coupled(AbstractConstraint):
     first: tuple[Frame, Frame]
     second: tuple[Frame, Frame]
     coefficients: Float[Array, " n"]
-    coordinates: tuple[Coordinate, Coordinate] = eqx.field(static=True)
-    roles: tuple[int, int, int, int] = eqx.field(static=True)
+    coordinates: tuple[Coordinate, ...] = eqx.field(static=True)  # two
+    roles: tuple[int, ...] = eqx.field(static=True)  # four
 
     drawn = None
 
@@ -202,11 +202,11 @@ class Coupled(AbstractConstraint):
     def value(self, a, b, t, *others):
         ends = [(a, b, *others)[role] for role in self.roles]
         first, second = (of.of for of in self.coordinates)
-        x = second(_seen(*ends[2:], *self.second))
+        x = second(_seen(ends[2], ends[3], *self.second))
         total = jnp.zeros_like(x)
         for i in reversed(range(self.coefficients.shape[0])):  # Horner's scheme
             total = (total + self.coefficients[i]) * x
-        missing = first(_seen(*ends[:2], *self.first)) - total
+        missing = first(_seen(ends[0], ends[1], *self.first)) - total
         if self.coordinates[0].periodic:
             missing = jnp.arctan2(jnp.sin(missing), jnp.cos(missing))
         return missing[None]
@@ -233,12 +233,14 @@ class CoordinateCoupling(AbstractJoint):
 
     first: AbstractJoint
     second: AbstractJoint
-    coefficients: Float[Array, " n"] = eqx.field(
-        converter=lambda value: as_float(value, None, "CoordinateCoupling: `coefficients`"), default=(1.0,)
-    )
-    names: tuple[str | None, str | None] = eqx.field(static=True, default=(None, None))
+    coefficients: Float[Array, " n"]
+    names: tuple[str | None, str | None] = eqx.field(static=True)
 
     assembled = True
+
+    def __init__(self, first: AbstractJoint, second: AbstractJoint, coefficients: Any = (1.0,), names=(None, None)):
+        self.first, self.second, self.names = first, second, names
+        self.coefficients = as_float(coefficients, None, "CoordinateCoupling: `coefficients`")
 
     def __check_init__(self):
         for joint, name in zip((self.first, self.second), self.names):

@@ -37,6 +37,7 @@ def carried(
     if all(part is None for part in (a, b, *others)):
         return element
     if others:
+        assert isinstance(element, AbstractConstraint)
         return _CarriedConstraint(element, a, b, others)
     fields = fixed_fields(element)
     if by_frames or not fields:
