@@ -79,7 +79,10 @@ def compare(model, data, imported, tolerance=1e-9):
     assert worst < tolerance * (1.0 + np.abs(data.qacc).max())
 
 
-@pytest.mark.parametrize("name", ["arm", "figure", "cart"])
+SLOW = pytest.mark.slow  # ten seconds of processor each
+
+
+@pytest.mark.parametrize("name", ["cart", pytest.param("arm", marks=SLOW), pytest.param("figure", marks=SLOW)])
 def test_accelerations_of_trees(name):
     """Hinges, slides, balls and a free base; several joints on one body; springs, dampers, armature, motors, servos."""
     path = DATA / f"{name}.xml"
@@ -99,3 +102,169 @@ def test_accelerations_of_an_arm_in_urdf():
         "limit of the forces of actuators on the joint: slew, reach",
         "dry friction of the joint: elbow",
     }
+
+
+def by_hand(mass=2.5, drive=0.7):
+    """The four-bar of the file in its plane, with bodies of three freedoms and hinges of our own."""
+    end = np.array([0.6753277879007873, 0.0, 0.4842074344021209])
+    axis = (0.0, -1.0, 0.0)
+    coupler = np.array([[0.01, 0.0, -0.02], [0.0, 0.11, 0.0], [-0.02, 0.0, 0.1]])
+    bodies = {
+        "crank": lg.RigidBody(1.2, (0.01, 0.01, 0.0008), (0.0, 0.0, 0.15), free="x z ry"),
+        "coupler": lg.RigidBody(mass, coupler, (0.33, 0.0, 0.37), free="x z ry"),
+        "rocker": lg.RigidBody(1.9, (0.04, 0.04, 0.002), (0.74, 0.0, 0.24), free="x z ry"),
+        "rotor": lg.RigidBody(1.0, (0.05, 0.05, 0.05), free="rx"),
+    }
+    joints = {
+        "drive": lg.RevoluteJoint(None, "crank", at=np.zeros(3), axis=axis),
+        "crank end": lg.RevoluteJoint("crank", "coupler", at=(0.0, 0.0, 0.3), axis=axis),
+        "closure": lg.RevoluteJoint("coupler", "rocker", at=end, axis=axis),
+        "pin": lg.RevoluteJoint(None, "rocker", at=(0.8, 0.0, 0.0), axis=axis),
+    }
+    turn = lg.RevoluteJoint(None, "rotor", at=np.zeros(3), axis=(1.0, 0.0, 0.0))
+    joints["armature"] = lg.CoordinateCoupling(joints["drive"], turn)
+    forces = {
+        "weight": lg.Gravity((0.0, 0.0, -9.81)),
+        "motor": lg.TorsionSpringDamper(None, "crank", axis=axis, damping=0.2, motor=2.0 * drive),
+        "spring": lg.TorsionSpringDamper(None, "rocker", axis=axis, stiffness=4.0, damping=0.1),
+    }
+    return lg.Model(bodies, joints, forces)
+
+
+def test_four_bar_is_that_by_hand():
+    """Accelerations at rest, in the plane; of MuJoCo to what its soft loop allows."""
+    imported = lg.importers.mjcf(DATA / "four_bar.xml", ctrl=[0.7])
+    assert imported.report.loops == {"closure": "SphericalJoint"}
+    assert any("repeat others" in note for note in imported.report.notes)  # a ball joint in a plane
+    (ours, _, _, of_ours), (own, _, _, of_own) = start(imported.model), start(by_hand())
+    ours_at, own_at = ours.twists(of_ours), own.twists(of_own)
+    assert np.abs(ours_at).max() > 1.0
+    for name in ("crank", "coupler", "rocker"):
+        pair = ours_at[ours.body_names.index(name)], own_at[own.body_names.index(name)]
+        # body axes: those of principal inertia in the file, of the ground by hand; both turn about y
+        np.testing.assert_allclose(pair[0][:3], pair[1][:3], atol=1e-10)
+        np.testing.assert_allclose(np.linalg.norm(pair[0][3:]), np.abs(pair[1][4]), atol=1e-10)
+
+
+PENDULUM = """
+<mujoco><worldbody><body name="bob" pos="0 0 1" euler="0 40 0">
+  <joint name="pin" axis="0 1 0" damping="0.1" armature="0.05"/><geom size="0.1" pos="0 0 -0.5"/>
+</body></worldbody><actuator><motor name="drive" joint="pin" gear="3"/></actuator></mujoco>
+"""
+
+
+def check_gradients(source, joint, leaves):
+    """Of an angle after 50 ms by numbers of the model that was read, against differences."""
+    imported = lg.importers.mjcf(source, ctrl=[0.7]).model
+
+    def angle(model):
+        return lg.simulate(model, t1=0.05, num_steps=5).joint(joint).coordinates["angle"][-1]
+
+    value_and_gradient = eqx.filter_jit(eqx.filter_value_and_grad(angle))
+    _, gradient = value_and_gradient(imported)
+    for leaf in leaves:
+        moved = [value_and_gradient(eqx.tree_at(leaf, imported, leaf(imported) * (1.0 + h)))[0] for h in (1e-4, -1e-4)]
+        difference = (moved[0] - moved[1]) / 2e-4
+        assert abs(difference) > 1e-7
+        # differences of second order in steps of 1e-4: 1e-8 of the third derivative, and round-off 1e-14/1e-4
+        np.testing.assert_allclose(jnp.sum(leaf(gradient) * leaf(imported)), difference, rtol=1e-6, atol=1e-9)
+
+
+def test_gradients_of_what_was_read():
+    """By a mass, the inertia of a rotor, the place of a hinge, a torque."""
+    leaves = (
+        lambda model: model.bodies["bob"].mass,
+        lambda model: model.bodies["pin rotor"].inertia,
+        lambda model: model.joints["pin"].at,
+        lambda model: model.forces["drive motor"].motor,
+    )
+    check_gradients(PENDULUM, "pin", leaves)
+
+
+@pytest.mark.slow  # two minutes of processor: a loop with equations that repeat each other
+def test_gradients_of_a_loop():
+    leaves = (
+        lambda model: model.bodies["coupler"].mass,
+        lambda model: model.bodies["drive rotor"].inertia,
+        lambda model: model.forces["motor motor"].motor,
+    )
+    check_gradients(DATA / "four_bar.xml", "drive", leaves)
+
+
+EQUALITIES = """
+<mujoco><worldbody>
+  <body name="one"><joint name="a" axis="0 1 0"/><geom size="0.1" pos="0.3 0 0"/></body>
+  <body name="two" pos="1 0 0"><joint name="b" type="slide" axis="0 0 1"/><geom size="0.1"/><site name="s"/></body>
+  <body name="three" pos="2 0 0"><joint name="c" axis="0 1 0"/><geom size="0.1"/></body>
+</worldbody><equality>
+  <joint name="cam" joint1="b" joint2="a" polycoef="0.1 0.5 0.2 0 0"/>
+  <joint name="lock" joint1="c" polycoef="0.3 0 0 0 0"/>
+  <weld name="off" body1="one" body2="two" active="false"/>
+</equality><sensor><jointpos joint="a"/></sensor></mujoco>
+"""
+
+
+def test_equalities_of_joints():
+    """q_b − 0.1 = 0.5 q_a + 0.2 q_a² and q_c = 0.3, from a configuration that satisfies them."""
+    qpos = np.array([0.4, 0.1 + 0.5 * 0.4 + 0.2 * 0.4**2, 0.3])
+    imported = lg.importers.mjcf(EQUALITIES, qpos=qpos, qvel=[1.0, 0.5 + 0.4 * 0.4, 0.0])
+    system, _, _, vdot = start(imported.model)
+    assert imported.report.loops == {"cam": "CoordinateCoupling", "lock": "RotationDriver"}
+    np.testing.assert_allclose(imported.model.joints["cam"].coefficients, [0.5 + 0.4 * 0.4, 0.2], rtol=1e-14)
+    mass, arm, inertia = 1000.0 * 4 / 3 * np.pi * 1e-3, 0.3, 0.4 * 1e-2 * (4 / 3 * np.pi)
+    # Lagrange: (J + m l² + m p'²) q̈ + m p' p'' q̇² = m g (l cos q − p'), with the rates of p there
+    slope, curvature = 0.5 + 0.4 * 0.4, 0.4
+    pull = mass * 9.81 * (arm * np.cos(0.4) - slope) - mass * slope * curvature
+    expected = pull / (inertia + mass * (arm**2 + slope**2))
+    twists = system.twists(vdot)
+    np.testing.assert_allclose(np.linalg.norm(twists[system.body_names.index("one"), 3:]), abs(expected), rtol=1e-10)
+    assert set(imported.report.dropped) == {"off: not active", "contacts of 3 geoms", "1 sensors"}
+    with pytest.raises(ValueError, match="misses 'cam' by"):
+        lg.importers.mjcf(EQUALITIES, qpos=np.array([0.4, 0.0, 0.3]))
+    followed = lg.importers.mjcf(EQUALITIES).model  # the others follow from a = 0
+    np.testing.assert_allclose(followed.bodies["two"].position, [1.0, 0.0, 0.1], atol=1e-15)
+
+
+def test_mimic_joints_are_coupled():
+    text = (DATA / "arm.urdf").read_text(encoding="utf-8")
+    imported = lg.importers.urdf(text.replace("MIMIC", '<mimic joint="elbow" multiplier="-0.5" offset="0.2"/>'))
+    (coupling,) = imported.report.loops
+    np.testing.assert_allclose(imported.model.joints[coupling].coefficients, [-0.5])
+
+
+WRONG = {
+    "no MJCF": (lambda: lg.importers.mjcf("<robot/>"), "it has no element <mujoco>"),
+    "nothing moves": (lambda: lg.importers.mjcf("<mujoco/>"), "no body can move"),
+    "not read": (lambda: lg.importers.mjcf("<mujoco><nothing/></mujoco>"), "MuJoCo cannot read it"),
+    "qpos": (lambda: lg.importers.mjcf(EQUALITIES, qpos=[0.0]), "`qpos` must be 3 finite numbers"),
+    "keyframe": (lambda: lg.importers.mjcf(EQUALITIES, keyframe="home"), "'home' is not one of"),
+    "slides": (
+        lambda: lg.importers.mjcf(
+            '<mujoco><worldbody><body name="b"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="1 1 0"/>'
+            '<geom size="1"/></body></worldbody></mujoco>'
+        ),
+        "its slides are not orthogonal; put a body with a mass between them",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_bad_input(name):
+    make, message = WRONG[name]
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_the_report_says_what_there_is():
+    """Every thing of the arm that acts, and what was not carried over."""
+    report = lg.importers.mjcf(DATA / "arm.xml").report
+    assert report.bodies == ("shoulder", "upper", "fore", "hand")
+    assert report.joints["roll + bend + twist"] == "SerialJoint"
+    assert report.forces["servo motor"] == report.forces["pitch spring"] == "CoordinateForce"
+    assert report.notes == ("plate: without joints, parts of 'hand'",)
+    assert report.dropped == (
+        "limit of the joint: pitch",
+        "dry friction of the joint: elbow",
+        "limit of the actuator's control: turn",
+    )
+    assert "Not carried over (3):" in repr(report)
