@@ -8,7 +8,7 @@ import numpy as np
 
 from lgsens.importers._chrono_data import Data, prepare
 from lgsens.importers._chrono_generic import generic_rows
-from lgsens.importers._chrono_types import TYPES, Row
+from lgsens.importers._chrono_types import REPEATING, TYPES, Row
 from lgsens.importers._report import Imported, Report, built, made
 from lgsens.model import (
     AbstractForce,
@@ -76,7 +76,7 @@ def chrono(
     for row in rows:
         assembly.add(row)
     forces: dict[str, AbstractForce] = {"gravity": made(Gravity, gravity)} | assembly.forces
-    model, more = built(assembly.bodies, assembly.joints, forces)
+    model, more = built(assembly.bodies, assembly.joints, forces, check=data.template in REPEATING)
     types = lambda of: {name: type(each).__name__ for name, each in of.items()}
     notes = (*notes, *assembly.notes, *more)
     name = f"{data.content.get('Name', data.path.stem)} ({data.template})"
@@ -147,11 +147,11 @@ class Assembly:
 
     def _body(self, body: str, *ends: str, axes: np.ndarray | None = None) -> None:
         section = body.removeprefix("*")
-        if "COM" in self.data.content[section]:
+        if not ends or self.data.has(section, "COM"):
             centre = self.point(f"{section}/COM")
         else:
             centre = np.mean([self.point(end) for end in ends], axis=0)
-        moments = "Moments of Inertia" if "Moments of Inertia" in self.data.content[section] else "Inertia"
+        moments = "Moments of Inertia" if self.data.has(section, "Moments of Inertia") else "Inertia"
         inertia = np.diag(self.data.vector(section, moments))
         if moments != "Inertia":
             xy, xz, yz = self.data.vector(section, "Products of Inertia") * (self.side, 1.0, self.side)
@@ -197,7 +197,7 @@ class Assembly:
     def _rod(self, body: str, a: str, at_a: str, b: str, at_b: str) -> None:
         """A body on a universal joint and a ball joint; without mass a distance."""
         section = body.removeprefix("*")
-        if "Mass" not in self.data.content[section]:
+        if not self.data.has(section, "Mass"):
             self._distance(body, a, at_a, b, at_b)
             return
         along = self.point(at_b) - self.point(at_a)

@@ -39,6 +39,9 @@ class Data:
         self.taken.add((section, key))
         return found[key]
 
+    def has(self, section: str, key: str) -> bool:
+        return key in self.content.get(section, {})
+
     def need(self, section: str, key: str) -> Any:
         if (found := self.get(section, key)) is None:
             raise ValueError(f"{self.path}: {self.template} needs {key!r} in {section!r}.")

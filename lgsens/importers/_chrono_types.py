@@ -121,6 +121,9 @@ _TRIANGLE: list[Row] = [
 _ON_TUBE: Row = ("spindle", TUBE)
 _HOUSING = "*Axle Housing"
 
+# Whose equations may repeat others: all rods of the former are in planes along x.
+REPEATING = ("HendricksonPRIMAXX", "GenericWheeledSuspension")
+
 TYPES: dict[str, list[Row]] = {
     "DoubleWishbone": [
         ("body", "Upright"),

@@ -14,7 +14,7 @@ from lgsens._validate import optional
 from lgsens.importers._mjcf_elements import actuators, between_bodies, loops
 from lgsens.importers._mjcf_source import Source
 from lgsens.importers._report import Imported, Report, built, made
-from lgsens.model import Gravity, Model, RigidBody
+from lgsens.model import Gravity, RigidBody
 
 
 def mjcf(source: str | Path, *, qpos: Any = None, qvel: Any = None, ctrl: Any = None, keyframe: Any = None) -> Imported:
@@ -76,11 +76,8 @@ def _imported(source, kind: str, qpos, qvel, ctrl, keyframe) -> Imported:
     if gravity.any() and not read.disabled("GRAVITY"):
         forces["gravity"] = made(Gravity, gravity)
     joints = found.joints | closing
-    if closing:
-        model, notes = built(bodies | found.rotors, joints, forces)
-        read.notes += notes
-    else:
-        model = Model(bodies | found.rotors, joints, forces)
+    model, notes = built(bodies | found.rotors, joints, forces, check=bool(closing))
+    read.notes += notes
     types = lambda of: {name: type(each).__name__ for name, each in of.items()}
     dropped = (*read.dropped, *_dropped(read))
     return Imported(

@@ -27,7 +27,7 @@ def _wrenches(system: MultibodySystem, q, lam, t) -> list[Float[Array, "n e 6"]]
     def at_time(q, lam, t):
         stacks = system.constraints
         every = zip(stacks, at_ends(stacks, q), system.topology.rows)
-        return [stack.map(of_element, ends, (chosen(lam, rows), t, *stack.others(q))) for stack, ends, rows in every]
+        return [stack.map(of_element, ends, (chosen(lam, rows), t)) for stack, ends, rows in every]
 
     return jax.vmap(at_time)(system._placed(q), lam, t)
 

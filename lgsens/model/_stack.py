@@ -53,10 +53,13 @@ class Placed(NamedTuple, Generic[Element]):
 
 
 class AtEnds(NamedTuple):
-    """What bodies have at the ends of a stack: positions, orientations, …, with a leading axis; None: the ground."""
+    """What bodies have at the ends of a stack: positions, orientations, …, with a leading axis; None: the ground.
+    `others`: the frames of further bodies.
+    """
 
     a: tuple[Array, ...] | None
     b: tuple[Array, ...] | None
+    others: tuple[Frame, ...] = ()
 
 
 class Stack(eqx.Module, Generic[Element]):
@@ -106,6 +109,8 @@ class Stack(eqx.Module, Generic[Element]):
 
     def others(self, q: Pose) -> tuple[Frame, ...]:
         """The frames of the further bodies of constraints (`AbstractJoint.others`)."""
+        if not isinstance(self.elements, AbstractRows):
+            return ()
         return tuple(Frame(q.position[np.asarray(of)], q.orientation[np.asarray(of)]) for of in self.carriers)
 
     @property
@@ -129,23 +134,23 @@ class Stack(eqx.Module, Generic[Element]):
         return Stack(elements, a, b, self.owners[own], self.kept[own], self.places[own], carriers)
 
     def map(self, function, ends: AtEnds, extra: Sequence[Any] = ()):
-        """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra)` for every element; `ends`: of `at_ends`.
+        """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra, *others)` for each; `ends`: of `at_ends`.
 
         A ground side gets the inertial frame and zeros. Each of `extra` has a leading axis over the elements, or is a
-        scalar; frames have one.
+        scalar.
         """
         known = ends.a or ends.b
         assert known is not None  # not both are the ground
         dtype = known[0].dtype
         ground = (*ground_frame(dtype), *(jnp.zeros(array.shape[1:], dtype) for array in known[2:]))
         arrays = [item for pair in zip(ends.a or ground, ends.b or ground) for item in pair]
-        axes = [None if end is None else 0 for end in ends] * len(ground)
-        extra_axes = [0 if isinstance(value, Frame) or jnp.ndim(value) else None for value in extra]
+        axes = [None if end is None else 0 for end in ends[:2]] * len(ground)
+        extra_axes = [*(0 if jnp.ndim(value) else None for value in extra), *(0 for _ in ends.others)]
 
         def each(element, position_a, position_b, orientation_a, orientation_b, *others):
             return function(element, Frame(position_a, orientation_a), Frame(position_b, orientation_b), *others)
 
-        return jax.vmap(each, in_axes=(0, *axes, *extra_axes))(self.elements, *arrays, *extra)
+        return jax.vmap(each, in_axes=(0, *axes, *extra_axes))(self.elements, *arrays, *extra, *ends.others)
 
 
 def at_ends(stacks: Sequence[Stack], q: Pose, *arrays) -> list[AtEnds]:
@@ -164,7 +169,8 @@ def at_ends(stacks: Sequence[Stack], q: Pose, *arrays) -> list[AtEnds]:
         pieces = zip(*(lax.split(array[index], sizes) for array in (*q, *arrays)))
         return [None if bodies is None else next(pieces) for bodies in sides]
 
-    return [AtEnds(a, b) for a, b in zip(at([stack.a for stack in stacks]), at([stack.b for stack in stacks]))]
+    sides = zip(at([stack.a for stack in stacks]), at([stack.b for stack in stacks]))
+    return [AtEnds(a, b, stack.others(q)) for stack, (a, b) in zip(stacks, sides)]
 
 
 def state_coordinates(stack: Stack, index: np.ndarray) -> np.ndarray:

@@ -135,8 +135,8 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         square = jnp.where(square > 0, square, 1.0)
         angular, t = [], jnp.zeros((), mass.dtype)
         for stack, ends, rows in zip(self.constraints, at_ends(self.constraints, self.pose), self.topology.rows):
-            own = stack.map(constraint_jacobian, ends, (t, *stack.others(self.pose))).reshape(*rows.shape, -1, BODY_DIM)
-            without = jnp.all(own[..., : ROTATION.start] == 0.0, axis=(2, 3))
+            translation = stack.map(constraint_jacobian, ends, (t,)).reshape(*rows.shape, -1, BODY_DIM)
+            without = jnp.all(translation[..., : ROTATION.start] == 0.0, axis=(2, 3))
             angular.append((without.astype(mass.dtype), rows))
         angular = lax.stop_gradient(added(angular, self.topology.num_constraints, mass.dtype))
         return (1.0 + angular * (1.0 / square - 1.0)) / mass
@@ -264,7 +264,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             force = stack.map(generalized_force, ends, (t, *stack.states(twist)))
             forces.append((-stack.acting(force), coordinates))
         for stack, ends, pattern in zip(self.constraints, at_ends(self.constraints, q), topology.jacobian):
-            force = stack.map(constraint_force, ends, (chosen(lam, pattern.rows), t, *stack.others(q)))
+            force = stack.map(constraint_force, ends, (chosen(lam, pattern.rows), t))
             forces.append((stack.acting(force), pattern.columns))
         return added(forces, self.group.dim, v.dtype)
 
@@ -276,7 +276,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     def constraint(self, q, t):
         q, stacks = self._placed(q), self.constraints[: self.topology.num_positions]
         values = [
-            (stack.map(lambda e, *args: e.value(*args), ends, (t, *stack.others(q))), rows)
+            (stack.map(lambda e, *args: e.value(*args), ends, (t,)), rows)
             for stack, ends, rows in zip(stacks, at_ends(stacks, q), self.topology.rows)
         ]
         return added(values, self.topology.num_constraints - self.num_velocity_rows, self.mass.dtype)
@@ -303,13 +303,13 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     def sparse_constraint_jacobian(self, q, t):
         q = self._placed(q)
         parts = [
-            Blocks(stack.acting(stack.map(constraint_jacobian, ends, (t, *stack.others(q)))), pattern)
+            Blocks(stack.acting(stack.map(constraint_jacobian, ends, (t,))), pattern)
             for stack, ends, pattern in zip(self.constraints, at_ends(self.constraints, q), self.topology.jacobian)
         ]
         return SparseMatrix(tuple(parts), (self.topology.num_constraints, self.group.dim), self.mass.dtype)
 
-    def tangents(self, *state):
-        return Tangents(*(matrix.dense() for matrix in self.sparse_tangents(*state)))
+    def tangents(self, q, v, vdot, lam, t):
+        return Tangents(*(matrix.dense() for matrix in self.sparse_tangents(q, v, vdot, lam, t)))
 
     @_traced_once
     def sparse_tangents(self, q, v, vdot, lam, t):
@@ -329,8 +329,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
                 damping.append(Blocks(-square_blocks(velocity, own), pattern))
         placed = zip(self.constraints, at_ends(self.constraints, q), topology.rows, topology.stiffness)
         for stack, ends, rows, coupled in placed:
-            every = stack.map(constraint_stiffness, ends, (chosen(lam, rows), t, *stack.others(q)))
-            block = square_blocks(every, stack.ends.own)
+            block = square_blocks(stack.map(constraint_stiffness, ends, (chosen(lam, rows), t)), stack.ends.own)
             stiffness.extend(Blocks(square_blocks(block, places), pattern) for places, pattern in coupled)
         return Tangents(self._square(stiffness), self._square(damping), self.sparse_constraint_jacobian(q, t))
 

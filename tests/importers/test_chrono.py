@@ -14,7 +14,9 @@ from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 
 import lgsens as lg
+from lgsens.cli import main
 from lgsens.importers import chrono
+from lgsens.importers._chrono_types import TYPES
 
 DATA = Path(__file__).parent / "data" / "chrono"
 NAMES = sorted(path.stem for path in DATA.glob("*.json"))
@@ -110,7 +112,23 @@ def single_wishbone(at, c):
     ]
 
 
+def generic(_, c):
+    """The double wishbone as a list of joints: a ball on each arm, at its distance from a hinge and along it."""
+    content = json.loads(re.sub(r"//[^\n]*", "", (DATA / "GenericWheeledSuspension.json").read_text(encoding="utf-8")))
+    joints = {entry["Name"]: entry for entry in content["Joints"]}
+    rows = []
+    for arm in ("UCA", "LCA"):
+        hinge, ball = joints[f"Revolute{arm}"], np.array(joints[f"Spherical{arm}"]["Position"])
+        at, (w, *v) = np.array(hinge["Position"]), hinge["Rotation"]
+        along = Rotation.from_quat([*v, w]).apply(Z)
+        rows += [kept(c(ball), at, ball, at), along @ (c(ball) - ball)]
+    (rod,) = content["Distance Constraints"]
+    p, q = np.array(rod["Point2"]), np.array(rod["Point1"])
+    return [*rows, kept(c(p), q, p, q)]
+
+
 INDEPENDENT = {
+    "GenericWheeledSuspension": generic,
     "DoubleWishbone": double_wishbone,
     "DoubleWishboneReduced": double_wishbone,
     "MacPhersonStrut": macpherson,
@@ -291,3 +309,107 @@ def test_curves_agree_with_an_independent_position_solver(name):
 @pytest.mark.parametrize("name", sorted({*INDEPENDENT, *AXLES} - {*QUICK}))
 def test_curves_of_the_other_types(name):
     check_curves(name)
+
+
+# The freedoms that joints leave with locked wheels: two of an axle, one of a pinned one, none of a rigid one. In the
+# model of leaf springs by links bending leaves two more; four links and parallel beams repeat an equation (below).
+FREEDOMS = {name: 2 for name in NAMES} | {
+    "RigidPinnedAxle": 1,
+    "RigidSuspension": 0,
+    "SAELeafspringAxle": 4,
+    "SAEToeBarLeafspringAxle": 4,
+    "HendricksonPRIMAXX": 1,
+    "TranslationalDamperSuspension": 1,
+}
+EQUATIONS = {
+    "RevoluteJoint": 5,
+    "SphericalJoint": 3,
+    "UniversalJoint": 4,
+    "CylindricalJoint": 4,
+    "FixedJoint": 6,
+    "DistanceJoint": 1,
+    "PlanarJoint": 3,
+    "PointOnPlaneJoint": 1,
+}
+
+
+@pytest.mark.parametrize("name", sorted({*NAMES} - {"HendricksonPRIMAXX", "GenericWheeledSuspension"}))
+def test_every_type_is_read(name):
+    """As many freedoms as such an axle has, and nothing of the file but what the model has not."""
+    imported = chrono(DATA / f"{name}.json", wheels="locked")
+    joints = imported.report.joints
+    equations = sum(EQUATIONS[kind] for kind in joints.values())
+    assert 6 * len(imported.model.bodies) - equations == FREEDOMS[name]
+    unused = {line.partition(":")[0].partition("/")[2] for line in imported.report.dropped}
+    assert unused <= {
+        *("Minimum Length", "Maximum Length", "Degressivity Compression", "Degressivity Expansion"),
+        *("Inertia", "Location Wheel", "Location Spindle", "Location Stabilizer"),
+    }
+    assert set(TYPES) == {*NAMES} - {"GenericWheeledSuspension"}
+
+
+@pytest.mark.slow  # three seconds each
+@pytest.mark.parametrize("name", sorted({*NAMES} - {*INDEPENDENT, *AXLES}))
+def test_every_other_type_assembles(name):
+    """Its reference satisfies all equations to round-off, of points 1 m away; the rank is that of the freedoms."""
+    system = chrono(DATA / f"{name}.json").model.system()
+    q, _ = system.reference()
+    assert np.abs(system.constraint(q, 0.0)).max(initial=0.0) < 1e-14
+    jacobian = np.asarray(system.constraint_jacobian(q, 0.0))
+    repeated = len(jacobian) - np.linalg.matrix_rank(jacobian, tol=1e-8)
+    assert repeated == (1 if name == "HendricksonPRIMAXX" else 0)
+
+
+def test_numbers_of_a_file():
+    """The double wishbone: masses and points where the file says, both sides, springs, and what no body has."""
+    at = points("DoubleWishbone")
+    imported = chrono(DATA / "DoubleWishbone.json")
+    bodies, forces = imported.model.bodies, imported.model.forces
+    for side, mirror in (("left", 1.0), ("right", MIRROR)):
+        np.testing.assert_allclose(bodies[f"{side} Upright"].position, at("Upright", "COM") * mirror)
+        np.testing.assert_allclose(forces[f"{side} Spring"].at_b, at("Spring", "Location Arm") * mirror)
+    assert float(forces["left Spring"].free_length) == at("Spring", "Free Length")
+    assert float(forces["right Shock"].damping) == at("Shock", "Damping Coefficient")
+    # 0.8938 > 0.4 + 0.4
+    assert any("left Lower Control Arm: no body has the moments" in note for note in imported.report.notes)
+    moments = np.linalg.eigvalsh(np.diag(bodies["left Lower Control Arm"].inertia))
+    np.testing.assert_allclose(moments, [0.4469, 0.4469, 0.8938], rtol=1e-12)
+
+
+def test_rates_of_leaves():
+    """A front leaf of 0.45 m of a spring of 94748.2 N/m: 94748.2 · 0.45²/2 N m/rad, as the generic form of it says."""
+    spring = chrono(DATA / "SAELeafspringAxle.json").model.forces["left Frontleaf torsion y"]
+    np.testing.assert_allclose(spring.stiffness, 9593.2, rtol=1e-4)  # printed with five digits
+    np.testing.assert_allclose(spring.damping, 95.932, rtol=1e-4)
+
+
+WRONG = {
+    "no suspension": ('{"Type": "Tire"}', "no suspension of Chrono"),
+    "no JSON": ("{", "no JSON"),
+    "unknown type": ('{"Type": "Suspension", "Template": "Sled"}', "'Sled' is not one of"),
+    "missing": (
+        '{"Type": "Suspension", "Template": "RigidSuspension", "Spindle": {"Mass": 1, "Inertia": [1, 1, 1]}}',
+        "needs 'COM' in 'Spindle'",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_bad_input(name, tmp_path):
+    text, message = WRONG[name]
+    (tmp_path / "file.json").write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=message):
+        chrono(tmp_path / "file.json")
+
+
+def test_the_command_line_reports_and_animates(tmp_path, capsys):
+    assert (
+        main(["import", str(DATA / "RigidPinnedAxle.json"), "--simulate", "0.05", "--out", str(tmp_path / "out")]) == 0
+    )
+    said = capsys.readouterr().out
+    assert "Not carried over (1):" in said and "Axle/Inertia: 0.4" in said and "Degrees of freedom" in said
+    assert "<html" in (tmp_path / "out" / "motion.html").read_text(encoding="utf-8")
+    assert len((tmp_path / "out" / "motion.csv").read_text(encoding="utf-8").splitlines()) == 52
+    (tmp_path / "other.txt").write_text("nothing", encoding="utf-8")
+    assert main(["import", str(tmp_path / "other.txt")]) == 2
+    assert "is no MJCF" in capsys.readouterr().err
