@@ -378,7 +378,7 @@ def test_numbers_of_a_file():
 
 def test_rates_of_leaves():
     """A front leaf of 0.45 m of a spring of 94748.2 N/m: 94748.2 · 0.45²/2 N m/rad, as the generic form of it says."""
-    spring = chrono(DATA / "SAELeafspringAxle.json").model.forces["left Frontleaf torsion y"]
+    spring = chrono(DATA / "SAEToeBarLeafspringAxle.json").model.forces["left Frontleaf torsion y"]
     np.testing.assert_allclose(spring.stiffness, 9593.2, rtol=1e-4)  # printed with five digits
     np.testing.assert_allclose(spring.damping, 95.932, rtol=1e-4)
 
