@@ -156,7 +156,7 @@ def _dropped(read: Source) -> list[str]:
     if touching and not read.disabled("CONTACT"):
         found.append(f"contacts of {touching} geoms")
     for feature in _FEATURES:
-        numbers = np.asarray(getattr(model, feature.field, np.zeros(0)))
+        numbers = np.asarray(getattr(model, feature.field))
         absent = -1 if feature.field.endswith("plugin") else 0
         places = np.flatnonzero((numbers.reshape(len(numbers), -1) != absent).any(axis=1)) if len(numbers) else []
         if len(places):
@@ -164,7 +164,7 @@ def _dropped(read: Source) -> list[str]:
                 feature.of, lambda i, kind=feature.of: read.named(kind, int(i))
             )
             found.append(f"{feature.meaning}: {', '.join(dict.fromkeys(of(i) for i in places))}")
-    found += [f"{getattr(model, count)} {meaning}" for count, meaning in _COUNTS if getattr(model, count, 0)]
+    found += [f"{getattr(model, count)} {meaning}" for count, meaning in _COUNTS if getattr(model, count)]
     option = model.opt
     if option.density or option.viscosity:
         found.append(f"forces of the medium, density {option.density:g} kg/m³ and viscosity {option.viscosity:g} Pa s")

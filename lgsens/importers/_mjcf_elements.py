@@ -207,7 +207,7 @@ def _spring(read: Source, found: Found, joint: int, axis: Axis) -> None:
 def _rotor(read: Source, found: Found, joint: int, axis: Axis) -> None:
     """A body of inertia a that turns by s about the x axis of the ground; a slide of 1 m turns it by 1 rad."""
     model, name = read.model, read.joint_name(joint)
-    driving = np.flatnonzero((model.actuator_trnid[:, 0] == joint) & (model.actuator_trntype <= 1)) if model.nu else []
+    driving = np.flatnonzero((model.actuator_trnid[:, 0] == joint) & (model.actuator_trntype <= 1))
     armature = read.of_dofs("dof_armature", joint)
     armature += sum(float(model.actuator_armature[i]) * model.actuator_gear[i, 0] ** 2 for i in driving)
     if not armature:
@@ -296,7 +296,7 @@ def actuators(read: Source, found: Found) -> dict[str, AbstractForce]:
     if read.disabled("ACTUATION"):
         read.dropped.append("actuators: disabled in the file")
         return motors
-    for i in range(model.nactuator if hasattr(model, "nactuator") else model.nu):
+    for i in range(model.nactuator):
         name, joint = read.named("actuator", i), int(model.actuator_trnid[i, 0])
         on_joint = model.actuator_trntype[i] in (read.code("mjTRN_JOINT"), read.code("mjTRN_JOINTINPARENT"))
         bias = model.actuator_biastype[i]
@@ -328,7 +328,7 @@ def actuators(read: Source, found: Found) -> dict[str, AbstractForce]:
 def _control(read: Source, i: int) -> float:
     """The control, clipped to its range as MuJoCo does."""
     model = read.model
-    value = float(read.data.ctrl[model.actuator_ctrladr[i] if hasattr(model, "actuator_ctrladr") else i])
+    value = float(read.data.ctrl[model.actuator_ctrladr[i]])
     if model.actuator_ctrllimited[i] and not read.disabled("CLAMPCTRL"):
         value = float(np.clip(value, *model.actuator_ctrlrange[i]))
     return value

@@ -15,6 +15,7 @@ _CODES = {
     "BIAS": "mjtBias",
     "CNSTR": "mjtConstraint",
 }
+_PASSED_OVER = ("transmission", "gazebo", "safety_controller", "calibration")
 _WIDTH = {HINGE: 1, SLIDE: 1, BALL: 3, FREE: 6}
 
 
@@ -23,9 +24,9 @@ class Source:
 
     def __init__(self, mujoco: Any, source: str | Path, kind: str, qpos, qvel, ctrl, keyframe):
         self.mujoco = mujoco
-        self.model = self._compiled(source, kind)
         self.notes: list[str] = []
         self.dropped: list[str] = []
+        self.model = self._compiled(source, kind)
         self.data = mujoco.MjData(self.model)
         if keyframe is not None:
             if any(given is not None for given in (qpos, qvel, ctrl)):
@@ -50,6 +51,8 @@ class Source:
             text = Path(source).read_text(encoding="utf-8")
         if root not in text:
             raise ValueError(f"{self.name} is no {kind}: it has no element {root}>.")
+        # what the parser of URDF passes over
+        self.dropped += [f"{text.count(f'<{tag}')} elements <{tag}>" for tag in _PASSED_OVER if f"<{tag}" in text]
         load = self.mujoco.MjModel.from_xml_string if is_text else self.mujoco.MjModel.from_xml_path
         try:
             return load(str(source))

@@ -227,7 +227,9 @@ def test_equalities_of_joints():
 
 def test_mimic_joints_are_coupled():
     text = (DATA / "arm.urdf").read_text(encoding="utf-8")
+    text = text.replace("</robot>", '<transmission name="t"/></robot>')
     imported = lg.importers.urdf(text.replace("MIMIC", '<mimic joint="elbow" multiplier="-0.5" offset="0.2"/>'))
+    assert "1 elements <transmission>" in imported.report.dropped
     (coupling,) = imported.report.loops
     np.testing.assert_allclose(imported.model.joints[coupling].coefficients, [-0.5])
 
