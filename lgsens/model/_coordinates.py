@@ -3,6 +3,7 @@
 A joint's coordinate s is a function of the pose of its frame on b in that on a (`_relative`), whatever the joint is.
 """
 
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,21 +12,35 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, number_field, point_field, require, suggestion
-from lgsens.liegroups import SO3, turn_back
-from lgsens.model._constraints import AbstractConstraint
+from lgsens.liegroups import SO3, skew, turn_back
+from lgsens.model._constraints import AbstractClosedFormConstraint
 from lgsens.model._forces import AbstractForce, Attached, _frame
-from lgsens.model._frames import BODY_A, BODY_B, ROTATION, TURNING_A, TURNING_B, Frame
+from lgsens.model._frames import BODY_DIM, ROTATION, TURNING_A, TURNING_B, Frame
 from lgsens.model._joints import AbstractJoint
-from lgsens.model._loads import AbstractLoad
+from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, LoadTangents
 from lgsens.model._relative import Coordinate
 from lgsens.model._signals import Prescribed, at_time, prepared, prescribed_field
-from lgsens.model._stack import moved
 
 
 def _seen(a: Frame, b: Frame, on_a: Frame, on_b: Frame) -> Frame:
     """The frame `on_b` of b as seen from the frame `on_a` of a, both in the frames of their bodies."""
     axes_a, axes_b = a.orientation @ on_a.orientation, b.orientation @ on_b.orientation
     return Frame(turn_back(axes_a, b.point(on_b.position) - a.point(on_a.position)), axes_a.T @ axes_b)
+
+
+def _tilted(frames: Sequence[Frame], x) -> list[Frame]:
+    """Frames after small x = [u, θ] of each, to first order: x + u, R (I + θ̃). Derivatives at x = 0 are those of
+    R exp(θ̃), of which XLA would compile the series."""
+    parts = jnp.split(x, len(frames))
+    return [Frame(f.position + u[:3], f.orientation + f.orientation @ skew(u[3:])) for f, u in zip(frames, parts)]
+
+
+def _row(
+    value: Callable[..., Float[Array, ""]], frames: Sequence[Frame]
+) -> tuple[Float[Array, ""], Float[Array, " n"]]:
+    """A function of some frames, and its derivative by their [u, θ]."""
+    zero = jnp.zeros(BODY_DIM * len(frames), frames[0].position.dtype)
+    return jax.value_and_grad(lambda x: value(*_tilted(frames, x)))(zero)
 
 
 def _attached(joint: AbstractJoint, a: Frame, b: Frame) -> tuple[Frame, Frame]:
@@ -55,8 +70,11 @@ class CoordinateMeasure(NamedTuple):
     force: Float[Array, ""]
 
 
-class CoordinateLoad(AbstractLoad):
-    """Q = (∂s/∂q)ᵀ f along the coordinate s, f = motor(t) − k (s − s₀) − c ṡ, whose power is f ṡ."""
+class CoordinateLoad(AbstractClosedFormLoad):
+    """Q = (∂s/∂q)ᵀ f along the coordinate s, f = motor(t) − k (s − s₀) − c ṡ, whose power is f ṡ.
+
+    ∂Q/∂v = −c (∂s/∂q)ᵀ (∂s/∂q).
+    """
 
     on_a: Frame
     on_b: Frame
@@ -70,9 +88,7 @@ class CoordinateLoad(AbstractLoad):
     drawn = None
 
     def _both(self, a, b, va, vb, t):
-        value = lambda x: self.coordinate.of(_seen(moved(a, x[BODY_A]), moved(b, x[BODY_B]), self.on_a, self.on_b))
-        zero = jnp.zeros(2 * (BODY_B.stop - BODY_B.start), va.dtype)
-        s, row = jax.value_and_grad(value)(zero)
+        s, row = _row(lambda a, b: self.coordinate.of(_seen(a, b, self.on_a, self.on_b)), (a, b))
         rate = jnp.sum(row * jnp.concatenate([va, vb]))
         force = -self.stiffness * (s - self.free) - self.damping * rate
         if self.motor is not None:
@@ -85,6 +101,16 @@ class CoordinateLoad(AbstractLoad):
     def force(self, a, b, va, vb, t):
         found, row = self._both(a, b, va, vb, t)
         return found.force * row
+
+    def tangents(self, a, b, va, vb, t):
+        zero, row = jnp.zeros_like(va, shape=2 * BODY_DIM), self._both(a, b, va, vb, t)[1]
+
+        def force(x):
+            one, other = _tilted((a, b), x)
+            return self.force(one, other, va, vb, t)
+
+        position = jax.jacfwd(force)(zero)
+        return LoadTangents(position, -self.damping * jnp.outer(row, row))
 
 
 class CoordinateForce(AbstractForce):
@@ -184,7 +210,7 @@ class RotationalSpringDamper(AbstractForce):
         return (Attached(BallLoad(a, b @ SO3().exp(self.turned), self.stiffness, self.damping), self.a, self.b),)
 
 
-class Coupled(AbstractConstraint):
+class Coupled(AbstractClosedFormConstraint):
     """Φ = s₁ − Σ c_i s₂ⁱ of two coordinates; `roles`: which of the frames (a, b, *others) their four ends are."""
 
     first: tuple[Frame, Frame]
@@ -210,6 +236,21 @@ class Coupled(AbstractConstraint):
         if self.coordinates[0].periodic:
             missing = jnp.arctan2(jnp.sin(missing), jnp.cos(missing))
         return missing[None]
+
+    def jacobian(self, a, b, t, *others):
+        return _row(lambda a, b, *others: self.value(a, b, t, *others)[0], (a, b, *others))[1][None]
+
+    def force(self, a, b, lam, t, *others):
+        return lam[0] * self.jacobian(a, b, t, *others)[0]
+
+    def geometric_stiffness(self, a, b, lam, t, *others):
+        frames = (a, b, *others)
+
+        def force(x):
+            one, other, *more = _tilted(frames, x)
+            return self.force(one, other, lam, t, *more)
+
+        return jax.jacfwd(force)(jnp.zeros_like(lam, shape=BODY_DIM * len(frames)))
 
 
 class CoordinateCoupling(AbstractJoint):

@@ -219,7 +219,7 @@ def _moved(frames, x) -> tuple[Frame, ...]:
 def constraint_jacobian(element: AbstractRows, a: Frame, b: Frame, t, *others: Frame):
     """B of one element, or A, shape (rows, 12), 6 more for each other body."""
     if isinstance(element, AbstractClosedFormConstraint):
-        return element.jacobian(a, b, t)
+        return element.jacobian(a, b, t, *others)
     zero = jnp.zeros(BODY_DIM * (2 + len(others)), a.position.dtype)
     if isinstance(element, AbstractConstraint):
 
@@ -235,14 +235,14 @@ def constraint_jacobian(element: AbstractRows, a: Frame, b: Frame, t, *others: F
 def constraint_force(element: AbstractRows, a: Frame, b: Frame, lam, t, *others: Frame):
     """Bᵀλ of one element, or Aᵀλ, shape (12,) or more."""
     if isinstance(element, AbstractClosedFormConstraint):
-        return element.force(a, b, lam, t)
+        return element.force(a, b, lam, t, *others)
     return lam @ constraint_jacobian(element, a, b, t, *others)
 
 
 def constraint_stiffness(element: AbstractRows, a: Frame, b: Frame, lam, t, *others: Frame):
     """D_q(Bᵀλ) of one element, or D_q(Aᵀλ), shape (12, 12) or more."""
     if isinstance(element, AbstractClosedFormConstraint):
-        return element.geometric_stiffness(a, b, lam, t)
+        return element.geometric_stiffness(a, b, lam, t, *others)
     zero = jnp.zeros(BODY_DIM * (2 + len(others)), a.position.dtype)
 
     def force(x):
