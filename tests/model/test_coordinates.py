@@ -71,6 +71,7 @@ def test_a_rotor_is_an_inertia_of_the_hinge(options):
     np.testing.assert_allclose(change[1], expected, rtol=1e-12)  # round-off times the condition of B M⁻¹ Bᵀ, 1e3
 
 
+@SLOW
 def test_many_turns():
     """Two wheels on a belt, a motor on the second: θ₁ = 2 θ₂ = t² M/(J₂ + 4 J₁), more than three turns."""
     moment, first, second = 40.0, 0.3, 0.8
