@@ -20,7 +20,7 @@ RANKS = (
     ("simulation",),
     ("criteria",),
     ("analysis",),
-    ("sweeps", "examples"),
+    ("sweeps", "examples", "importers"),
     ("plotting",),
     ("accuracy", "optimize", "testing"),
     ("cli",),

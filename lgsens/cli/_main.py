@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 import jax
 
 from lgsens._xla import compilation_cache
-from lgsens.cli import _curves, _optimize, _paper, _top, _tradeoff
+from lgsens.cli import _curves, _import, _optimize, _paper, _top, _tradeoff
 from lgsens.cli._report import INTERRUPTED, UNFINISHED, interrupted, version
 from lgsens.examples import DEFAULT, PARAMETERS, shipped
 from lgsens.simulation import SimulationError
@@ -137,6 +137,20 @@ def _parser() -> argparse.ArgumentParser:
     paper.add_argument("--only", choices=list(_paper.STUDIES), help="one of the figures (default: all)")
     paper.add_argument("--coarse", action="store_true", help="two large steps instead of four or five: a quick look")
     paper.quiet("no progress bar and no tables")
+
+    read = commands.add_parser(
+        "import",
+        help="read a model of another program",
+        description="What an MJCF, URDF or Chrono suspension file has, what of it was not carried over, and with "
+        "--simulate its free motion as a page on which it moves.",
+    )
+    read.set_defaults(run=_import.run)
+    read.add_argument("file", metavar="FILE", help="MJCF or URDF (extra `mujoco`), or a suspension of Chrono, .json")
+    written = "simulate T seconds, write motion.html and motion.csv"
+    read.add_argument("--simulate", type=_positive, metavar="T", help=written)
+    read.option("--dt", 1e-3, "step size [s]", type=_positive)
+    read.out("out/import", "motion.html and motion.csv")
+    read.quiet("no report and no progress bar")
 
     tradeoff = commands.add_parser(
         "tradeoff",

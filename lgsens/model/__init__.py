@@ -18,6 +18,12 @@ from lgsens.model._controls import (
     MaxwellElement as MaxwellElement,
     PIDController as PIDController,
 )
+from lgsens.model._coordinates import (
+    CoordinateCoupling as CoordinateCoupling,
+    CoordinateForce as CoordinateForce,
+    CoordinateMeasure as CoordinateMeasure,
+    RotationalSpringDamper as RotationalSpringDamper,
+)
 from lgsens.model._curves import CurveSpringDamper as CurveSpringDamper
 from lgsens.model._drivers import (
     Angle as Angle,

@@ -82,19 +82,23 @@ def _assemble(
     frame = {None: None} | {name: StackRow(frames, i) for i, name in enumerate(sorted(bodies))}
 
     between = [(name, joint) for name, joint in sorted(joints.items()) if places[joint.a].body != places[joint.b].body]
+    ends_of = lambda joint: (joint.a, joint.b, *joint.others)
     members = [
-        (joint, frame[joint.a], frame[joint.b], places[joint.a].offset, places[joint.b].offset) for _, joint in between
+        (joint, *map(frame.get, ends_of(joint)), *(places[end].offset for end in ends_of(joint)))
+        for _, joint in between
     ]
     kinds = [(_kind(joint), *(end is None for end in ends)) for joint, *ends in members]
     constraints = []
     for (name, joint), row in zip(between, evaluated(_constraints, members, kinds)):
-        ends = places[joint.a], places[joint.b]
-        a, b = (number[end.body] for end in ends)
-        own = [moving[end.body] for end in ends if end.body is not None]
+        a, b, *others = (number[places[end].body] for end in ends_of(joint))
+        if None in others or len({a, b, *others}) < 2 + len(others):
+            raise ValueError(f"Joint {name!r} couples bodies that `merge_fixed` makes one, or ground; leave it out.")
+        more = tuple(other for other in others if other is not None)
+        own = [moving[body] for end in ends_of(joint) if (body := places[end].body) is not None]
         single = [jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), of) for of in row.of]
         for i, (of, kept) in enumerate(zip(row.of, violable_rows(name, joint, single, own))):
             if any(kept):
-                constraints.append(Placed(StackRow(of, row.index), a, b, name, kept, i))
+                constraints.append(Placed(StackRow(of, row.index), a, b, name, kept, i, more))
     loads, free = [], [body.coordinates for body in ordered]
     for name, force in sorted(forces.items()):
         for load, *ends in force.loads(moving if force.on_merged else bodies):
@@ -148,11 +152,12 @@ def _kind(joint: AbstractJoint) -> Hashable:
     return type(joint), structure, tuple((leaf.shape, leaf.dtype) if eqx.is_array(leaf) else leaf for leaf in leaves)
 
 
-def _constraints(joint: AbstractJoint, a: Frame | None, b: Frame | None, part_a: Frame | None, part_b: Frame | None):
-    """The constraints of a joint between its bodies; `part_a`, `part_b`: the poses of merged parts there."""
-    ground = ground_frame(next(end.position.dtype for end in (a, b) if end is not None))
-    elements = joint.constraints(ground if a is None else a, ground if b is None else b)
-    return tuple(carried(element, part_a, part_b) for element in elements)
+def _constraints(joint: AbstractJoint, *frames_and_parts: Frame | None):
+    """The constraints of a joint between its bodies: their frames, and the poses of merged parts there."""
+    frames, parts = frames_and_parts[: len(frames_and_parts) // 2], frames_and_parts[len(frames_and_parts) // 2 :]
+    ground = ground_frame(next(end.position.dtype for end in frames if end is not None))
+    elements = joint.constraints(*(ground if end is None else end for end in frames))
+    return tuple(carried(element, *parts) for element in elements)
 
 
 def _inertia(body: RigidBody):

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from lgsens.dynamics import least_norm
 from lgsens.liegroups import cross
 from lgsens.linear import chosen
-from lgsens.model._frames import Frame
+from lgsens.model._frames import BODY_DIM, Frame
 from lgsens.model._stack import at_ends, constraint_force
 from lgsens.model._system import MultibodySystem
 
@@ -20,8 +20,8 @@ from lgsens.model._system import MultibodySystem
 def _wrenches(system: MultibodySystem, q, lam, t) -> list[Float[Array, "n e 6"]]:
     """−Bᵀλ of each constraint on its body b: force [N], and moment about the inertial origin [N m], inertial frame."""
 
-    def of_element(element, a: Frame, b: Frame, lam, t):
-        _, _, force, moment = jnp.split(-constraint_force(element, a, b, lam, t), 4)
+    def of_element(element, a: Frame, b: Frame, *args):
+        _, _, force, moment = jnp.split(-constraint_force(element, a, b, *args)[: 2 * BODY_DIM], 4)
         return jnp.concatenate([force, cross(b.position, force) + b.axis(moment)])
 
     def at_time(q, lam, t):

@@ -66,6 +66,11 @@ class AbstractJoint(eqx.Module):
     coordinates: ClassVar[tuple[Coordinate, ...]] = ()
 
     @property
+    def others(self) -> tuple[str, ...]:
+        """Further bodies that it depends on: their frames are the last arguments of `constraints` and `value`."""
+        return ()
+
+    @property
     def frames(self) -> tuple[Frame, Frame] | None:
         """Its frames on a and on b, inertial frame, in the reference configuration; None: both at the centre of mass of
         b, with the axes of the inertial frame."""

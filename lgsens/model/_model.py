@@ -117,6 +117,7 @@ class Model(eqx.Module):
             raise ValueError("Model: no body has a degree of freedom; let at least one of them have a `free` one.")
         for name, joint in self.joints.items():
             self._check_connection(f"Joint {name!r}", (joint.a, joint.b))
+            self._check_connection(f"Joint {name!r}", joint.others)
         for name, force in self.forces.items():
             self._check_connection(f"Force {name!r}", force.bodies)
         self._check_duplicates()

@@ -27,13 +27,18 @@ _SEEN = {
 }
 
 
-def carried(element: AbstractElement, a: Frame | None, b: Frame | None, *, by_frames: bool = False) -> Any:
-    """A constraint or load between two parts as one between their bodies; `a`, `b`: the poses of the parts there.
+def carried(
+    element: AbstractElement, a: Frame | None, b: Frame | None, *others: Frame | None, by_frames: bool = False
+) -> Any:
+    """A constraint or load between two parts as one between their bodies; `a`, `b`, `others`: the poses of the parts.
 
     `by_frames`: by the frames of the parts, whatever the element says of its numbers.
     """
-    if a is None and b is None:
+    if all(part is None for part in (a, b, *others)):
         return element
+    if others:
+        assert isinstance(element, AbstractConstraint)
+        return _CarriedConstraint(element, a, b, others)
     fields = fixed_fields(element)
     if by_frames or not fields:
         kinds = {
@@ -76,6 +81,7 @@ class _CarriedConstraint(AbstractConstraint):
     element: AbstractConstraint
     a: Frame | None
     b: Frame | None
+    others: tuple[Frame | None, ...] = ()
 
     @property
     def num_rows(self):
@@ -93,8 +99,8 @@ class _CarriedConstraint(AbstractConstraint):
     def driven(self):
         return self.element.driven
 
-    def value(self, a, b, t):
-        return self.element.value(_frame(a, self.a), _frame(b, self.b), t)
+    def value(self, a, b, t, *others):
+        return self.element.value(_frame(a, self.a), _frame(b, self.b), t, *map(_frame, others, self.others))
 
 
 class _CarriedVelocityConstraint(AbstractVelocityConstraint):

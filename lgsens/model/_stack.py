@@ -39,7 +39,8 @@ Element = TypeVar("Element", AbstractRows, AbstractLoad | AbstractDynamicLoad)
 
 class Placed(NamedTuple, Generic[Element]):
     """An element or a `StackRow`, the numbers of its two bodies (None: the ground), the name of its owner; of a
-    constraint, which of its equations are kept, and which one of its joint's it is; of a load, what carries its states.
+    constraint, which of its equations are kept, which one of its joint's it is, and further bodies; of a load, what
+    carries its states.
     """
 
     element: Element | StackRow
@@ -52,10 +53,13 @@ class Placed(NamedTuple, Generic[Element]):
 
 
 class AtEnds(NamedTuple):
-    """What bodies have at the ends of a stack: positions, orientations, …, with a leading axis; None: the ground."""
+    """What bodies have at the ends of a stack: positions, orientations, …, with a leading axis; None: the ground.
+    `others`: the frames of further bodies.
+    """
 
     a: tuple[Array, ...] | None
     b: tuple[Array, ...] | None
+    others: tuple[Frame, ...] = ()
 
 
 class Stack(eqx.Module, Generic[Element]):
@@ -67,7 +71,7 @@ class Stack(eqx.Module, Generic[Element]):
     owners: tuple[str, ...] = eqx.field(static=True)
     kept: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
     places: tuple[int, ...] = eqx.field(static=True)
-    carriers: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())  # of states, as `a` and `b`
+    carriers: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())  # or others; as `a` and `b`
 
     def __check_init__(self):
         name, acts_on = type(self.elements).__name__, self.elements.acts_on
@@ -103,14 +107,23 @@ class Stack(eqx.Module, Generic[Element]):
         translations = [twist[np.asarray(of), : ROTATION.start] for of in self.carriers]
         return (jnp.concatenate(translations, axis=1)[:, : num_states(self.elements)],)
 
+    def others(self, q: Pose) -> tuple[Frame, ...]:
+        """The frames of the further bodies of constraints (`AbstractJoint.others`)."""
+        if not isinstance(self.elements, AbstractRows):
+            return ()
+        return tuple(Frame(q.position[np.asarray(of)], q.orientation[np.asarray(of)]) for of in self.carriers)
+
     @property
     def ends(self) -> Ends:
         found = Ends(self.a, self.b, self.owners, self.kept, acts_on=self.elements.acts_on)
         if not isinstance(self.elements, AbstractRows):
             places = places_of_states(num_states(self.elements))
             return found._replace(carriers=self.carriers, acts_on=(*found.acts_on, *places))
-        velocity = isinstance(self.elements, AbstractVelocityConstraint)
-        return found._replace(relative=self.elements.relative, coupled=self.elements.coupled, velocity=velocity)
+        velocity, relative = isinstance(self.elements, AbstractVelocityConstraint), self.elements.relative
+        if self.carriers:
+            every = tuple(range(BODY_DIM * (2 + len(self.carriers))))
+            return found._replace(carriers=self.carriers, acts_on=every, coupled=(every,), velocity=velocity)
+        return found._replace(relative=relative, coupled=self.elements.coupled, velocity=velocity)
 
     def only(self, i: int) -> "Stack[Element]":
         """The stack of one of its elements."""
@@ -121,7 +134,7 @@ class Stack(eqx.Module, Generic[Element]):
         return Stack(elements, a, b, self.owners[own], self.kept[own], self.places[own], carriers)
 
     def map(self, function, ends: AtEnds, extra: Sequence[Any] = ()):
-        """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra)` for every element; `ends`: of `at_ends`.
+        """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra, *others)` for each; `ends`: of `at_ends`.
 
         A ground side gets the inertial frame and zeros. Each of `extra` has a leading axis over the elements, or is a
         scalar.
@@ -131,13 +144,13 @@ class Stack(eqx.Module, Generic[Element]):
         dtype = known[0].dtype
         ground = (*ground_frame(dtype), *(jnp.zeros(array.shape[1:], dtype) for array in known[2:]))
         arrays = [item for pair in zip(ends.a or ground, ends.b or ground) for item in pair]
-        axes = [None if end is None else 0 for end in ends] * len(ground)
-        extra_axes = [0 if jnp.ndim(value) else None for value in extra]
+        axes = [None if end is None else 0 for end in ends[:2]] * len(ground)
+        extra_axes = [*(0 if jnp.ndim(value) else None for value in extra), *(0 for _ in ends.others)]
 
         def each(element, position_a, position_b, orientation_a, orientation_b, *others):
             return function(element, Frame(position_a, orientation_a), Frame(position_b, orientation_b), *others)
 
-        return jax.vmap(each, in_axes=(0, *axes, *extra_axes))(self.elements, *arrays, *extra)
+        return jax.vmap(each, in_axes=(0, *axes, *extra_axes))(self.elements, *arrays, *extra, *ends.others)
 
 
 def at_ends(stacks: Sequence[Stack], q: Pose, *arrays) -> list[AtEnds]:
@@ -156,7 +169,8 @@ def at_ends(stacks: Sequence[Stack], q: Pose, *arrays) -> list[AtEnds]:
         pieces = zip(*(lax.split(array[index], sizes) for array in (*q, *arrays)))
         return [None if bodies is None else next(pieces) for bodies in sides]
 
-    return [AtEnds(a, b) for a, b in zip(at([stack.a for stack in stacks]), at([stack.b for stack in stacks]))]
+    sides = zip(at([stack.a for stack in stacks]), at([stack.b for stack in stacks]))
+    return [AtEnds(a, b, stack.others(q)) for stack, (a, b) in zip(stacks, sides)]
 
 
 def state_coordinates(stack: Stack, index: np.ndarray) -> np.ndarray:
@@ -198,30 +212,44 @@ def moved(frame: Frame, x) -> Frame:
     return Frame(*R3xSO3().retract(Pose(*frame), x))
 
 
-def constraint_jacobian(element: AbstractRows, a: Frame, b: Frame, t):
-    """B of one element, or A, shape (rows, 12)."""
+def _moved(frames, x) -> tuple[Frame, ...]:
+    return tuple(moved(frame, x[BODY_DIM * i : BODY_DIM * (i + 1)]) for i, frame in enumerate(frames))
+
+
+def constraint_jacobian(element: AbstractRows, a: Frame, b: Frame, t, *others: Frame):
+    """B of one element, or A, shape (rows, 12), 6 more for each other body."""
     if isinstance(element, AbstractClosedFormConstraint):
-        return element.jacobian(a, b, t)
-    zero = jnp.zeros(12, a.position.dtype)
+        return element.jacobian(a, b, t, *others)
+    zero = jnp.zeros(BODY_DIM * (2 + len(others)), a.position.dtype)
     if isinstance(element, AbstractConstraint):
-        return jax.jacfwd(lambda x: element.value(moved(a, x[BODY_A]), moved(b, x[BODY_B]), t))(zero)
+
+        def value(x):
+            a_, b_, *others_ = _moved((a, b, *others), x)
+            return element.value(a_, b_, t, *others_)
+
+        return jax.jacfwd(value)(zero)
     assert isinstance(element, AbstractVelocityConstraint)
     return jax.jacfwd(lambda v: element.rate(a, b, v[BODY_A], v[BODY_B], t))(zero)
 
 
-def constraint_force(element: AbstractRows, a: Frame, b: Frame, lam, t):
-    """Bᵀλ of one element, or Aᵀλ, shape (12,)."""
+def constraint_force(element: AbstractRows, a: Frame, b: Frame, lam, t, *others: Frame):
+    """Bᵀλ of one element, or Aᵀλ, shape (12,) or more."""
     if isinstance(element, AbstractClosedFormConstraint):
-        return element.force(a, b, lam, t)
-    return lam @ constraint_jacobian(element, a, b, t)
+        return element.force(a, b, lam, t, *others)
+    return lam @ constraint_jacobian(element, a, b, t, *others)
 
 
-def constraint_stiffness(element: AbstractRows, a: Frame, b: Frame, lam, t):
-    """D_q(Bᵀλ) of one element, or D_q(Aᵀλ), shape (12, 12)."""
+def constraint_stiffness(element: AbstractRows, a: Frame, b: Frame, lam, t, *others: Frame):
+    """D_q(Bᵀλ) of one element, or D_q(Aᵀλ), shape (12, 12) or more."""
     if isinstance(element, AbstractClosedFormConstraint):
-        return element.geometric_stiffness(a, b, lam, t)
-    zero = jnp.zeros(12, a.position.dtype)
-    return jax.jacfwd(lambda x: constraint_force(element, moved(a, x[BODY_A]), moved(b, x[BODY_B]), lam, t))(zero)
+        return element.geometric_stiffness(a, b, lam, t, *others)
+    zero = jnp.zeros(BODY_DIM * (2 + len(others)), a.position.dtype)
+
+    def force(x):
+        a_, b_, *others_ = _moved((a, b, *others), x)
+        return constraint_force(element, a_, b_, lam, t, *others_)
+
+    return jax.jacfwd(force)(zero)
 
 
 def entries_at(arrays: Float[Array, "... n"], places: np.ndarray, axis: int = -1) -> Float[Array, "... p"]:

@@ -276,7 +276,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     def constraint(self, q, t):
         q, stacks = self._placed(q), self.constraints[: self.topology.num_positions]
         values = [
-            (stack.map(lambda e, a, b, t: e.value(a, b, t), ends, (t,)), rows)
+            (stack.map(lambda e, *args: e.value(*args), ends, (t,)), rows)
             for stack, ends, rows in zip(stacks, at_ends(stacks, q), self.topology.rows)
         ]
         return added(values, self.topology.num_constraints - self.num_velocity_rows, self.mass.dtype)

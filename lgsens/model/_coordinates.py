@@ -1,0 +1,326 @@
+"""What acts on the relative coordinates of joints: springs, dampers and motors, and couplings between two joints.
+
+A joint's coordinate s is a function of the pose of its frame on b in that on a (`_relative`), whatever the joint is.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens._validate import as_float, number_field, point_field, require, suggestion
+from lgsens.liegroups import SO3, skew, turn_back
+from lgsens.model._constraints import AbstractClosedFormConstraint
+from lgsens.model._forces import AbstractForce, Attached, _frame
+from lgsens.model._frames import BODY_DIM, ROTATION, TURNING_A, TURNING_B, Frame
+from lgsens.model._joints import AbstractJoint
+from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, LoadTangents
+from lgsens.model._relative import Coordinate
+from lgsens.model._signals import Prescribed, at_time, prepared, prescribed_field
+
+
+def _seen(a: Frame, b: Frame, on_a: Frame, on_b: Frame) -> Frame:
+    """The frame `on_b` of b as seen from the frame `on_a` of a, both in the frames of their bodies."""
+    axes_a, axes_b = a.orientation @ on_a.orientation, b.orientation @ on_b.orientation
+    return Frame(turn_back(axes_a, b.point(on_b.position) - a.point(on_a.position)), axes_a.T @ axes_b)
+
+
+def _tilted(frames: Sequence[Frame], x) -> list[Frame]:
+    """Frames after small x = [u, θ] of each, to first order: x + u, R (I + θ̃). Derivatives at x = 0 are those of
+    R exp(θ̃), of which XLA would compile the series."""
+    parts = jnp.split(x, len(frames))
+    return [Frame(f.position + u[:3], f.orientation + f.orientation @ skew(u[3:])) for f, u in zip(frames, parts)]
+
+
+def _row(
+    value: Callable[..., Float[Array, ""]], frames: Sequence[Frame]
+) -> tuple[Float[Array, ""], Float[Array, " n"]]:
+    """A function of some frames, and its derivative by their [u, θ]."""
+    zero = jnp.zeros(BODY_DIM * len(frames), frames[0].position.dtype)
+    return jax.value_and_grad(lambda x: value(*_tilted(frames, x)))(zero)
+
+
+def _attached(joint: AbstractJoint, a: Frame, b: Frame) -> tuple[Frame, Frame]:
+    """The frames of a joint in those of its bodies, which have the reference frames a and b."""
+    assert joint.frames is not None
+    of_a, of_b = joint.frames
+    local = lambda body, own: Frame(body.local_point(own.position), body.orientation.T @ own.orientation)
+    return local(a, of_a), local(b, of_b)
+
+
+def _coordinate(what: str, joint: AbstractJoint, name: str | None) -> Coordinate:
+    known = {coordinate.name: coordinate for coordinate in joint.coordinates}
+    if not known or joint.frames is None:
+        raise ValueError(f"{what}: a {type(joint).__name__} has no relative coordinate; give a RevoluteJoint, say.")
+    if name is None and len(known) > 1:
+        raise ValueError(f"{what}: a {type(joint).__name__} has the coordinates {list(known)}; give the name of one.")
+    if name is not None and name not in known:
+        raise ValueError(f"{what}: {suggestion(name, known)}.")
+    return known[name or next(iter(known))]
+
+
+class CoordinateMeasure(NamedTuple):
+    """What is moved at one instant: the coordinate, its rate, and the generalized force along it, shape ()."""
+
+    coordinate: Float[Array, ""]
+    rate: Float[Array, ""]
+    force: Float[Array, ""]
+
+
+class CoordinateLoad(AbstractClosedFormLoad):
+    """Q = (∂s/∂q)ᵀ f along the coordinate s, f = motor(t) − k (s − s₀) − c ṡ, whose power is f ṡ.
+
+    ∂Q/∂v = −c (∂s/∂q)ᵀ (∂s/∂q).
+    """
+
+    on_a: Frame
+    on_b: Frame
+    stiffness: Float[Array, ""]
+    damping: Float[Array, ""]
+    free: Float[Array, ""]
+    motor: Prescribed | None
+    coordinate: Coordinate = eqx.field(static=True)
+
+    balanced = True
+    drawn = None
+
+    def _both(self, a, b, va, vb, t):
+        s, row = _row(lambda a, b: self.coordinate.of(_seen(a, b, self.on_a, self.on_b)), (a, b))
+        rate = jnp.sum(row * jnp.concatenate([va, vb]))
+        force = -self.stiffness * (s - self.free) - self.damping * rate
+        if self.motor is not None:
+            force += at_time(self.motor, t)
+        return CoordinateMeasure(s, rate, force), row
+
+    def measure(self, a, b, va, vb, t) -> CoordinateMeasure:
+        return self._both(a, b, va, vb, t)[0]
+
+    def force(self, a, b, va, vb, t):
+        found, row = self._both(a, b, va, vb, t)
+        return found.force * row
+
+    def tangents(self, a, b, va, vb, t):
+        zero, row = jnp.zeros_like(va, shape=2 * BODY_DIM), self._both(a, b, va, vb, t)[1]
+
+        def force(x):
+            one, other = _tilted((a, b), x)
+            return self.force(one, other, va, vb, t)
+
+        position = jax.jacfwd(force)(zero)
+        return LoadTangents(position, -self.damping * jnp.outer(row, row))
+
+
+class CoordinateForce(AbstractForce):
+    """Spring, damper and motor along a relative coordinate s of a joint: f = M(t) − k (s − s₀) − c ṡ.
+
+    It acts on both bodies as Q = (∂s/∂q)ᵀ f: about the axis of a hinge, along that of a slider, on each of the two arms
+    of a cross.
+
+    Arguments:
+        joint: whose coordinate it is, with its bodies and its geometry; it need not be one of the model's.
+        coordinate: the name of the coordinate, static; None: the only one.
+        stiffness: k [N/m or N m/rad], shape ().
+        damping: c [N s/m or N m s/rad], shape ().
+        free: s₀ [m or rad], at which the spring is free, shape (). An angle is within half a turn of 0.
+        motor: M(t) [N or N m], a number, shape (), or a signal; None: no motor.
+
+    `Trajectory.force` gives the coordinate, its rate, and f. Raises `ValueError` for a joint without the coordinate,
+    and for wrong shapes.
+    """
+
+    joint: AbstractJoint
+    coordinate: str | None = eqx.field(static=True, default=None)
+    stiffness: Float[Array, ""] = number_field("stiffness", default=0.0)
+    damping: Float[Array, ""] = number_field("damping", default=0.0)
+    free: Float[Array, ""] = number_field("free", default=0.0)
+    motor: Prescribed | None = prescribed_field("motor")
+
+    def __check_init__(self):
+        _coordinate("CoordinateForce", self.joint, self.coordinate)
+
+    @property
+    def bodies(self):
+        return (self.joint.a, self.joint.b)
+
+    def loads(self, bodies):
+        ends = _attached(self.joint, *(_frame(bodies, name, self.stiffness.dtype) for name in self.bodies))
+        motor = None if self.motor is None else prepared(self.motor)
+        coordinate = _coordinate("CoordinateForce", self.joint, self.coordinate)
+        return (
+            Attached(CoordinateLoad(*ends, self.stiffness, self.damping, self.free, motor, coordinate), *self.bodies),
+        )
+
+
+class BallLoad(AbstractLoad):
+    """The moment −k φ − c ω on b, its opposite on a: φ the rotation vector of b in a, ω their relative velocity.
+
+    With S = (R_a T_a)ᵀ R_b T_b = exp(φ̃), φ is along the same axis for both; the moment −k φ has the energy ½ k |φ|².
+    """
+
+    triad_a: Float[Array, "3 3"]
+    triad_b: Float[Array, "3 3"]
+    stiffness: Float[Array, ""]
+    damping: Float[Array, ""]
+
+    balanced = True
+    drawn = None
+
+    @property
+    def acts_on(self):
+        return TURNING_A + TURNING_B
+
+    def force(self, a, b, va, vb, t):
+        axes_a, axes_b = a.orientation @ self.triad_a, b.orientation @ self.triad_b
+        phi = axes_a @ SO3().log(axes_a.T @ axes_b)
+        moment = self.stiffness * phi + self.damping * (b.axis(vb[ROTATION]) - a.axis(va[ROTATION]))
+        zero = jnp.zeros_like(moment)
+        return jnp.concatenate([zero, a.local_axis(moment), zero, -b.local_axis(moment)])
+
+
+class RotationalSpringDamper(AbstractForce):
+    """Spring and damper against all rotations between two bodies, of a ball joint say: the moment −k φ − c ω on b.
+
+    φ is the rotation vector of `b` in `a`, |φ| < π, and ω their relative angular velocity. A `Bushing` has a stiffness
+    about each of three axes.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        stiffness: k [N m/rad], shape ().
+        damping: c [N m s/rad], shape ().
+        turned: φ in the reference configuration [rad], inertial frame, shape (3,).
+
+    Raises `ValueError` for wrong shapes.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    stiffness: Float[Array, ""] = number_field("stiffness", default=0.0)
+    damping: Float[Array, ""] = number_field("damping", default=0.0)
+    turned: Float[Array, "3"] = point_field("turned", default=(0.0, 0.0, 0.0))
+
+    @property
+    def bodies(self):
+        return (self.a, self.b)
+
+    def loads(self, bodies):
+        a, b = (_frame(bodies, name, self.turned.dtype).orientation.T for name in (self.a, self.b))
+        return (Attached(BallLoad(a, b @ SO3().exp(self.turned), self.stiffness, self.damping), self.a, self.b),)
+
+
+class Coupled(AbstractClosedFormConstraint):
+    """Φ = s₁ − Σ c_i s₂ⁱ of two coordinates; `roles`: which of the frames (a, b, *others) their four ends are."""
+
+    first: tuple[Frame, Frame]
+    second: tuple[Frame, Frame]
+    coefficients: Float[Array, " n"]
+    coordinates: tuple[Coordinate, ...] = eqx.field(static=True)  # two
+    roles: tuple[int, ...] = eqx.field(static=True)  # four
+
+    drawn = None
+
+    @property
+    def num_rows(self):
+        return 1
+
+    def value(self, a, b, t, *others):
+        ends = [(a, b, *others)[role] for role in self.roles]
+        first, second = (of.of for of in self.coordinates)
+        x = second(_seen(ends[2], ends[3], *self.second))
+        total = jnp.zeros_like(x)
+        for i in reversed(range(self.coefficients.shape[0])):  # Horner's scheme
+            total = (total + self.coefficients[i]) * x
+        missing = first(_seen(ends[0], ends[1], *self.first)) - total
+        if self.coordinates[0].periodic:
+            missing = jnp.arctan2(jnp.sin(missing), jnp.cos(missing))
+        return missing[None]
+
+    def jacobian(self, a, b, t, *others):
+        return _row(lambda a, b, *others: self.value(a, b, t, *others)[0], (a, b, *others))[1][None]
+
+    def force(self, a, b, lam, t, *others):
+        return lam[0] * self.jacobian(a, b, t, *others)[0]
+
+    def geometric_stiffness(self, a, b, lam, t, *others):
+        frames = (a, b, *others)
+
+        def force(x):
+            one, other, *more = _tilted(frames, x)
+            return self.force(one, other, lam, t, *more)
+
+        return jax.jacfwd(force)(jnp.zeros_like(lam, shape=BODY_DIM * len(frames)))
+
+
+class CoordinateCoupling(AbstractJoint):
+    """The coordinates of two joints move together: s₁ = c₁ s₂ + c₂ s₂² + …; 1 equation between up to four bodies.
+
+    Two fingers of a gripper, a cam, a belt between two joints of an arm. With a *rotor* as one of them, a body that
+    only turns about an axis of the ground, it is the inertia of a drive in joint coordinates: the rotor of inertia J
+    turns by s₁ = s₂, and adds the kinetic energy ½ J ṡ₂² and nothing else (MuJoCo's `armature`, the motor's inertia
+    times the square of its gear ratio).
+
+    Arguments:
+        first, second: the joints, with bodies and geometry; they need not be joints of the model, where others hold
+            the bodies.
+        coefficients: c₁, c₂, …, shape (n,), n ≥ 1. Both coordinates vanish together: in the reference configuration.
+        names: the names of the coordinates of both, static; None: the only one.
+
+    Angles may turn by any number of turns where c₁ is an integer and the only coefficient; else `second` stays within
+    half a turn. The multiplier is the generalized force that the coupling takes from s₁ [N or N m]. Raises `ValueError`
+    for joints without the coordinate, coefficients of a wrong shape, or fewer than two bodies.
+    """
+
+    first: AbstractJoint
+    second: AbstractJoint
+    coefficients: Float[Array, " n"]
+    names: tuple[str | None, str | None] = eqx.field(static=True)
+
+    assembled = True
+
+    def __init__(self, first: AbstractJoint, second: AbstractJoint, coefficients: Any = (1.0,), names=(None, None)):
+        self.first, self.second, self.names = first, second, names
+        self.coefficients = as_float(coefficients, None, "CoordinateCoupling: `coefficients`")
+
+    def __check_init__(self):
+        for joint, name in zip((self.first, self.second), self.names):
+            _coordinate("CoordinateCoupling", joint, name)
+        if self.coefficients.ndim != 1 or not self.coefficients.shape[0]:
+            raise ValueError(
+                f"CoordinateCoupling: `coefficients` must have shape (n,), n ≥ 1, got {self.coefficients.shape}."
+            )
+        require(lambda c: c.any(), "CoordinateCoupling: `coefficients` are all zero.", self.coefficients)
+        if len(self._order) < 2:
+            raise ValueError(f"CoordinateCoupling: needs two or more bodies, got {self._ends}.")
+
+    @property
+    def _ends(self) -> tuple[str | None, ...]:
+        return (self.first.a, self.first.b, self.second.a, self.second.b)
+
+    @property
+    def _order(self) -> list[str | None]:
+        """Its bodies, each once, the ground first."""
+        return sorted(dict.fromkeys(self._ends), key=lambda name: name is not None)
+
+    @property
+    def a(self):
+        return self._order[0]
+
+    @property
+    def b(self):
+        return self._order[1]
+
+    @property
+    def others(self):
+        return tuple(self._order[2:])
+
+    def constraints(self, a, b, *others):
+        order, frames = self._order, (a, b, *others)
+        roles = tuple(order.index(name) for name in self._ends)
+        ends = [frames[role] for role in roles]
+        coordinates = tuple(
+            _coordinate("CoordinateCoupling", joint, name) for joint, name in zip((self.first, self.second), self.names)
+        )
+        both = _attached(self.first, *ends[:2]), _attached(self.second, *ends[2:])
+        return (Coupled(*both, self.coefficients, coordinates, roles),)
