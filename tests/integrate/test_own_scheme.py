@@ -81,8 +81,9 @@ def differences(f):
     return np.array([central(lambda s, e=e: compiled(P + s * e), 1e-3) for e in jnp.eye(3)])
 
 
+@pytest.mark.slow  # `test_radau.py` has a scheme of this kind in the quick run
 @pytest.mark.parametrize(
-    "integrator", [pytest.param(MIDPOINT, marks=pytest.mark.slow, id="equal"), pytest.param(GIVEN, id="given")]
+    "integrator", [pytest.param(MIDPOINT, id="equal"), pytest.param(GIVEN, id="given")]
 )
 def test_both_modes_on_every_grid(integrator):
     f = lambda p: psi(p, integrator=integrator)

@@ -82,7 +82,7 @@ def test_motion_of_the_heavy_top():
     check_invariants(name, energy_of_top(PROBLEMS[name].parameters), {"energy": HEAVY["states"][0]["energy"]})
 
 
-@pytest.mark.parametrize("case", ["nutating", "simo_wong"])
+@pytest.mark.parametrize("case", [pytest.param("nutating", marks=pytest.mark.slow), "simo_wong"])
 def test_motion_of_the_lagrange_top(case):
     """The closed form, and its three integrals: energy, vertical angular momentum, spin."""
     name = f"lagrange_top_analytic.{case}"
