@@ -62,6 +62,8 @@ from lgsens.model import (
     GearJoint as GearJoint,
     Gravity as Gravity,
     Harmonic as Harmonic,
+    JointFriction as JointFriction,
+    LuGreFriction as LuGreFriction,
     MaxwellElement as MaxwellElement,
     Model as Model,
     PIDController as PIDController,

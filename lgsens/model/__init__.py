@@ -37,6 +37,11 @@ from lgsens.model._forces import (
 )
 from lgsens.model._frames import Frame as Frame, motion_at as motion_at
 from lgsens.model._free import ALL_FREE as ALL_FREE
+from lgsens.model._friction import (
+    JointFriction as JointFriction,
+    LuGreFriction as LuGreFriction,
+    SlidingFriction as SlidingFriction,
+)
 from lgsens.model._joint_forces import joint_wrenches as joint_wrenches
 from lgsens.model._joints import (
     AbstractJoint as AbstractJoint,
@@ -58,6 +63,7 @@ from lgsens.model._loads import (
     SpringDamperLoad as SpringDamperLoad,
     TyreLoad as TyreLoad,
 )
+from lgsens.model._measured import measured as measured
 from lgsens.model._model import Model as Model
 from lgsens.model._on_merged_bodies import carried as carried
 from lgsens.model._relative import (

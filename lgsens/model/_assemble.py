@@ -97,7 +97,7 @@ def _assemble(
                 constraints.append(Placed(StackRow(of, row.index), a, b, name, kept, i))
     loads, free = [], [body.coordinates for body in ordered]
     for name, force in sorted(forces.items()):
-        for load, *ends in force.loads(moving if force.on_merged else bodies):
+        for load, *ends, joint in force.on(joints).loads(moving if force.on_merged else bodies):
             a, b = (places[end] for end in ends)
             own = carriers(num_states(load))
             if own and a.body is b.body is None:
@@ -108,7 +108,7 @@ def _assemble(
             if own or a.body != b.body or (a.body is not None and not load.balanced):
                 here = tuple(range(len(free), len(free) + len(own)))
                 element = carried(load, a.offset, b.offset)
-                loads.append(Placed(element, number[a.body], number[b.body], name, carriers=here))
+                loads.append(Placed(element, number[a.body], number[b.body], name, carriers=here, joint=joint))
                 free.extend(own)
     kinds = [
         (jnp.shape(body.inertia) if body.inertia is not None else None, body.pivot is None, body.mass.dtype)

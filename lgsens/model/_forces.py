@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from lgsens._validate import number_field, point_field
 from lgsens.model._body import RigidBody
 from lgsens.model._frames import Frame, ground_frame
+from lgsens.model._joints import AbstractJoint
 from lgsens.model._loads import (
     AbstractDynamicLoad,
     AbstractLoad,
@@ -27,11 +28,13 @@ from lgsens.model._turning_loads import FollowingForce, FullBushingLoad, Rotatio
 
 
 class Attached(NamedTuple):
-    """A load and the two bodies that it acts between; None is the ground."""
+    """A load and the two bodies that it acts between, None is the ground; of one that reads the multipliers of a joint,
+    the name of the joint."""
 
     load: AbstractLoad | AbstractDynamicLoad
     a: str | None
     b: str | None
+    joint: str | None = None
 
 
 class AbstractForce(eqx.Module):
@@ -62,6 +65,10 @@ class AbstractForce(eqx.Module):
     def with_preload(self, preload) -> "AbstractForce":
         """The same element with this preload in the reference configuration."""
         return dataclasses.replace(self, preload=preload)
+
+    def on(self, joints: Mapping[str, AbstractJoint]) -> "AbstractForce":
+        """The same element, given the joints of the model, one of which it may act in."""
+        return self
 
     @abc.abstractmethod
     def loads(self, bodies: Mapping[str, RigidBody]) -> tuple[Attached, ...]:

@@ -62,11 +62,13 @@ class AbstractDynamicLoad(AbstractElement):
     """A force between two bodies that depends on states of its own, which obey ż = g(q, v, z, t).
 
     A state is the velocity of a coordinate with unit mass, of which an element has as many as states: then Q and g
-    together are one generalized force, and autodiff gives the tangents of both. `states` are their names, one or more;
-    `balanced` as in `AbstractLoad`.
+    together are one generalized force, and autodiff gives the tangents of both. `states` are their names; `balanced` as
+    in `AbstractLoad`. A load that depends on the multipliers of a joint (`Attached.joint`) says in `reads` how many
+    each basic constraint of the joint has: they follow the states in z.
     """
 
     states: ClassVar[Any]
+    reads: ClassVar[Any] = ()
     balanced: ClassVar[bool] = False
     drawn = "spring"
 
@@ -111,7 +113,7 @@ def num_states(load: Any) -> int:
 def generalized_force(load: Any, a: Frame, b: Frame, va, vb, t, *z) -> Float[Array, " n"]:
     """Q, and where there are states z the force g on their carriers, n = 12 + 6 for each three of them."""
     force = load.force(a, b, va, vb, t, *z)
-    if not z:
+    if not num_states(load):
         return force
     rate = load.rate(a, b, va, vb, t, *z)
     zeros = jnp.zeros(BODY_DIM * (2 + len(carriers(rate.shape[0]))), force.dtype)

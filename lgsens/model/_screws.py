@@ -101,6 +101,7 @@ class ScrewJoint(AbstractJoint):
 
     assembled = True
     coordinates = (ANGLE, DISPLACEMENT)
+    slips = (0, 3)
     frames = frames_at
 
     @property

@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.liegroups import Pose, R3xSO3
+from lgsens.linear import chosen
 from lgsens.model._constraints import (
     AbstractClosedFormConstraint,
     AbstractConstraint,
@@ -39,7 +40,8 @@ Element = TypeVar("Element", AbstractRows, AbstractLoad | AbstractDynamicLoad)
 
 class Placed(NamedTuple, Generic[Element]):
     """An element or a `StackRow`, the numbers of its two bodies (None: the ground), the name of its owner; of a
-    constraint, which of its equations are kept, and which one of its joint's it is; of a load, what carries its states.
+    constraint, which of its equations are kept, and which one of its joint's it is; of a load, what carries its states,
+    and the joint whose multipliers it reads.
     """
 
     element: Element | StackRow
@@ -49,6 +51,7 @@ class Placed(NamedTuple, Generic[Element]):
     kept: tuple[bool, ...] = ()
     place: int = 0
     carriers: tuple[int, ...] = ()
+    joint: str | None = None
 
 
 class AtEnds(NamedTuple):
@@ -68,6 +71,7 @@ class Stack(eqx.Module, Generic[Element]):
     kept: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
     places: tuple[int, ...] = eqx.field(static=True)
     carriers: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())  # of states, as `a` and `b`
+    joints: tuple[str | None, ...] = eqx.field(static=True, default=())  # whose multipliers its elements read
 
     def __check_init__(self):
         name, acts_on = type(self.elements).__name__, self.elements.acts_on
@@ -96,21 +100,27 @@ class Stack(eqx.Module, Generic[Element]):
         ends = self.ends
         return entries_at(arrays, ends.own[ends.places(ends.acts_on)])
 
-    def states(self, twist: Float[Array, "N 6"]) -> tuple[Float[Array, "e s"], ...]:
-        """The states of its elements, if these have any, from [ẋ, Ω] of the bodies."""
-        if not self.carriers:
-            return ()
-        translations = [twist[np.asarray(of), : ROTATION.start] for of in self.carriers]
-        return (jnp.concatenate(translations, axis=1)[:, : num_states(self.elements)],)
+    def inputs(self, twist: Float[Array, "N 6"], lam, read: np.ndarray) -> tuple[Float[Array, "e s"], ...]:
+        """The states of its elements, from [ẋ, Ω] of the bodies, and the multipliers that they `read`, if any."""
+        parts = []
+        if self.carriers:
+            translations = [twist[np.asarray(of), : ROTATION.start] for of in self.carriers]
+            parts.append(jnp.concatenate(translations, axis=1)[:, : num_states(self.elements)])
+        if read.size:
+            parts.append(chosen(lam, read))
+        return (jnp.concatenate(parts, axis=1),) if len(parts) > 1 else tuple(parts)
 
     @property
     def ends(self) -> Ends:
         found = Ends(self.a, self.b, self.owners, self.kept, acts_on=self.elements.acts_on)
         if not isinstance(self.elements, AbstractRows):
             places = places_of_states(num_states(self.elements))
-            return found._replace(carriers=self.carriers, acts_on=(*found.acts_on, *places))
+            counts = getattr(self.elements, "reads", ())
+            read = tuple((joint, counts) for joint in self.joints) if counts else ()
+            return found._replace(carriers=self.carriers, acts_on=(*found.acts_on, *places), read=read)
         velocity = isinstance(self.elements, AbstractVelocityConstraint)
-        return found._replace(relative=self.elements.relative, coupled=self.elements.coupled, velocity=velocity)
+        relative, coupled = self.elements.relative, self.elements.coupled
+        return found._replace(relative=relative, coupled=coupled, velocity=velocity, nth=self.places)
 
     def only(self, i: int) -> "Stack[Element]":
         """The stack of one of its elements."""
@@ -118,7 +128,7 @@ class Stack(eqx.Module, Generic[Element]):
         a, b = (None if side is None else side[own] for side in (self.a, self.b))
         elements = jax.tree.map(lambda leaf: leaf[own], self.elements)
         carriers = tuple(of[own] for of in self.carriers)
-        return Stack(elements, a, b, self.owners[own], self.kept[own], self.places[own], carriers)
+        return Stack(elements, a, b, self.owners[own], self.kept[own], self.places[own], carriers, self.joints[own])
 
     def map(self, function, ends: AtEnds, extra: Sequence[Any] = ()):
         """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra)` for every element; `ends`: of `at_ends`.
@@ -185,6 +195,7 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
                 kept=tuple(m.kept for m in members),
                 places=tuple(m.place for m in members),
                 carriers=tuple(zip(*(m.carriers for m in members))),
+                joints=tuple(m.joint for m in members),
             )
         )
     return tuple(sorted(stacks, key=lambda stack: stack.ends.velocity))
@@ -247,7 +258,15 @@ def load_tangents(element: AbstractLoad | AbstractDynamicLoad, a: Frame, b: Fram
     velocity = jax.jacfwd(lambda x: force(a, b, va + x[BODY_A], vb + x[BODY_B], *z))(zero)
     if z:
         wide = jnp.zeros((len(position), len(position)), zero.dtype)
-        by_states = jax.jacfwd(lambda z: force(a, b, va, vb, z))(*z)
         position, velocity = (wide.at[:, : 2 * BODY_DIM].set(part) for part in (position, velocity))
-        velocity = velocity.at[:, np.asarray(places_of_states(len(*z)))].set(by_states)
+        if count := num_states(element):
+            by_states = jax.jacfwd(lambda z: force(a, b, va, vb, z))(*z)[:, :count]
+            velocity = velocity.at[:, np.asarray(places_of_states(count))].set(by_states)
     return LoadTangents(position, velocity)
+
+
+def load_by_multipliers(element: AbstractDynamicLoad, a: Frame, b: Frame, va, vb, t, z) -> Float[Array, "n r"]:
+    """∂Q/∂λ, and ∂g/∂λ, of one element that reads multipliers."""
+    states, lam = jnp.split(z, [num_states(element)])
+    at = lambda lam: generalized_force(element, a, b, va, vb, t, jnp.concatenate([states, lam]))
+    return jax.jacfwd(at)(lam)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from lgsens._validate import suggestion
 from lgsens.dynamics import AbstractRedundantSystem, AbstractSparseSystem, Tangents, finite, least_norm
 from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew, turn
-from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, chosen
+from lgsens.linear import AbstractLinearSolver, Blocks, Pattern, SparseMatrix, added, chosen
 from lgsens.model._checks import are_bodies
 from lgsens.model._constraints import AbstractRows
 from lgsens.model._frames import BODY_DIM, ROTATION, motion_at
@@ -25,6 +25,7 @@ from lgsens.model._stack import (
     constraint_force,
     constraint_jacobian,
     constraint_stiffness,
+    load_by_multipliers,
     load_tangents,
     square_blocks,
     state_coordinates,
@@ -260,8 +261,9 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             moment = moment + jax.vmap(cross)(spin, turned(self.inertia, spin))
         topology = self.topology
         forces = [(jnp.concatenate([force, moment], axis=1), topology.mass.rows)]
-        for stack, ends, coordinates in zip(self.loads, at_ends(self.loads, q, twist), topology.forces):
-            force = stack.map(generalized_force, ends, (t, *stack.states(twist)))
+        placed = zip(self.loads, at_ends(self.loads, q, twist), topology.forces, topology.read)
+        for stack, ends, coordinates, read in placed:
+            force = stack.map(generalized_force, ends, (t, *stack.inputs(twist, lam, read)))
             forces.append((-stack.acting(force), coordinates))
         for stack, ends, pattern in zip(self.constraints, at_ends(self.constraints, q), topology.jacobian):
             force = stack.map(constraint_force, ends, (chosen(lam, pattern.rows), t))
@@ -320,9 +322,10 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             momentum = jnp.einsum("nij,nj->ni", self.inertia, spin)
             gyroscopic = jax.vmap(skew)(spin) @ self.inertia - jax.vmap(skew)(momentum)
             damping.append(Blocks(gyroscopic, topology.gyroscopic))
-        for stack, ends, pattern in zip(self.loads, at_ends(self.loads, q, twist), topology.loads):
+        placed = zip(self.loads, at_ends(self.loads, q, twist), topology.loads, topology.read)
+        for stack, ends, pattern, read in placed:
             own = stack.ends.own
-            position, velocity = stack.map(load_tangents, ends, (t, *stack.states(twist)))
+            position, velocity = stack.map(load_tangents, ends, (t, *stack.inputs(twist, lam, read)))
             if position is not None:
                 stiffness.append(Blocks(-square_blocks(position, own), pattern))
             if velocity is not None:
@@ -333,18 +336,17 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             stiffness.extend(Blocks(square_blocks(block, places), pattern) for places, pattern in coupled)
         return Tangents(self._square(stiffness), self._square(damping), self.sparse_constraint_jacobian(q, t))
 
-    def measure(self, force: str, q, v, t):
-        """The `measure` of the load of the force element `force` at each of the stacked poses, velocities and times."""
-        found = [stack.only(i) for stack in self.loads for i, owner in enumerate(stack.owners) if owner == force]
-        if not found:
-            known = {owner for stack in self.loads for owner in stack.owners}
-            raise ValueError(f"`force`: {suggestion(force, known)}.")
-        if len(found) > 1:
-            raise ValueError(f"`force`: {force!r} acts on {len(found)} bodies and has no single value.")
+    @property
+    def reads_multipliers(self):
+        return any(read.size for read in self.topology.read)
 
-        def at_time(q, v, t):
-            twist = self.twists(v)
-            (ends,) = at_ends(found, self._placed(q), twist)
-            return found[0].map(lambda e, *args: e.measure(*args), ends, (t, *found[0].states(twist)))
-
-        return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(at_time)(q, v, t))
+    @_traced_once
+    def multiplier_jacobian(self, q, v, lam, t):
+        parts, placed, twist = list(self.sparse_constraint_jacobian(q, t).T.parts), self._placed(q), self.twists(v)
+        every = zip(self.loads, at_ends(self.loads, placed, twist), self.topology.forces, self.topology.read)
+        for stack, ends, coordinates, read in every:
+            if read.size:
+                columns = stack.map(load_by_multipliers, ends, (t, *stack.inputs(twist, lam, read)))
+                acting = jnp.swapaxes(stack.acting(jnp.swapaxes(columns, 1, 2)), 1, 2)
+                parts.append(Blocks(-acting, Pattern(coordinates, read)))
+        return SparseMatrix(tuple(parts), (self.group.dim, self.topology.num_constraints), self.mass.dtype)
