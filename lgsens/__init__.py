@@ -68,6 +68,7 @@ from lgsens.model import (
     Model as Model,
     PIDController as PIDController,
     PlanarJoint as PlanarJoint,
+    PlaneContact as PlaneContact,
     PointOnLineJoint as PointOnLineJoint,
     PointOnPlaneJoint as PointOnPlaneJoint,
     Polynomial as Polynomial,

@@ -17,14 +17,14 @@ and of both sweeps. Motion and derivatives stay exact; the start is the solution
 """
 
 import abc
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import number_field, require, suggestion
+from lgsens._validate import number_field, require_positive, suggestion
 from lgsens.liegroups import cross
 from lgsens.model._constraints import AbstractRows
 from lgsens.model._forces import AbstractForce, Attached, _frame
@@ -62,8 +62,7 @@ class Surface(eqx.Module):
         """N."""
         if not self.constraints:
             return self.preload
-        ends = np.cumsum([0, *self.reads])
-        own = [lam[start:end] for start, end in zip(ends, ends[1:])]
+        own = jnp.split(lam, np.cumsum(self.reads)[:-1])
         carried = sum(constraint_force(of, a, b, lam, t) for of, lam in zip(self.constraints, own))
         force = carried[TRANSLATION_B]
         square = jnp.sum(force * force)
@@ -129,7 +128,7 @@ class CoulombLoad(AbstractDynamicLoad):
 
 
 class LuGreLoad(AbstractDynamicLoad):
-    """s = −N (σ₀ z + σ₁ ż) − c w,  ż = w − σ₀ |w| z/μ(w),  μ(w) = μ_k + (μ_s − μ_k) exp(−w²/w_s²), |w| rounded by w₀."""
+    """s = −N (σ₀ z + σ₁ ż) − c w,  ż = w − σ₀ |w| z/μ(w) with w²/√(w² + w₀²) for |w|."""
 
     surface: Surface
     coefficient: Float[Array, ""]
@@ -243,14 +242,6 @@ class _InJoint(AbstractForce):
         return (Attached(of._load(surface), *self.bodies, of.joint if of.own_forces else None),)
 
 
-def _require_positive(friction: Any, *names: str) -> None:
-    for name in names:
-        value = getattr(friction, name)
-        if value is not None:
-            what = type(friction).__name__
-            require(lambda x: np.all(x > 0), f"{what}: `{name}` must be positive, got {value}.", value)
-
-
 class JointFriction(_AbstractJointFriction):
     """Coulomb's and viscous friction in a joint, in proportion to what the joint carries.
 
@@ -258,7 +249,7 @@ class JointFriction(_AbstractJointFriction):
 
     w is the velocity with which the surfaces slip: that of a slider, r times the angular velocity of a hinge or of a
     ball, both together of a sleeve; f and m are the force and the moment that the joint carries at its point, λ, in the
-    same instant. All derivatives are continuous. Below w₀ the friction is viscous: it holds nothing for ever, but creeps.
+    same instant. All derivatives are continuous. Below w₀ the friction is viscous: what it holds creeps.
 
     Arguments:
         joint: name of the joint: revolute, prismatic, cylindrical, spherical, planar or screw.
@@ -288,7 +279,7 @@ class JointFriction(_AbstractJointFriction):
     own_forces: bool = eqx.field(static=True, default=True, kw_only=True)
 
     def __check_init__(self):
-        _require_positive(self, "slip_speed", "radius", "arm", "load_rounding")
+        require_positive(self, "slip_speed", "radius", "arm", "load_rounding")
 
     def _load(self, surface):
         return CoulombLoad(surface, self.coefficient, self.viscous, self.slip_speed)
@@ -332,7 +323,7 @@ class LuGreFriction(_AbstractJointFriction):
 
     def __check_init__(self):
         names = "coefficient", "static_coefficient", "stribeck_speed", "stiffness"
-        _require_positive(self, *names, "slip_speed", "radius", "arm", "load_rounding")
+        require_positive(self, *names, "slip_speed", "radius", "arm", "load_rounding")
 
     def _load(self, surface):
         numbers = self.coefficient, self.static_coefficient, self.stribeck_speed, self.stiffness, self.damping

@@ -17,7 +17,6 @@ from jaxtyping import Array, Float
 from lgsens.liegroups import cross, skew
 from lgsens.model._elements import AbstractElement, body_fixed
 from lgsens.model._frames import (
-    BODY_B,
     BODY_DIM,
     ROTATION,
     ROTATION_A,
@@ -257,6 +256,11 @@ class BushingLoad(AbstractClosedFormLoad):
         gradient = jnp.concatenate([-back, skew(r), back, -back @ b.orientation @ skew(self.point_b)], axis=1)
         return r, gradient
 
+    def stretch(self, a, b, va, vb) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """u and u̇."""
+        r, gradient = self._gradient(a, b)
+        return r - self.point_a, gradient @ jnp.concatenate([va, vb])
+
     def _tension(self, r, gradient, va, vb):
         """g, on a, in the frame of a."""
         rate = gradient @ jnp.concatenate([va, vb])
@@ -286,38 +290,6 @@ class BushingLoad(AbstractClosedFormLoad):
         )
         position = gradient.T @ (self.stiffness @ gradient + self.damping @ rate) + geometric
         return LoadTangents(-position, -gradient.T @ self.damping @ gradient)
-
-
-class TyreLoad(AbstractClosedFormLoad):
-    """A vertical spring between the road and a point of b: F_z = F₀ + k (z_road(t) − z + ℓ₀), along the inertial z.
-
-    With e_z the vertical, d the point and D_b = [I, −R_b X̃_b] its gradient: Q_b = F_z D_bᵀ e_z,
-    ∂Q/∂q = −k D_bᵀ e_z e_zᵀ D_b + D_q(Dᵀ f)|_{f = F_z e_z}.
-    """
-
-    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
-    stiffness: Float[Array, ""]
-    free_radius: Float[Array, ""]
-    preload: Float[Array, ""]
-    road: AbstractSignal
-
-    drawn = "wheel"
-
-    def measure(self, a, b, va, vb, t) -> Float[Array, ""]:
-        return self.preload + self.stiffness * (self.road(t) + self.free_radius - b.point(self.point_b)[2])
-
-    def _vertical(self, a, b):
-        up = jnp.asarray([0.0, 0.0, 1.0], self.point_b.dtype)
-        return jnp.concatenate([jnp.zeros(BODY_B.start, up.dtype), up, cross(self.point_b, b.orientation[2])])
-
-    def force(self, a, b, va, vb, t):
-        return self.measure(a, b, va, vb, t) * self._vertical(a, b)
-
-    def tangents(self, a, b, va, vb, t):
-        vertical = self._vertical(a, b)
-        force = self.measure(a, b, va, vb, t) * jnp.asarray([0.0, 0.0, 1.0], vertical.dtype)
-        geometric = separation_stiffness(a, b, jnp.zeros_like(self.point_b), self.point_b, force)
-        return LoadTangents(geometric - self.stiffness * jnp.outer(vertical, vertical), None)
 
 
 class PointForce(AbstractClosedFormLoad):

@@ -5,14 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_count, axis_field, number_field, point_field, require, require_nonzero
+from lgsens._validate import as_count, axis_field, point_field, require
 from lgsens.liegroups import cross
-from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint, Orthogonality
+from lgsens.model._constraints import AbstractConstraint, ConstraintSum, Orthogonality
 from lgsens.model._elements import body_fixed
 from lgsens.model._frames import normals
-from lgsens.model._free import ROTATIONS
 from lgsens.model._joints import AbstractJoint, _coincidence
 from lgsens.model._relative import ROTATION_VECTOR, frames_at
+from lgsens.model._signals import Prescribed, at_time, prepared, prescribed_field, require_ratio
 
 
 class Gearing(AbstractConstraint):
@@ -29,7 +29,7 @@ class Gearing(AbstractConstraint):
     second_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
     first_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
     second_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
-    ratio: Float[Array, ""]
+    ratio: Prescribed
     teeth: int = eqx.field(static=True)
 
     drawn = None
@@ -45,12 +45,13 @@ class Gearing(AbstractConstraint):
     def value(self, a, b, t):
         d = b.point(self.point_b) - a.point(self.point_a)
         turned = lambda frame, x, y: -jnp.arctan2(jnp.sum(frame.axis(y) * d), jnp.sum(frame.axis(x) * d))
-        angle = turned(b, self.first_b, self.second_b) - self.ratio * turned(a, self.first_a, self.second_a)
+        ratio = at_time(self.ratio, t)
+        angle = turned(b, self.first_b, self.second_b) - ratio * turned(a, self.first_a, self.second_a)
         return (jnp.arctan2(jnp.sin(self.teeth * angle), jnp.cos(self.teeth * angle)) / self.teeth)[None]
 
 
 class GearJoint(AbstractJoint):
-    """Two gears turn in a fixed ratio, φ_b = ρ φ_a; 1 equation.
+    """Two gears turn in a ratio, φ_b = ρ φ_a; 1 equation.
 
     Their angles are seen from the line between their centres, so from what carries both, which may move, too: sun and
     planet roll on each other. Other joints hold the axes.
@@ -61,7 +62,8 @@ class GearJoint(AbstractJoint):
             the line between which has any direction but those of the axes.
         axis_a, axis_b: directions of their axes, inertial frame, shape (3,), any length > 0.
         ratio: ρ, shape (): turns of `b` about `axis_b` for one of `a` about `axis_a`; of an external pair with
-            parallel axes −n_a/n_b for n_a and n_b teeth.
+            parallel axes −n_a/n_b for n_a and n_b teeth. Or a signal of time: the angles, not their rates, have its
+            ratio at every instant, as a drive of variable ratio has it that is shifted with `a` near the reference.
         teeth: n_b or another count for which ratio · teeth is an integer: gears then turn any number of times. With
             another ratio, and for the derivative by the ratio, `a` is within half a turn of the reference.
 
@@ -75,11 +77,11 @@ class GearJoint(AbstractJoint):
     at_b: Float[Array, "3"] = point_field("at_b")
     axis_a: Float[Array, "3"] = axis_field("axis_a")
     axis_b: Float[Array, "3"] = axis_field("axis_b")
-    ratio: Float[Array, ""] = number_field("ratio")
+    ratio: Prescribed | None = prescribed_field("ratio")
     teeth: int = eqx.field(static=True, default=1, kw_only=True)
 
     def __check_init__(self):
-        require_nonzero("GearJoint", "ratio", self.ratio, "; a gear that does not turn is fixed by another joint")
+        require_ratio("GearJoint", "ratio", self.ratio, "; a gear that does not turn is fixed by another joint")
         as_count(self.teeth, "teeth")
         for name, axis in (("axis_a", self.axis_a), ("axis_b", self.axis_b)):
             require(
@@ -101,58 +103,16 @@ class GearJoint(AbstractJoint):
             first = cross(second, axis)
             marks += [frame.local_axis(mark / jnp.linalg.norm(mark)) for mark in (first, second)]
         centres = a.local_point(self.at_a), b.local_point(self.at_b)
-        return (Gearing(*centres, *marks, ratio=self.ratio, teeth=self.teeth),)
-
-
-class NoTwist(AbstractClosedFormConstraint):
-    """b is bent against a, and not twisted: Φ = (y_a·x_b − x_a·y_b)/2; λ is a moment [N m].
-
-    With x, y orthogonal to a shaft of each body, the rotation between both is exp(ñ) with n orthogonal to the shaft
-    where its skew part has no entry of x and y. `xy` is −x_a·y_b/2 and `yx` is y_a·x_b/2.
-    """
-
-    xy: Orthogonality
-    yx: Orthogonality
-
-    drawn = None
-
-    @property
-    def num_rows(self):
-        return 1
-
-    @property
-    def relative(self):
-        return True
-
-    @property
-    def acts_on(self):
-        return self.xy.acts_on
-
-    @property
-    def coupled(self):
-        return self.xy.coupled
-
-    def violable(self, free):
-        return (bool(free & {*ROTATIONS}),)
-
-    def value(self, a, b, t):
-        return self.xy.value(a, b, t) + self.yx.value(a, b, t)
-
-    def jacobian(self, a, b, t):
-        return self.xy.jacobian(a, b, t) + self.yx.jacobian(a, b, t)
-
-    def force(self, a, b, lam, t):
-        return self.xy.force(a, b, lam, t) + self.yx.force(a, b, lam, t)
-
-    def geometric_stiffness(self, a, b, lam, t):
-        return self.xy.geometric_stiffness(a, b, lam, t) + self.yx.geometric_stiffness(a, b, lam, t)
+        return (Gearing(*centres, *marks, ratio=prepared(self.ratio), teeth=self.teeth),)
 
 
 class ConstantVelocityJoint(AbstractJoint):
     """Two shafts meet in a point and turn alike whatever the angle between them; 4 equations.
 
     One is turned into the direction of the other about an axis orthogonal to both, without twist: both see each other
-    mirrored in the plane between them, so their angular velocities along themselves are equal.
+    mirrored in the plane between them, so their angular velocities along themselves are equal. With x, y orthogonal to
+    a shaft of each body, the rotation between both is exp(ñ) with n orthogonal to the shaft where its skew part has no
+    entry of x and y: (y_a·x_b − x_a·y_b)/2 = 0.
 
     Arguments:
         a, b: names of the two bodies; None is the ground.
@@ -192,4 +152,4 @@ class ConstantVelocityJoint(AbstractJoint):
         (x_a, y_a), (x_b, y_b) = across_a, map(turned, across_a)
         pairs = ((-0.5 * x_a, y_b), (0.5 * y_a, x_b))
         xy, yx = (Orthogonality(a.local_axis(of_a), b.local_axis(of_b)) for of_a, of_b in pairs)
-        return (_coincidence(a, b, self.at), NoTwist(xy, yx))
+        return (_coincidence(a, b, self.at), ConstraintSum((xy, yx)))

@@ -40,7 +40,7 @@ def torsion_energy(load, a, b, t):
 
 
 def bushing_energy(load, a, b, t):
-    own, turned = load.translation, load.rotation
+    own, turned = load.parts
     u = a.local_point(b.point(own.point_b)) - own.point_a
     s = (a.orientation @ turned.triad_a).T @ b.orientation @ turned.triad_b
     angle = jnp.arccos((jnp.trace(s) - 1) / 2)
