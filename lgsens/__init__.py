@@ -63,6 +63,7 @@ from lgsens.model import (
     Gravity as Gravity,
     Harmonic as Harmonic,
     JointFriction as JointFriction,
+    LinkedAntiRollBar as LinkedAntiRollBar,
     LuGreFriction as LuGreFriction,
     MaxwellElement as MaxwellElement,
     Model as Model,

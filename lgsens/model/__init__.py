@@ -54,6 +54,7 @@ from lgsens.model._joints import (
     SphericalJoint as SphericalJoint,
     UniversalJoint as UniversalJoint,
 )
+from lgsens.model._linked_bar import LinkedAntiRollBar as LinkedAntiRollBar
 from lgsens.model._loads import (
     AbstractClosedFormLoad as AbstractClosedFormLoad,
     AbstractDynamicLoad as AbstractDynamicLoad,

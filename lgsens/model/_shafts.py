@@ -68,7 +68,7 @@ class GearJoint(AbstractJoint):
             another ratio, and for the derivative by the ratio, `a` is within half a turn of the reference.
 
     The multiplier is the moment of `b` on the mesh about its axis [N m]: its negative drives `b`. Raises `ValueError`
-    for a wrong shape, a zero axis, centres along an axis, a zero ratio, or a count below 1.
+    for a wrong shape, a zero axis, centres along an axis, a zero ratio, or a count below 1. Source: Haug (1989), §3.4.
     """
 
     a: str | None = eqx.field(static=True)
@@ -122,6 +122,7 @@ class ConstantVelocityJoint(AbstractJoint):
 
     The multipliers are the force of `b` on `a` [N], and the moment about the shafts [N m] for a straight joint, 2/(1 +
     cos β) of it at an angle β. Raises `ValueError` for a wrong shape, a zero axis, or shafts at a right angle or more.
+    Source: Seherr-Thoss, Schmelz & Aucktor, Universal Joints and Driveshafts (2nd ed. 2006), chapter 2.
     """
 
     a: str | None = eqx.field(static=True)

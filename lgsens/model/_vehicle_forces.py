@@ -39,7 +39,8 @@ class TorsionSpringDamper(AbstractForce):
         motor: the moment M(t) on b [N m], a number, shape (), or a signal; None: no motor.
 
     Give `free_angle` or `preload`, not both. `Trajectory.force` gives the angle [rad], its rate [rad/s] and the moment
-    on b [N m]. Raises `ValueError` for both, a zero axis, or wrong shapes.
+    on b [N m]. Raises `ValueError` for both, a zero axis, or wrong shapes. Source: Haug (1989), chapter 6 (rotational
+    spring-damper-actuator).
     """
 
     a: str | None = eqx.field(static=True)
@@ -89,7 +90,8 @@ class AntiRollBar(AbstractForce):
         damping: c [N m s/rad], shape ().
 
     `Trajectory.force` gives the angle [rad], its rate [rad/s] and the moment on b [N m]. Raises `ValueError` for a
-    wrong shape, a zero axis, or dimensions that no bar has.
+    wrong shape, a zero axis, or dimensions that no bar has. Source: Milliken & Milliken, Race Car Vehicle Dynamics
+    (1995), chapter 21.
     """
 
     a: str | None = eqx.field(static=True)
@@ -157,7 +159,8 @@ class BumpStop(AbstractForce):
         rebound: whether it is a rebound stop, which pulls the points together: x = max(0, ℓ − ℓ₀ − gap).
 
     `Trajectory.force` gives its `LineForce`, of negative tension where it pushes. Raises `ValueError` for wrong shapes,
-    a rounding or progression ≤ 0, or points that coincide.
+    a rounding or progression ≤ 0, or points that coincide. Source, of what it is for: Blundell & Harty, The Multibody
+    Systems Approach to Vehicle Dynamics (2004), chapter 4; the formula is of this library.
     """
 
     a: str | None = eqx.field(static=True)
@@ -252,7 +255,8 @@ class Drag(AbstractForce):
         density: ρ [kg/m³], shape ().
         wind: [m/s], inertial frame, shape (3,).
 
-    Its derivatives are continuous, its second ones but for u = 0. Raises `ValueError` for wrong shapes.
+    Its derivatives are continuous, its second ones but for u = 0. Raises `ValueError` for wrong shapes. Source: Hoerner,
+    Fluid-Dynamic Drag (1965), chapter 1.
     """
 
     body: str = eqx.field(static=True)
