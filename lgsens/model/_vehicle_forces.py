@@ -255,8 +255,8 @@ class Drag(AbstractForce):
         density: ρ [kg/m³], shape ().
         wind: [m/s], inertial frame, shape (3,).
 
-    Its derivatives are continuous, its second ones but for u = 0. Raises `ValueError` for wrong shapes. Source: Hoerner,
-    Fluid-Dynamic Drag (1965), chapter 1.
+    Its derivatives are continuous, its second ones but for u = 0. Raises `ValueError` for wrong shapes. Source:
+    Hoerner, Fluid-Dynamic Drag (1965), chapter 1.
     """
 
     body: str = eqx.field(static=True)

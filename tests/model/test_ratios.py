@@ -39,9 +39,8 @@ def test_joints_are_what_they_say(name):
 def test_values_over_many_turns():
     """Φ = s − f(θ), s − r(t) θ and φ_b − ρ(t) φ_a at poses by hand."""
     ground, t, time = Frame(np.zeros(3), np.eye(3)), 0.7, jnp.asarray(0.7)
-    placed = lambda s, angle: Frame(
-        jnp.array([s, 0.0, 0.0]), jnp.asarray(Rotation.from_rotvec([0, angle, 0]).as_matrix())
-    )
+    about_y = lambda angle: jnp.asarray(Rotation.from_rotvec([0, angle, 0]).as_matrix())
+    placed = lambda s, angle: Frame(jnp.array([s, 0.0, 0.0]), about_y(angle))
     rack = {"at": ORIGIN, "axis": Y, "direction": X}
     for angle in (-5.0, -0.4, 0.0, 2.0, 4.9):
         (element,) = lg.RackAndPinionJoint("a", "b", **rack, radius=RADIUS, travel=TRAVEL).constraints(ground, ground)
