@@ -87,8 +87,8 @@ class Bushing(AbstractForce):
         if self.springs is not None or self.dampers is not None:
             load = CurveBushingLoad(load, back, ready(self.springs), ready(self.dampers))
         about = self.rotational_stiffness, self.rotational_damping, self.rotational_preload
-        curves = ready(self.rotational_springs), ready(self.rotational_dampers)
-        if any(numbers is not None for numbers in (*about, *curves)):
-            about = (jnp.zeros_like(self.at) if numbers is None else numbers for numbers in about)
-            load = LoadSum((load, RotationLoad(back, b.orientation.T, *about, *curves)))
+        curves = {"springs": ready(self.rotational_springs), "dampers": ready(self.rotational_dampers)}
+        if any(numbers is not None for numbers in (*about, *curves.values())):
+            k, c, m = (jnp.zeros_like(self.at) if numbers is None else numbers for numbers in about)
+            load = LoadSum((load, RotationLoad(back, b.orientation.T, k, c, m, **curves)))
         return (Attached(load, self.a, self.b),)

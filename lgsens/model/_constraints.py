@@ -277,20 +277,21 @@ class ConstraintSum(AbstractClosedFormConstraint):
         return self.parts[0].violable(free)
 
     def value(self, a, b, t):
-        value = _sum(part.value(a, b, t) for part in self.parts)
+        value = total(part.value(a, b, t) for part in self.parts)
         return value if self.prescribed is None else value - at_time(self.prescribed, t)
 
     def jacobian(self, a, b, t):
-        return _sum(part.jacobian(a, b, t) for part in self.parts)
+        return total(part.jacobian(a, b, t) for part in self.parts)
 
     def force(self, a, b, lam, t):
-        return _sum(part.force(a, b, lam, t) for part in self.parts)
+        return total(part.force(a, b, lam, t) for part in self.parts)
 
     def geometric_stiffness(self, a, b, lam, t):
-        return _sum(part.geometric_stiffness(a, b, lam, t) for part in self.parts)
+        return total(part.geometric_stiffness(a, b, lam, t) for part in self.parts)
 
 
-def _sum(parts: Iterable[Array]) -> Any:
+def total(parts: Iterable[Array]) -> Any:
+    """The sum of one array or more."""
     first, *others = parts
     return sum(others, first)
 

@@ -71,7 +71,8 @@ class PlaneContactLoad(AbstractLoad):
     stiffness: Float[Array, ""]
     damping: Float[Array, ""]
     rounding: Float[Array, ""]
-    friction: tuple[Float[Array, ""], Float[Array, ""]] | None  # μ and u₀
+    coefficient: Float[Array, ""] | None  # μ
+    slip_speed: Float[Array, ""] | None  # u₀
 
     balanced = True
     drawn = None
@@ -92,8 +93,7 @@ class PlaneContactLoad(AbstractLoad):
     def force(self, a, b, va, vb, t):
         local, n, rate, size = self._at(a, b, va, vb)
         f = size * n
-        if self.friction is not None:
-            coefficient, speed = self.friction
+        if self.coefficient is not None and self.slip_speed is not None:
             slip = rate - jnp.sum(n * rate) * n
-            f -= size * coefficient / jnp.sqrt(jnp.sum(slip * slip) + speed**2) * slip
+            f -= size * self.coefficient / jnp.sqrt(jnp.sum(slip * slip) + self.slip_speed**2) * slip
         return separation_force(a, b, local, self.point_b, f)

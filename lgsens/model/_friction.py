@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import number_field, require_positive, suggestion
 from lgsens.liegroups import cross
-from lgsens.model._constraints import AbstractRows
+from lgsens.model._constraints import AbstractRows, total
 from lgsens.model._forces import AbstractForce, Attached, _frame
 from lgsens.model._frames import BODY_DIM, ROTATION, ROTATION_B, TRANSLATION_B, Frame
 from lgsens.model._joints import AbstractJoint
@@ -63,7 +63,7 @@ class Surface(eqx.Module):
         if not self.constraints:
             return self.preload
         own = jnp.split(lam, np.cumsum(self.reads)[:-1])
-        carried = sum(constraint_force(of, a, b, lam, t) for of, lam in zip(self.constraints, own))
+        carried = total(constraint_force(of, a, b, lam, t) for of, lam in zip(self.constraints, own))
         force = carried[TRANSLATION_B]
         square = jnp.sum(force * force)
         if self.arm is not None:
@@ -74,7 +74,7 @@ class Surface(eqx.Module):
     def _along(self, a: Frame):
         """The axes of the frame on a, inertial frame, and ∂w/∂[ẋ, ω], which is constant."""
         one = jnp.ones_like(self.preload)
-        scale = jnp.stack([one if i < ROTATION.start else one * self.radius for i in self.slips])
+        scale = jnp.stack([one if i < ROTATION.start or self.radius is None else self.radius for i in self.slips])
         return a.orientation @ self.axes, scale[:, None] * np.eye(BODY_DIM, dtype=one.dtype)[list(self.slips)]
 
     def slip(self, a: Frame, b: Frame, va, vb) -> Float[Array, " w"]:

@@ -26,7 +26,7 @@ class LinkedAntiRollBar(eqx.Module):
     travel, nothing in parallel travel, with k of the bar.
 
     Arguments:
-        name: of the bar; the halves are "NAME left" and "NAME right", the joints "NAME left hinge", "NAME left link", ….
+        name: of the bar; halves are "NAME left" and "NAME right", joints "NAME left hinge", "NAME left link", ….
         chassis: name of the body that carries it; None is the ground.
         sides: names of the left and right body at the links.
         bearings: where the twisted part ends, on the axis of the bar, left and right, in the reference configuration

@@ -274,8 +274,8 @@ def at_time(value: Prescribed, t) -> Float[Array, ""]:
     return value(t) if isinstance(value, AbstractSignal) else value
 
 
-def number_of(value: Prescribed) -> Float[Array, ""] | None:
-    """A number; None: a signal."""
+def number_of(value: Prescribed | None) -> Float[Array, ""] | None:
+    """A number; None: a signal, or nothing."""
     return None if isinstance(value, AbstractSignal) else value
 
 

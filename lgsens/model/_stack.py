@@ -5,7 +5,7 @@ vmapped kernel, so what is compiled grows with the number of element types, not 
 """
 
 from collections.abc import Sequence
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -71,7 +71,7 @@ class Stack(eqx.Module, Generic[Element]):
     kept: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
     places: tuple[int, ...] = eqx.field(static=True)
     carriers: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())  # of states, as `a` and `b`
-    joints: tuple[str | None, ...] = eqx.field(static=True, default=())  # whose multipliers its elements read
+    joints: tuple[str, ...] = eqx.field(static=True, default=())  # whose multipliers its elements read, if any
 
     def __check_init__(self):
         name, acts_on = type(self.elements).__name__, self.elements.acts_on
@@ -115,8 +115,7 @@ class Stack(eqx.Module, Generic[Element]):
         found = Ends(self.a, self.b, self.owners, self.kept, acts_on=self.elements.acts_on)
         if not isinstance(self.elements, AbstractRows):
             places = places_of_states(num_states(self.elements))
-            counts = getattr(self.elements, "reads", ())
-            read = tuple((joint, counts) for joint in self.joints) if counts else ()
+            read = tuple((joint, cast(Any, self.elements).reads) for joint in self.joints)
             return found._replace(carriers=self.carriers, acts_on=(*found.acts_on, *places), read=read)
         velocity = isinstance(self.elements, AbstractVelocityConstraint)
         relative, coupled = self.elements.relative, self.elements.coupled
@@ -195,7 +194,7 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
                 kept=tuple(m.kept for m in members),
                 places=tuple(m.place for m in members),
                 carriers=tuple(zip(*(m.carriers for m in members))),
-                joints=tuple(m.joint for m in members),
+                joints=tuple(m.joint for m in members if m.joint is not None),
             )
         )
     return tuple(sorted(stacks, key=lambda stack: stack.ends.velocity))

@@ -23,7 +23,7 @@ class Ends(NamedTuple):
     velocity: bool = False  # of constraints, whether their rows have velocity level only
     carriers: tuple[tuple[int, ...], ...] = ()  # of loads with states: the bodies that carry them
     nth: tuple[int, ...] = ()  # of constraints: which of its joint's each is
-    read: tuple[tuple[str | None, tuple[int, ...]], ...] = ()  # of loads: the joint whose multipliers each reads
+    read: tuple[tuple[str, tuple[int, ...]], ...] = ()  # of loads: the joint whose multipliers each reads
 
     @property
     def _sides(self) -> list[tuple[int, tuple[int, ...]]]:

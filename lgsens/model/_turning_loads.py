@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens.liegroups import SO3, cross, skew, turn, turn_back
+from lgsens.model._constraints import total
 from lgsens.model._drivers import Angle
 from lgsens.model._elements import body_fixed
 from lgsens.model._frames import BODY_B, ROTATION, ROTATION_B, TRANSLATION_B, TURNING_A, TURNING_B, embedded
@@ -164,13 +165,12 @@ class LoadSum(AbstractClosedFormLoad):
         return self.parts[0].fixed(kind, bodies)
 
     def force(self, a, b, va, vb, t):
-        first, *others = (part.force(a, b, va, vb, t) for part in self.parts)
-        return sum(others, first)
+        return total(part.force(a, b, va, vb, t) for part in self.parts)
 
     def tangents(self, a, b, va, vb, t):
         every = zip(*(load_tangents(part, a, b, va, vb, t) for part in self.parts))
         given = ([part for part in parts if part is not None] for parts in every)
-        return LoadTangents(*(sum(parts[1:], parts[0]) if parts else None for parts in given))
+        return LoadTangents(*(total(parts) if parts else None for parts in given))
 
 
 class FollowingForce(AbstractClosedFormLoad):

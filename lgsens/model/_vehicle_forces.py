@@ -240,8 +240,8 @@ class PlaneContact(AbstractForce):
         a, b = (_frame(bodies, name, self.gap.dtype) for name in (self.a, self.b))
         unit = self.axis / jnp.linalg.norm(self.axis)
         places = a.local_point(self.at - self.gap * unit), a.local_axis(unit), b.local_point(self.at)
-        friction = None if self.coefficient is None else (self.coefficient, self.slip_speed)
-        load = PlaneContactLoad(*places, self.stiffness, self.damping, self.rounding, friction)
+        numbers = self.stiffness, self.damping, self.rounding, self.coefficient, self.slip_speed
+        load = PlaneContactLoad(*places, *numbers)
         return (Attached(load, self.a, self.b),)
 
 
