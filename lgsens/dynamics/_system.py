@@ -160,6 +160,12 @@ class AbstractSparseSystem(AbstractSystem):
 
     linear_solver: eqx.AbstractVar[AbstractLinearSolver | None]
 
+    def mass_matrix(self):
+        return self.sparse_mass_matrix().dense()
+
+    def tangents(self, q, v, vdot, lam, t):
+        return Tangents(*(matrix.dense() for matrix in self.sparse_tangents(q, v, vdot, lam, t)))
+
     @property
     @abc.abstractmethod
     def elimination(self) -> Elimination | None:

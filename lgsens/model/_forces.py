@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Mapping
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,13 +27,11 @@ from lgsens.model._turning_loads import FixedMoment, FollowingForce, LoadSum
 
 
 class Attached(NamedTuple):
-    """A load and the two bodies that it acts between, None is the ground; of one that reads the multipliers of a joint,
-    the name of the joint."""
+    """A load and the two bodies that it acts between; None is the ground."""
 
     load: AbstractLoad | AbstractDynamicLoad
     a: str | None
     b: str | None
-    joint: str | None = None
 
 
 class AbstractForce(eqx.Module):
@@ -50,11 +48,13 @@ class AbstractForce(eqx.Module):
     velocity [ẋ, Ω], ẋ in the inertial frame, Ω in that of the body. `lgsens.testing.check_force` checks a force.
 
     `preload_shape` is that of its `preload`, in which its force is linear, for `static_preload`; None: it has none.
-    `on_merged` says whether its loads on bodies that fixed joints merge are one load on what they are merged to.
+    `on_merged` says whether its loads on bodies that fixed joints merge are one load on what they are merged to;
+    `reads` is the name of the joint whose multipliers its loads depend on (`AbstractDynamicLoad`), None for almost all.
     """
 
     preload_shape: ClassVar[tuple[int, ...] | None] = None
     on_merged: ClassVar[bool] = False
+    reads: ClassVar[Any] = None
 
     @property
     @abc.abstractmethod

@@ -220,6 +220,10 @@ class _InJoint(AbstractForce):
     joint: AbstractJoint
 
     @property
+    def reads(self):
+        return self.friction.joint if self.friction.own_forces else None
+
+    @property
     def bodies(self):
         return (self.joint.a, self.joint.b)
 
@@ -239,7 +243,7 @@ class _InJoint(AbstractForce):
             load_rounding=of.load_rounding,
             slips=joint.slips,
         )
-        return (Attached(of._load(surface), *self.bodies, of.joint if of.own_forces else None),)
+        return (Attached(of._load(surface), *self.bodies),)
 
 
 class JointFriction(_AbstractJointFriction):

@@ -62,8 +62,8 @@ class AbstractDynamicLoad(AbstractElement):
 
     A state is the velocity of a coordinate with unit mass, of which an element has as many as states: then Q and g
     together are one generalized force, and autodiff gives the tangents of both. `states` are their names; `balanced` as
-    in `AbstractLoad`. A load that depends on the multipliers of a joint (`Attached.joint`) says in `reads` how many
-    each basic constraint of the joint has: they follow the states in z.
+    in `AbstractLoad`. A load that depends on the multipliers of a joint (`AbstractForce.reads`) says in its `reads` how
+    many each basic constraint of the joint has: they follow the states in z.
     """
 
     states: ClassVar[Any]

@@ -14,7 +14,7 @@ def measured(system: MultibodySystem, force: str, q, v, vdot, lam, t) -> Any:
     """The `measure` of the load of the force element `force`, along a leading axis of states and times."""
     whole, placed, twists, _ = system.of_parts(q, v, vdot)
     found = [
-        (stack.only(i), read[i : i + 1])
+        (stack.only(i), read.rows[i : i + 1])
         for stack, read in zip(whole.loads, whole.topology.read)
         for i, owner in enumerate(stack.owners)
         if owner == force

@@ -5,11 +5,12 @@ from there to where it is needs to be known: it is small, whatever the number of
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens._validate import axis_field, number_field, point_field, require_nonzero
-from lgsens.model._constraints import AbstractConstraint, InPlane
+from lgsens.model._constraints import AbstractClosedFormConstraint, InPlane
 from lgsens.model._drivers import Angle
 from lgsens.model._elements import body_fixed
 from lgsens.model._frames import Frame, normals
@@ -24,12 +25,14 @@ from lgsens.model._signals import (
     prescribed_field,
     require_ratio,
 )
+from lgsens.model._stack import constraint_force, constraint_jacobian, constraint_stiffness
 
 
-class Advance(AbstractConstraint):
+class Advance(AbstractClosedFormConstraint):
     """b advances along an axis of a as it turns about another: Φ = s − ρ θ, or s − f(θ); λ is a force [N].
 
-    s as in `InPlane`, and θ the angle about the normal of `first_a` and `second_a`, that which is nearest to s/ρ.
+    s as in `InPlane`, and θ the angle about the normal of `first_a` and `second_a`, that which is nearest to s/ρ. With
+    B and K of s and of θ, f′ = ρ without a curve: B_s − f′ B_θ and K_s − f′ K_θ − λ f″ B_θᵀB_θ.
     """
 
     point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
@@ -51,11 +54,43 @@ class Advance(AbstractConstraint):
     def relative(self):
         return True
 
+    def _line(self) -> InPlane:
+        return InPlane(self.point_a, self.point_b, self.axis_a)
+
+    def _angle(self, from_angle=0.0) -> Angle:
+        return Angle(self.first_a, self.second_a, self.first_b, jnp.asarray(from_angle, self.first_a.dtype))
+
+    def _state(self, a, b, t):
+        """ρ, s and θ − s/ρ."""
+        per_radian, s = at_time(self.per_radian, t), self._line().value(a, b, t)[0]
+        return per_radian, s, self._angle(s / per_radian).value(a, b, t)[0]
+
     def value(self, a, b, t):
-        s = InPlane(self.point_a, self.point_b, self.axis_a).value(a, b, t)[0]
-        per_radian = at_time(self.per_radian, t)
-        rest = Angle(self.first_a, self.second_a, self.first_b, s / per_radian).value(a, b, t)
-        return -per_radian * rest if self.travel is None else (s - self.travel(s / per_radian + rest[0]))[None]
+        per_radian, s, rest = self._state(a, b, t)
+        return (-per_radian * rest if self.travel is None else s - self.travel(s / per_radian + rest))[None]
+
+    def _slopes(self, a, b, t):
+        """f′ and f″, or ρ and None."""
+        if self.travel is None:
+            return at_time(self.per_radian, t), None
+        per_radian, s, rest = self._state(a, b, t)
+        return jax.jvp(jax.grad(self.travel), (s / per_radian + rest,), (jnp.ones_like(s),))
+
+    def _tangent(self, of, a, b, *rest):
+        return of(self._line(), a, b, *rest) - self._slopes(a, b, rest[-1])[0] * of(self._angle(), a, b, *rest)
+
+    def jacobian(self, a, b, t):
+        return self._tangent(constraint_jacobian, a, b, t)
+
+    def force(self, a, b, lam, t):
+        return self._tangent(constraint_force, a, b, lam, t)
+
+    def geometric_stiffness(self, a, b, lam, t):
+        stiffness, bend = self._tangent(constraint_stiffness, a, b, lam, t), self._slopes(a, b, t)[1]
+        if bend is None:
+            return stiffness
+        (row,) = constraint_jacobian(self._angle(), a, b, t)
+        return stiffness - lam[0] * bend * jnp.outer(row, row)
 
 
 def _advance(a: Frame, b: Frame, at, along, axis, per_radian, travel=None) -> Advance:

@@ -1,5 +1,6 @@
 """The multibody system: an `AbstractSystem` on (R³ × SO(3))^N or a subgroup of it, assembled by element type."""
 
+import dataclasses
 from functools import partial
 from typing import Any
 
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float
 from lgsens._validate import suggestion
 from lgsens.dynamics import AbstractRedundantSystem, AbstractSparseSystem, Tangents, finite, least_norm
 from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew, turn
-from lgsens.linear import AbstractLinearSolver, Blocks, Pattern, SparseMatrix, added, chosen
+from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, chosen
 from lgsens.model._checks import are_bodies
 from lgsens.model._constraints import AbstractRows
 from lgsens.model._frames import BODY_DIM, ROTATION, motion_at
@@ -219,9 +220,6 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             for owner, places in zip(stack.owners, state_coordinates(stack, self.index))
         }
 
-    def mass_matrix(self):
-        return self.sparse_mass_matrix().dense()
-
     def sparse_mass_matrix(self):
         translation = self.mass[:, None, None] * jnp.eye(ROTATION.start, dtype=self.mass.dtype)[None]
         none = jnp.zeros_like(translation)
@@ -250,6 +248,11 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         """Whether a body has three rotations: Ω × J Ω of one about a body axis has no component along it."""
         return bool((self.index[:, ROTATION] >= 0).all(axis=1).any())
 
+    def _acting(self, q, twist, lam, t, patterns):
+        """Each stack of loads, its ends, what its elements are given besides, and its pattern."""
+        for stack, ends, read, pattern in zip(self.loads, at_ends(self.loads, q, twist), self.topology.read, patterns):
+            yield stack, ends, (t, *stack.inputs(twist, lam, read.rows)), pattern
+
     @_traced_once
     def residual(self, q, v, vdot, lam, t):
         q, twist, acceleration = self._placed(q), self.twists(v), self.twists(vdot)
@@ -261,9 +264,8 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             moment = moment + jax.vmap(cross)(spin, turned(self.inertia, spin))
         topology = self.topology
         forces = [(jnp.concatenate([force, moment], axis=1), topology.mass.rows)]
-        placed = zip(self.loads, at_ends(self.loads, q, twist), topology.forces, topology.read)
-        for stack, ends, coordinates, read in placed:
-            force = stack.map(generalized_force, ends, (t, *stack.inputs(twist, lam, read)))
+        for stack, ends, inputs, coordinates in self._acting(q, twist, lam, t, topology.forces):
+            force = stack.map(generalized_force, ends, inputs)
             forces.append((-stack.acting(force), coordinates))
         for stack, ends, pattern in zip(self.constraints, at_ends(self.constraints, q), topology.jacobian):
             force = stack.map(constraint_force, ends, (chosen(lam, pattern.rows), t))
@@ -310,9 +312,6 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         ]
         return SparseMatrix(tuple(parts), (self.topology.num_constraints, self.group.dim), self.mass.dtype)
 
-    def tangents(self, q, v, vdot, lam, t):
-        return Tangents(*(matrix.dense() for matrix in self.sparse_tangents(q, v, vdot, lam, t)))
-
     @_traced_once
     def sparse_tangents(self, q, v, vdot, lam, t):
         q, twist, topology = self._placed(q), self.twists(v), self.topology
@@ -322,10 +321,9 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             momentum = jnp.einsum("nij,nj->ni", self.inertia, spin)
             gyroscopic = jax.vmap(skew)(spin) @ self.inertia - jax.vmap(skew)(momentum)
             damping.append(Blocks(gyroscopic, topology.gyroscopic))
-        placed = zip(self.loads, at_ends(self.loads, q, twist), topology.loads, topology.read)
-        for stack, ends, pattern, read in placed:
+        for stack, ends, inputs, pattern in self._acting(q, twist, lam, t, topology.loads):
             own = stack.ends.own
-            position, velocity = stack.map(load_tangents, ends, (t, *stack.inputs(twist, lam, read)))
+            position, velocity = stack.map(load_tangents, ends, inputs)
             if position is not None:
                 stiffness.append(Blocks(-square_blocks(position, own), pattern))
             if velocity is not None:
@@ -338,15 +336,14 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
 
     @property
     def reads_multipliers(self):
-        return any(read.size for read in self.topology.read)
+        return any(read.rows.size for read in self.topology.read)
 
     @_traced_once
     def multiplier_jacobian(self, q, v, lam, t):
-        parts, placed, twist = list(self.sparse_constraint_jacobian(q, t).T.parts), self._placed(q), self.twists(v)
-        every = zip(self.loads, at_ends(self.loads, placed, twist), self.topology.forces, self.topology.read)
-        for stack, ends, coordinates, read in every:
-            if read.size:
-                columns = stack.map(load_by_multipliers, ends, (t, *stack.inputs(twist, lam, read)))
-                acting = jnp.swapaxes(stack.acting(jnp.swapaxes(columns, 1, 2)), 1, 2)
-                parts.append(Blocks(-acting, Pattern(coordinates, read)))
-        return SparseMatrix(tuple(parts), (self.group.dim, self.topology.num_constraints), self.mass.dtype)
+        transposed, twist, topology = self.sparse_constraint_jacobian(q, t), self.twists(v), self.topology
+        for stack, ends, inputs, pattern in self._acting(self._placed(q), twist, lam, t, topology.read):
+            if pattern.rows.size:
+                columns = jnp.swapaxes(stack.map(load_by_multipliers, ends, inputs), 1, 2)
+                part = Blocks(-stack.acting(columns), pattern)
+                transposed = dataclasses.replace(transposed, parts=(*transposed.parts, part))
+        return transposed.T

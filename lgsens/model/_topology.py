@@ -68,8 +68,8 @@ class Topology:
             Pattern(rows, self.coordinates(ends)[:, ends.places(ends.acts_on)], ends.slots)
             for rows, ends in zip(self.rows, constraints)
         ]
-        self.read = [self._read(ends) for ends in loads]
         self.forces = [self.coordinates(ends)[:, ends.places(ends.acts_on)] for ends in loads]
+        self.read = [Pattern(self._read(ends), own) for ends, own in zip(loads, self.forces)]
 
     def coordinates(self, ends: Ends) -> np.ndarray:
         """The coordinates of each element's bodies, shape (elements, 6 or 12); −1 where a body has none."""

@@ -208,7 +208,7 @@ class PlaneContact(AbstractForce):
         gap: distance of the point from the plane there [m], shape (); negative where it is pressed into it.
         stiffness: k [N/m], shape ().
         rounding: w [m], shape (), > 0.
-        damping: c [s/m], shape (): of a speed v < 1/(2 c) about the part 2 c v/3 is lost in an impact.
+        damping: c [s/m], shape (): of a speed v ≪ 1/c about the part 2 c v/3 is lost in an impact.
         coefficient: μ of friction [–], shape (), the force μ F u/√(u² + u₀²) against the slip u; None: none.
         slip_speed: u₀ [m/s], shape (), > 0, given with `coefficient`.
 

@@ -78,12 +78,13 @@ def scene(seed=0):
 def test_force_is_that_of_the_definition():
     """The force on b, and the power of the moments, −m·φ̇."""
     bodies, frames, va, vb = scene()
-    ((load, *_),) = lg.Bushing("a", "b", at=AT, **RATES, **ALL).loads(bodies)
+    ((load, _, _),) = lg.Bushing("a", "b", at=AT, **RATES, **ALL).loads(bodies)
     force, moment, _, phi_rate = by_hand(bodies["a"].frame, bodies["b"].frame, np.array(AT), va, vb, frames)
     at = [Frame(*map(jnp.asarray, frame)) for frame in frames], jnp.asarray(va), jnp.asarray(vb)
     found = np.asarray(load.force(*at[0], *at[1:], 0.0))
     close(found[6:9], force, 50)
-    ((plain, *_),) = lg.Bushing("a", "b", at=AT, **RATES, springs=ALL["springs"], dampers=ALL["dampers"]).loads(bodies)
+    along = {name: ALL[name] for name in ("springs", "dampers")}
+    ((plain, _, _),) = lg.Bushing("a", "b", at=AT, **RATES, **along).loads(bodies)
     power = (found - plain.force(*at[0], *at[1:], 0.0)) @ np.concatenate([va, vb])
     np.testing.assert_allclose(power, -moment @ phi_rate, rtol=1e-7)
 
@@ -91,7 +92,7 @@ def test_force_is_that_of_the_definition():
 def test_bushing_does_not_know_the_frame():
     """All turned and moved together by a rigid motion that itself moves: the same forces, turned."""
     bodies, frames, va, vb = scene(1)
-    ((load, *_),) = lg.Bushing("a", "b", at=AT, **RATES, **ALL).loads(bodies)
+    ((load, _, _),) = lg.Bushing("a", "b", at=AT, **RATES, **ALL).loads(bodies)
     rng = np.random.default_rng(2)
     turn, shift, spin, drift = random_rotation(rng), *rng.normal(size=(3, 3))
     moved, twists = [], []

@@ -84,9 +84,11 @@ def test_impact_is_that_of_hunt_and_crossley():
     trajectory = eqx.filter_jit(lambda scene: lg.simulate(scene, t1=0.03, num_steps=3000, integrator=integrator))(scene)
     left = float(trajectory.body("b").velocity[-1, 2])
     g = lambda v: v / c - np.log1p(c * v) / c**2
-    exact = -brentq(lambda v: g(v) - g(speed), -speed, -1e-3)
+    after = lambda speed: -brentq(lambda v: g(v) - g(speed), -speed, -1e-3 * speed)
+    exact = after(speed)
     np.testing.assert_allclose(left, exact, rtol=1e-3)  # (w/x)² with the depth x = v √(m/k) = 5 mm, (ω h)²
-    assert abs(exact - speed * (1 - 2 * c * speed / 3)) < 0.03 * speed  # as the docstring says
+    slow = 0.1  # as the docstring says
+    assert abs(after(slow) / slow - (1 - 2 * c * slow / 3)) < (c * slow) ** 2
     push = np.asarray(trajectory.force("contact"))
     assert push.min() == 0.0 and push.max() > 100.0 and push[-1] == 0.0
 

@@ -200,7 +200,7 @@ def test_what_is_lost_is_rubbed():
     def missing(scene, steps):
         trajectory = lg.simulate(scene, t1=0.4, num_steps=steps)
         bar = trajectory.body("bar")
-        spin = jnp.sum(bar.angular_velocity * INERTIA * bar.angular_velocity, axis=1)
+        spin = bar.angular_velocity**2 @ INERTIA
         energy = MASS * (jnp.sum(bar.velocity**2, axis=1) / 2 + G * bar.position[:, 2]) + spin / 2
         rubs = [trajectory.force(name) for name in ("rubs", "bristles")]
         work = sum(lg.time_integral(trajectory.t, jnp.sum(one.force * one.slip, axis=1)) for one in rubs)
