@@ -18,9 +18,9 @@ from lgsens.model._signals import Prescribed, at_time, prepared, prescribed_fiel
 class Gearing(AbstractConstraint):
     """Two gears have turned in the ratio ρ against the line d between them: Φ = φ_b − ρ φ_a; λ is a moment on b [N m].
 
-    With x along d in the reference configuration and orthogonal to the axis, and y = e × x, both fixed to a gear, that
-    gear has turned by φ = −atan2(y·d, x·d). Poses tell angles
-    but for whole turns, and Φ but for those of `teeth` times itself: these cancel if `teeth` times ρ is an integer.
+    d may be given, fixed in the inertial frame. With x along d in the reference configuration and orthogonal to the
+    axis, and y = e × x, both fixed to a gear, that gear has turned by φ = −atan2(y·d, x·d). Poses tell angles but for
+    whole turns, and Φ but for those of `teeth` times itself: these cancel if `teeth` times ρ is an integer.
     """
 
     point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
@@ -29,6 +29,7 @@ class Gearing(AbstractConstraint):
     second_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
     first_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
     second_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
+    line: Float[Array, "3"] | None
     ratio: Prescribed
     teeth: int = eqx.field(static=True)
 
@@ -40,10 +41,10 @@ class Gearing(AbstractConstraint):
 
     @property
     def relative(self):
-        return True
+        return self.line is None
 
     def value(self, a, b, t):
-        d = b.point(self.point_b) - a.point(self.point_a)
+        d = b.point(self.point_b) - a.point(self.point_a) if self.line is None else self.line
         turned = lambda frame, x, y: -jnp.arctan2(jnp.sum(frame.axis(y) * d), jnp.sum(frame.axis(x) * d))
         ratio = at_time(self.ratio, t)
         angle = turned(b, self.first_b, self.second_b) - ratio * turned(a, self.first_a, self.second_a)
@@ -66,9 +67,11 @@ class GearJoint(AbstractJoint):
             ratio at every instant, as a drive of variable ratio has it that is shifted with `a` near the reference.
         teeth: n_b or another count for which ratio · teeth is an integer: gears then turn any number of times. With
             another ratio, and for the derivative by the ratio, `a` is within half a turn of the reference.
+        line: a direction, fixed in the inertial frame, shape (3,), from which the angles are seen instead: of gears on
+            one axis, or any that a third part connects, in a housing that does not turn; None: that of the centres.
 
     The multiplier is the moment of `b` on the mesh about its axis [N m]: its negative drives `b`. Raises `ValueError`
-    for a wrong shape, a zero axis, centres along an axis, a zero ratio, or a count below 1. Source: Haug (1989), §3.4.
+    for a wrong shape, a zero axis, a line along an axis, a zero ratio, or a count below 1. Source: Haug (1989), §3.4.
     """
 
     a: str | None = eqx.field(static=True)
@@ -79,31 +82,36 @@ class GearJoint(AbstractJoint):
     axis_b: Float[Array, "3"] = axis_field("axis_b")
     ratio: Prescribed | None = prescribed_field("ratio")
     teeth: int = eqx.field(static=True, default=1, kw_only=True)
+    line: Float[Array, "3"] | None = point_field("line", default=None)
 
     def __check_init__(self):
         require_ratio("GearJoint", "ratio", self.ratio, "; a gear that does not turn is fixed by another joint")
         as_count(self.teeth, "teeth")
         for name, axis in (("axis_a", self.axis_a), ("axis_b", self.axis_b)):
             require(
-                lambda a, b, e: np.linalg.norm(np.cross(b - a, e)) > 1e-6 * np.linalg.norm(b - a) * np.linalg.norm(e),
-                f"GearJoint: the line from `at_a` {self.at_a} to `at_b` {self.at_b} is along `{name}` {axis}; give the "
-                "centres of the gears, each on its own axis.",
-                self.at_a,
-                self.at_b,
+                lambda d, e: np.linalg.norm(np.cross(d, e)) > 1e-6 * np.linalg.norm(d) * np.linalg.norm(e),
+                f"GearJoint: the line from `at_a` {self.at_a} to `at_b` {self.at_b}, or `line` {self.line}, is along "
+                f"`{name}` {axis}; give the centres of the gears, each on its own axis, and of gears on one axis a "
+                "`line` across it.",
+                self._line,
                 axis,
             )
 
     assembled = True
 
+    @property
+    def _line(self):
+        return self.at_b - self.at_a if self.line is None else self.line
+
     def constraints(self, a, b):
-        d = self.at_b - self.at_a
+        d = self._line
         marks = []
         for frame, axis in ((a, self.axis_a), (b, self.axis_b)):
             second = cross(axis, d)
             first = cross(second, axis)
             marks += [frame.local_axis(mark / jnp.linalg.norm(mark)) for mark in (first, second)]
         centres = a.local_point(self.at_a), b.local_point(self.at_b)
-        return (Gearing(*centres, *marks, ratio=prepared(self.ratio), teeth=self.teeth),)
+        return (Gearing(*centres, *marks, self.line, prepared(self.ratio), self.teeth),)
 
 
 class ConstantVelocityJoint(AbstractJoint):

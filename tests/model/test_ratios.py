@@ -27,6 +27,9 @@ JOINTS = {
     "rack by time": lg.RackAndPinionJoint(
         "a", "b", at=AT, axis=AXIS, direction=AXIS_B, radius=lg.Harmonic(amplitude=0.1, frequency=0.3, offset=0.4)
     ),
+    "gears on one axis": lg.GearJoint(
+        "a", "b", at_a=AT, at_b=AT, axis_a=AXIS, axis_b=AXIS, ratio=3.0, teeth=1, line=AXIS_B
+    ),
     "gears by time": lg.GearJoint("a", "b", **GEARS, ratio=RATIO),
 }
 
@@ -58,6 +61,10 @@ def test_values_over_many_turns():
     ratio = -1.5 + 0.2 * np.sin(2 * np.pi * 0.3 * t)
     phi = element.value(placed(0.0, 0.8), placed(1.0, ratio * 0.8 + 0.01), time)
     close(phi, [0.01], 1e3, scale=1.0)
+    on_axis = {"at_a": ORIGIN, "at_b": ORIGIN, "axis_a": Y, "axis_b": Y, "ratio": 3.0, "line": X}
+    (element,) = lg.GearJoint("a", "b", **on_axis).constraints(ground, ground)
+    for angle in (-9.0, 0.5, 20.0):
+        close(element.value(placed(0.0, angle), placed(0.0, 3.0 * angle + 0.01), time), [0.01], 1e3, scale=60.0)
 
 
 def steering(travel):
