@@ -170,7 +170,7 @@ class RackAndPinionJoint(AbstractJoint):
     axis: Float[Array, "3"] = axis_field("axis")
     direction: Float[Array, "3"] = axis_field("direction")
     radius: Prescribed | None = prescribed_field("radius")
-    travel: AbstractSignal | None = eqx.field(default=None, kw_only=True)
+    travel: AbstractSignal | None = eqx.field(default=None, kw_only=True, metadata={"over": "angle"})
 
     def __check_init__(self):
         require_ratio("RackAndPinionJoint", "radius", self.radius, " m; give the travel per radian")

@@ -48,7 +48,8 @@ class Gearing(AbstractConstraint):
         turned = lambda frame, x, y: -jnp.arctan2(jnp.sum(frame.axis(y) * d), jnp.sum(frame.axis(x) * d))
         ratio = at_time(self.ratio, t)
         angle = turned(b, self.first_b, self.second_b) - ratio * turned(a, self.first_a, self.second_a)
-        return (jnp.arctan2(jnp.sin(self.teeth * angle), jnp.cos(self.teeth * angle)) / self.teeth)[None]
+        turn = 2.0 * jnp.pi / self.teeth
+        return (angle - turn * jnp.round(angle / turn))[None]
 
 
 class GearJoint(AbstractJoint):
