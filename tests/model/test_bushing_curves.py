@@ -25,9 +25,8 @@ ALL = {
 }
 
 
-@pytest.mark.parametrize(
-    "curves", [ALL, pytest.param({"dampers": (CURVE, None, None)}, marks=pytest.mark.slow)], ids=["all", "dampers"]
-)
+@pytest.mark.slow  # a program each
+@pytest.mark.parametrize("curves", [ALL, {"dampers": (CURVE, None, None)}], ids=["all", "dampers"])
 def test_bushing_is_what_it_says(curves):
     check_force(lg.Bushing("a", "b", at=AT, **RATES, **curves)).raise_if_failed()
 

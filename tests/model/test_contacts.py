@@ -42,7 +42,10 @@ FORCES = {
 }
 
 
-@pytest.mark.parametrize("name", FORCES)
+QUICK = "tyre in the rounding", "point that rubs"
+
+
+@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in FORCES])
 def test_forces_are_what_they_say(name):
     force, options = FORCES[name]
     check_force(force, length=0.3, **options).raise_if_failed()
@@ -74,6 +77,7 @@ def test_tyre_is_the_spring_until_it_lifts_off():
     close(measure(load(rounding=W), free), K * 3 * W / 16, 50)
 
 
+@pytest.mark.slow
 def test_impact_is_that_of_hunt_and_crossley():
     """m v dv = −k x (1 + c v) dx leaves g(v) = v/c − ln(1 + c v)/c² the same before and after; no pull, no step."""
     mass, speed, c = 2.0, 0.8, 0.4
@@ -93,6 +97,7 @@ def test_impact_is_that_of_hunt_and_crossley():
     assert push.min() == 0.0 and push.max() > 100.0 and push[-1] == 0.0
 
 
+@pytest.mark.slow
 def test_fixed_moment_turns_a_body_about_its_direction():
     """Whatever the orientation: J of a ball, ω̇ = m/J in the inertial frame, 2 rad/s² about an axis of its own."""
     turned = Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix()

@@ -24,7 +24,7 @@ def elements():
     bodies["rubber"] = lg.RigidBody(MASS, INERTIA, velocity=(1.0, -0.5, 0.3), angular_velocity=(1.0, 2.0, -1.5))
     forces = {
         "spring": lg.SpringDamper(None, "spring", **ENDS, stiffness=30.0, damping=2.0),
-        "curve": lg.CurveSpringDamper(None, "curve", **ENDS, spring=CURVE, damper=CURVE),
+        "curve": lg.CurveSpringDamper(None, "curve", **ENDS, spring=CURVE, damper=lg.Polynomial((0.0, 2.0, 0.0, 3.0))),
         "stop": lg.BumpStop(None, "stop", **ENDS, gap=0.1, stiffness=90.0, rounding=0.1, progression=0.3, rebound=True),
         "drag": lg.Drag("drag", drag_area=DRAG, density=DENSITY),
         "maxwell": lg.MaxwellElement(None, "maxwell", **ENDS, stiffness=40.0, damping=CREEP),
@@ -62,7 +62,7 @@ def balance(scene, steps):
     line = measured["spring"]
     account("spring", 15.0 * (line.length - 1.0) ** 2, -2.0 * line.rate**2)
     x, rate = measured["curve"].length - 1.0, measured["curve"].rate
-    account("curve", 10.0 * x**2 + 20.0 * x**4, -rate * (20.0 * rate + 80.0 * rate**3))
+    account("curve", 10.0 * x**2 + 20.0 * x**4, -rate * (2.0 * rate + 3.0 * rate**3))
     y, w, p = np.maximum(measured["stop"].length - 1.1, 0.0) ** 2, 0.01, 0.09
     log = np.log1p(y / w)
     account("stop", 45.0 * (y - w * log + (y**2 / 2 - w * y + w**2 * log) / p), 0.0 * y)

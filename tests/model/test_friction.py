@@ -30,9 +30,8 @@ FRICTIONS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [*list(FRICTIONS)[:1], *(pytest.param(n, marks=pytest.mark.slow) for n in list(FRICTIONS)[1:])]
-)
+@pytest.mark.slow  # a program each
+@pytest.mark.parametrize("name", FRICTIONS)
 def test_frictions_are_what_they_say(name):
     check_force(FRICTIONS[name].on(JOINTS), length=0.1).raise_if_failed()
 
@@ -158,6 +157,7 @@ def test_every_number(solver, stabilized):
     check_sensitivities(asked, swing(solver)).raise_if_failed()
 
 
+@pytest.mark.slow
 def test_bristles_slip_and_stick():
     """Driven at a constant rate: −N μ(w) − c w. On a slope below atan μ_s: it rests where N σ₀ z holds the weight."""
     rate, tilt = 0.1, 0.3

@@ -30,6 +30,7 @@ def axle(forces, **more):
     return lg.Model({**sides, **bar.bodies}, bar.joints, {**springs, **pushes, **bar.forces})
 
 
+@pytest.mark.slow
 def test_rate_at_the_sides():
     """In parallel travel the springs alone; in opposite travel 2 k/r² more, and its change with the lever."""
 

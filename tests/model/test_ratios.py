@@ -34,7 +34,10 @@ JOINTS = {
 }
 
 
-@pytest.mark.parametrize("name", JOINTS)
+QUICK = ("rack by a curve",)
+
+
+@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in JOINTS])
 def test_joints_are_what_they_say(name):
     check_joint(JOINTS[name], t=0.7).raise_if_failed()
 
@@ -79,6 +82,7 @@ def steering(travel):
     return lg.Model({"pinion": body(ORIGIN), "rack": body((0.0, 0.0, -0.1))}, joints)
 
 
+@pytest.mark.slow
 def test_rack_follows_its_curve():
     """Position, rate and moment of the wheel over two turns and more, against SciPy's spline through the samples."""
     angles = np.linspace(-7.0, 7.0, 29)
@@ -102,6 +106,7 @@ def test_rack_follows_its_curve():
     close(moment, -push * curve(turns, 1), 1e6)
 
 
+@pytest.mark.slow
 def test_gradient_by_the_curve():
     """The place of the rack by the coefficients of its curve: −θ^i."""
 
