@@ -224,6 +224,29 @@ def test_joint_without_its_forces_in_the_plane():
     close(state.vdot, [0.0, 0.0, expected], 1e3)
 
 
+@pytest.mark.slow  # two programs
+def test_hinge_on_a_part_of_a_merged_body():
+    """A hinge on a part that is fixed to the bar rubs as if both were one: accelerations, and what is measured."""
+    scene = swing()
+    part = lg.RigidBody(0.5, INERTIA, position=(0.1, 0.0, 0.0), velocity=(0.0, 0.0, 0.1), angular_velocity=(0, -1.0, 0))
+    joints = {
+        "hinge": lg.RevoluteJoint(None, "part", at=ORIGIN, axis=Y),
+        "weld": lg.FixedJoint("part", "bar", at=ORIGIN),
+    }
+
+    @eqx.filter_jit
+    def start(merged):
+        model = lg.Model(scene.bodies | {"part": part}, joints, scene.forces, merge_fixed=merged)
+        state = lg.initial_state(model)
+        instant = lg.Instant(t=jnp.zeros(()), state=state, system=model.system())
+        return instant.body("bar"), instant.force("rubs"), instant.force("bristles")
+
+    whole, parts = start(True), start(False)
+    for one, other in zip(jax.tree.leaves(whole), jax.tree.leaves(parts)):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)  # condition of 1e5 round-offs
+    assert np.abs(whole[1].force).max() > 1.0
+
+
 def test_a_scene_without_friction_has_nothing_of_it():
     bar = swing()
     plain = lg.Model(bar.bodies, bar.joints, {"gravity": bar.forces["gravity"]}).system()
