@@ -57,7 +57,7 @@ class Advance(AbstractClosedFormConstraint):
     def _line(self) -> InPlane:
         return InPlane(self.point_a, self.point_b, self.axis_a)
 
-    def _angle(self, from_angle=0.0) -> Angle:
+    def _angle(self, from_angle: Array | float = 0.0) -> Angle:
         return Angle(self.first_a, self.second_a, self.first_b, jnp.asarray(from_angle, self.first_a.dtype))
 
     def _state(self, a, b, t):

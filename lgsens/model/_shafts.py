@@ -112,7 +112,7 @@ class GearJoint(AbstractJoint):
             first = cross(second, axis)
             marks += [frame.local_axis(mark / jnp.linalg.norm(mark)) for mark in (first, second)]
         centres = a.local_point(self.at_a), b.local_point(self.at_b)
-        return (Gearing(*centres, *marks, self.line, prepared(self.ratio), self.teeth),)
+        return (Gearing(*centres, *marks, line=self.line, ratio=prepared(self.ratio), teeth=self.teeth),)
 
 
 class ConstantVelocityJoint(AbstractJoint):
