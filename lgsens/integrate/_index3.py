@@ -79,15 +79,24 @@ from lgsens.linear import LU, Factors, Matrix
 
 
 def factorize_iteration_matrix(
-    scheme: AbstractAlpha, system: AbstractSystem, tangents: Tangents, upper: Matrix, mass, x, h, kind: Any = LU
+    scheme: AbstractAlpha,
+    system: AbstractSystem,
+    tangents: Tangents,
+    mass,
+    x,
+    h,
+    kind: Any = LU,
+    upper: Matrix | None = None,
 ) -> Factors:
     """The factors of S above: one LU, which serves Newton, the DDM, and transposed, the AVM. Or its `Inverse`.
 
-    `upper`: ∂r/∂λ."""
+    `upper`: ∂r/∂λ; None: Jᵀ."""
     jacobian = tangents.constraint_jacobian
     stiffness, lower = times_tangent_operator(system, x, (tangents.stiffness, jacobian))
     dynamic = scheme.inertia_factor * mass + (scheme.gamma * h) * tangents.damping + (scheme.beta * h**2) * stiffness
-    return factorized(system, dynamic, upper, lower, mass_scale(mass), kind, softness(system))
+    return factorized(
+        system, dynamic, jacobian.T if upper is None else upper, lower, mass_scale(mass), kind, softness(system)
+    )
 
 
 class Index3Step(AbstractStep):
@@ -114,8 +123,8 @@ class Index3Step(AbstractStep):
         at_state = tangents(shared.system, motion.q, motion.v, motion.vdot, lam, t)
         jacobian = at_state.constraint_jacobian
         upper = multiplier_jacobian(shared.system, jacobian, motion.q, motion.v, lam, t)
-        matrices = at_state, upper, shared.mass
-        factors = factorize_iteration_matrix(shared.scheme, shared.system, *matrices, motion.x, h, kind)
+        matrices = at_state, shared.mass
+        factors = factorize_iteration_matrix(shared.scheme, shared.system, *matrices, motion.x, h, kind, upper)
         return factors, margin_of(factors, jacobian, shared.scale)
 
     def change(self, du, dlam):
@@ -233,7 +242,7 @@ class Index3(AbstractEquations):
         x = increment(self.scheme, previous, state.a, h)
         at_state = tangents(system, state.q, state.v, state.vdot, state.lam, node.t)
         upper = multiplier_jacobian(system, at_state.constraint_jacobian, state.q, state.v, state.lam, node.t)
-        factors = factorize_iteration_matrix(self.scheme, system, at_state, upper, self.mass, x, h)
+        factors = factorize_iteration_matrix(self.scheme, system, at_state, self.mass, x, h, upper=upper)
         return Index3LinearizedStep(x, at_state, factors)
 
     def margin(self, state, t):
