@@ -36,6 +36,7 @@ EXTREMES = {
     "damping": extremes_forces.damping,
     "no_length": extremes_forces.no_length,
     "nothing": extremes_forces.nothing,
+    "friction": extremes_forces.friction,
     "failures": extremes_failures.failures,
     "free_body": extremes_long.free_body,
     "reverse": extremes_long.reverse,

@@ -1,4 +1,4 @@
-"""The extremes of forces: stiffness to the rigid joint, damping to a thousand times critical, and nothing at all."""
+"""The extremes of forces: stiffness to the rigid joint, damping to a thousand times critical, nothing, dry friction."""
 
 from functools import partial
 
@@ -206,3 +206,59 @@ def nothing() -> list[Row]:
         # at rest nothing is computed but zeros and the joint, whose round-off is divided by βh² = 0.07 s²
         rows.append(Row("one step of a body at rest", f"{name}: place, v̇, λ and derivatives", error, 64 * EPS, "64 ε"))
     return rows
+
+
+SLIPS, SLOPE, RUBBED, RUB_STEPS = (1e-9, 1e-6, 1e-4, 1e-2), 0.2, 0.4, 100  # slip speeds [m/s], radians, s
+
+
+def block(p):
+    """The way of a block down a slope, from speed p₂, with friction μ = p₀ in its rail and the slip speed e^p₁."""
+    down = jnp.asarray((np.cos(SLOPE), 0.0, -np.sin(SLOPE)), p.dtype)
+    body = lg.RigidBody(MASS, (0.1, 0.2, 0.25), velocity=p[2] * down)
+    rail = lg.PrismaticJoint(None, "block", at=jnp.zeros_like(down), axis=down)
+    friction = lg.JointFriction("rail", coefficient=p[0], slip_speed=jnp.exp(p[1]), load_rounding=1e-6)
+    forces = {"g": lg.Gravity(jnp.asarray((0.0, 0.0, -9.81), p.dtype)), "friction": friction}
+    run = lg.simulate(lg.Model({"block": body}, {"rail": rail}, forces), t1=RUBBED, num_steps=RUB_STEPS)
+    return jnp.dot(run.body("block").position[-1:], down)
+
+
+def friction() -> list[Row]:
+    mu, steep, slips = 0.3, np.tan(SLOPE), np.array(SLIPS)
+    creep = slips * steep / np.sqrt(mu**2 - steep**2)  # where friction holds the weight
+    fast = [(mu, np.log(slip), 1.0) for slip in slips]
+    value, forward, reverse = derivatives(block, np.array([*fast, *zip(np.full(4, mu), np.log(slips), creep)]))
+    pull = 9.81 * np.cos(SLOPE)
+    gain = (steep - mu) * pull
+    exact, by_mu = RUBBED + gain * RUBBED**2 / 2, -pull * RUBBED**2 / 2
+    # the slowest it becomes is 1 m/s + gain · t; force and load are less by half the square of the rounding over them
+    rounded = mu * pull * RUBBED**2 / 2 * (slips / (1.0 + gain * RUBBED)) ** 2 / 2 + 64 * RUB_STEPS * EPS
+    labels, extreme = [f"w₀ = {slip:g} m/s" for slip in slips], "friction, slip speed 1e-9 … 1e-2 m/s"
+    slid, crept, modes = value[:4, 0], value[4:, 0], np.abs(forward - reverse)[:, 0]
+    why = "μ g t²/4 (w₀/w)² of the rounding, + 64 n ε; closed form of constant deceleration"
+    return [
+        worst_row(extreme, "way down a slope, sliding", np.abs(slid - exact), rounded, labels, why),
+        worst_row(
+            extreme,
+            "the way by μ",
+            np.abs(forward[:4, 0, 0] - by_mu),
+            rounded * 8 / mu,
+            labels,
+            "8/μ times that of the way: w changes by μ too",
+        ),
+        worst_row(
+            extreme,
+            "way of its creep where it is held, over the creep",
+            np.abs(crept / (creep * RUBBED) - 1.0),
+            64 * RUB_STEPS * EPS * (1.0 + 1.0 / creep),
+            labels,
+            "64 n ε of a metre, and of itself",
+        ),
+        worst_row(
+            extreme,
+            "reverse − forward, sliding, by μ",
+            modes[:4, 0],
+            64 * RUB_STEPS * EPS * np.ones(4),
+            labels,
+            "64 n ε",
+        ),
+    ]

@@ -117,6 +117,14 @@ def axis_field(name: str) -> Any:
     return eqx.field(converter=convert, kw_only=True)
 
 
+def require_positive(owner: Any, *names: str) -> None:
+    """Raise `ValueError` for numbers of an element that are given and not positive."""
+    for name in names:
+        if (value := getattr(owner, name)) is not None:
+            message = f"{type(owner).__name__}: `{name}` must be positive, got {value}."
+            require(lambda value: np.all(value > 0), message, value)
+
+
 def require_nonzero(what: str, name: str, value, advice: str) -> None:
     """Raise `ValueError` for a number of `what` that is zero; `advice` follows it: its unit, or what to do."""
     require(lambda value: value != 0, f"{what}: `{name}` must not be zero, got {value}{advice}.", value)

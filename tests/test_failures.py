@@ -252,7 +252,7 @@ def test_names_of_a_trajectory():
 def test_force_that_acts_on_several_bodies():
     system = lg.Model(TWO, {}, {"gravity": lg.Gravity(Z)}).system()
     with pytest.raises(ValueError, match=says("`force`: 'gravity' acts on 2 bodies and has no single value")):
-        system.measure("gravity", system.pose, system.velocity, jnp.zeros(1))
+        lg.model.measured(system, "gravity", system.pose, *(system.velocity,) * 2, jnp.zeros(0), jnp.zeros(1))
 
 
 class Oscillator(AbstractSystem):

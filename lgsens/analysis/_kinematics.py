@@ -1,5 +1,6 @@
 """`kinematics`: the motion that joints and prescribed coordinates alone determine."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -161,13 +162,18 @@ def _kinematics_jit(drive: _Drive, driven, rates):
 
 
 def _with_numbers(model: Model, t, names: Sequence[str] | None = None) -> Model:
-    """The model with numbers in place of the signals of these joints; None: of all."""
+    """The model with numbers in place of the signals of time of these joints; None: of all."""
     is_signal = lambda leaf: isinstance(leaf, AbstractSignal)
     number = lambda leaf: leaf(t) if is_signal(leaf) else leaf
-    joints = {
-        name: jax.tree.map(number, joint, is_leaf=is_signal) if names is None or name in names else joint
-        for name, joint in model.joints.items()
-    }
+
+    def numbers(joint: AbstractJoint) -> AbstractJoint:
+        leaves = lambda name: jax.tree.leaves(getattr(joint, name), is_leaf=is_signal)
+        over_time = [field.name for field in dataclasses.fields(joint) if field.metadata.get("over", "time") == "time"]
+        fields = [name for name in over_time if any(map(is_signal, leaves(name)))]
+        some = lambda joint: [getattr(joint, name) for name in fields]
+        return eqx.tree_at(some, joint, jax.tree.map(number, some(joint), is_leaf=is_signal)) if fields else joint
+
+    joints = {name: numbers(joint) if names is None or name in names else joint for name, joint in model.joints.items()}
     return eqx.tree_at(lambda model: model.joints, model, joints)
 
 

@@ -24,6 +24,7 @@ from lgsens.dynamics import (
     full_jacobian,
     is_redundant,
     require_independent,
+    require_linear,
 )
 from lgsens.liegroups import unskew
 from lgsens.model import Model
@@ -182,6 +183,8 @@ def linearize(
             "`model`: its joints have as many equations as it has coordinates, and leave no freedom; `constraint_rank`"
             " tells."
         )
+    if state is not None:
+        require_linear(system, "`linearize` of a motion")
     if rotation is not None and state is None:
         raise ValueError("`rotation` is that of a motion; give its `state` as well, `initial_state(model)` say.")
     rotation = as_float(jnp.zeros(3) if rotation is None else rotation, (3,), "`rotation`")

@@ -30,7 +30,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics._constraints import constraint_acceleration, fixed_velocity_rate, full_jacobian
-from lgsens.dynamics._matrices import kkt_product
+from lgsens.dynamics._matrices import kkt_product, require_linear
 from lgsens.dynamics._redundant import SOFTNESS, refined, softness
 from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem
 from lgsens.linear import LinearEquations, linear_solve
@@ -46,6 +46,7 @@ class Inertia(eqx.Module):
 
     @classmethod
     def of(cls, system: AbstractSystem) -> "Inertia":
+        require_linear(system, "Integration of the index-reduced equations")
         mass = system.mass_matrix()
         # N serves to solve only, and needs no derivative: that of the solution comes from M.
         fixed = lax.stop_gradient(mass)

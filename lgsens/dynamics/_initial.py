@@ -9,8 +9,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._xla import while_loop
-from lgsens.dynamics._constraints import fixed_velocity_rate, prescribed_velocity
-from lgsens.dynamics._matrices import ConstrainedMass, constraint_jacobian, factorized, for_once
+from lgsens.dynamics._constraints import fixed_velocity_rate, full_jacobian, prescribed_velocity
+from lgsens.dynamics._matrices import ConstrainedMass, constraint_jacobian, factorized, for_once, mass_scale
 from lgsens.dynamics._redundant import softness
 from lgsens.dynamics._results import RESULTS
 from lgsens.dynamics._system import AbstractSystem, State, finite
@@ -63,10 +63,40 @@ def accelerations(system: AbstractSystem, q, v, t, factors: Factors | None = Non
 
     M v̇ + Jᵀλ = ad(v)ᵀ M v − f(q, v, t),     J v̇ = −γ(q, v, t)
     """
+    if system.reads_multipliers:
+        return _implicit_accelerations(system, q, v, t)
     kkt = ConstrainedMass.of(system, q, t, factors)
     zero, lam_zero = jnp.zeros_like(v), jnp.zeros(kkt.jacobian.shape[0], v.dtype)
     force = -system.residual(q, v, zero, lam_zero, t)
     return kkt.solve(force, -fixed_velocity_rate(system, q, v, t))
+
+
+def _implicit_accelerations(system: AbstractSystem, q, v, t):
+    """The same where f depends on λ: r(q, v, v̇, λ, t) = 0 and J v̇ + γ = 0 by Newton's iteration, and its derivative."""
+    k, scale = v.shape[0], mass_scale(system.mass_matrix())  # of the equations of acceleration, and of λ
+    jacobian, drift = full_jacobian(system, q, t), fixed_velocity_rate(system, q, v, t)
+
+    def equation(y):
+        residual = system.residual(q, v, y[:k], scale * y[k:], t)
+        return jnp.concatenate([residual, scale * (jacobian @ y[:k] + drift)])
+
+    def newton(equation, y):
+        def body(carry):
+            y, _, iteration = carry
+            step = jnp.linalg.solve(jax.jacfwd(equation)(y), equation(y))
+            return y - step, jnp.max(jnp.abs(step)), iteration + 1
+
+        def unfinished(carry):
+            y, size, iteration = carry
+            small = 16 * jnp.finfo(y.dtype).eps * (1.0 + jnp.max(jnp.abs(y)))
+            return (size > small) & (iteration < _MAX_ITERATIONS)
+
+        return while_loop(unfinished, body, (y, jnp.full((), jnp.inf, y.dtype), jnp.zeros((), jnp.int32)))[0]
+
+    tangent_solve = lambda linear, rhs: jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(rhs)), rhs)
+    start = jnp.zeros(k + jacobian.shape[0], v.dtype)
+    y = lax.custom_root(equation, start, newton, tangent_solve)
+    return y[:k], scale * y[k:]
 
 
 def acceleration_and_jerk(system: AbstractSystem, q, v, t, factors: Factors | None = None):

@@ -31,6 +31,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from lgsens._xla import scan, while_loop
+from lgsens.dynamics._matrices import require_linear
 from lgsens.dynamics._system import AbstractSystem, State
 
 _MAX_ITERATIONS = 40
@@ -123,6 +124,7 @@ def forces_of_motion(
     drive: AbstractDrive, q, driven: tuple[Float[Array, " d"], Float[Array, ""]], rates: tuple[Array, Array]
 ) -> State:
     """v, v̇ and λ of the motion through q with constant rates of `driven`, values and time; a = v̇."""
+    require_linear(drive.system, "`kinematics`")
     (values, t), group = driven, drive.system.group
     system = drive.at(values)
     jacobian = system.constraint_jacobian(q, t)

@@ -37,6 +37,24 @@ def tangents(system: AbstractSystem, q, v, vdot, lam, t) -> Tangents:
     return (system.tangents if sparse is None else sparse.sparse_tangents)(q, v, vdot, lam, t)
 
 
+def multiplier_jacobian(system: AbstractSystem, jacobian: Matrix, q, v, lam, t) -> Matrix:
+    """∂r/∂λ, of the kind of J: Jᵀ, unless forces depend on λ."""
+    if not system.reads_multipliers:
+        return jacobian.T
+    every = system.multiplier_jacobian(q, v, lam, t)
+    return every.dense() if isinstance(every, SparseMatrix) and not isinstance(jacobian, SparseMatrix) else every
+
+
+def require_linear(system: AbstractSystem, method: str) -> None:
+    """Raise `ValueError` where forces depend on λ, for a method that solves linear equations for it."""
+    if system.reads_multipliers:
+        raise ValueError(
+            f"{method} needs forces that do not depend on multipliers, and the model has friction from the forces of "
+            "its joints. Use GeneralizedAlpha with DirectDifferentiation() or AdjointVariable(), or give the friction "
+            "a `preload` and own_forces=False."
+        )
+
+
 def factor_size(system: AbstractSystem) -> int:
     """How many numbers the factors of an iteration matrix are."""
     plan = system.elimination if isinstance(system, AbstractSparseSystem) else None

@@ -41,7 +41,8 @@ class State(eqx.Module):
 class Tangents(NamedTuple):
     """The matrices of the linearized equations of motion, §3.1.
 
-    δr = K_t δq + C_t δv + M δv̇ + Bᵀ δλ  and  δΦ = B δq, at one state.
+    δr = K_t δq + C_t δv + M δv̇ + Bᵀ δλ  and  δΦ = B δq, at one state; ∂r/∂λ of `multiplier_jacobian` in place of Bᵀ
+    where forces depend on λ.
     """
 
     stiffness: Matrix  # K_t, (k, k)
@@ -124,6 +125,17 @@ class AbstractSystem(eqx.Module):
         """A(q, t)."""
         return jnp.zeros_like(self.reference()[1], shape=(0, self.group.dim))
 
+    # Forces that depend on the multipliers, as friction of joints does: f(q, v, λ, t).
+
+    @property
+    def reads_multipliers(self) -> bool:
+        """Whether f depends on λ: ∂r/∂λ is not Jᵀ, and (v̇, λ) not the solution of linear equations."""
+        return False
+
+    def multiplier_jacobian(self, q, v, lam, t) -> Matrix:
+        """∂r/∂λ, shape (k, m); asked for where f depends on λ."""
+        return jax.jacfwd(lambda lam: self.residual(q, v, jnp.zeros_like(v), lam, t))(lam)
+
     # States that obey ż = g(q, v, z, t): z is the velocity of a coordinate with unit mass, on which nothing depends.
 
     @property
@@ -147,6 +159,12 @@ class AbstractSparseSystem(AbstractSystem):
     """
 
     linear_solver: eqx.AbstractVar[AbstractLinearSolver | None]
+
+    def mass_matrix(self):
+        return self.sparse_mass_matrix().dense()
+
+    def tangents(self, q, v, vdot, lam, t):
+        return Tangents(*(matrix.dense() for matrix in self.sparse_tangents(q, v, vdot, lam, t)))
 
     @property
     @abc.abstractmethod

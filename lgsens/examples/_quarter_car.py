@@ -220,9 +220,9 @@ class QuarterCar(eqx.Module):
             "tyre": TyreSpring("wheel", at=self.wheel.centre, **tyre),
         }
         for name in bushings:
-            rates = {"stiffness": bushing_stiffness, "damping": bushing_damping}
-            rates = {rate: jnp.full(3, value, self.bearing.dtype) for rate, value in rates.items()}
-            forces[f"{name}_bushing"] = Bushing("knuckle", name, at=self.links[name].knuckle, **rates)
+            stiffness, damping = (jnp.full(3, x, self.bearing.dtype) for x in (bushing_stiffness, bushing_damping))
+            at = self.links[name].knuckle
+            forces[f"{name}_bushing"] = Bushing("knuckle", name, at=at, stiffness=stiffness, damping=damping)
         model = Model(bodies, joints, forces)
         if free_length is not None:
             return model

@@ -6,7 +6,7 @@ Iteration. With ∂x/∂u = βh², ∂v⁺/∂u = γh and ∂v̇⁺/∂u = c = (
          [B T(x),                       0 ]]
 
 for the unknowns (u, λ) and the rows (r, Φ/(βh²)); with −diag(c) in the corner where constraints may be redundant, whose
-rows are Φ/(βh²) − c λ (`dynamics/_redundant.py`).
+rows are Φ/(βh²) − c λ (`dynamics/_redundant.py`). Where forces depend on λ, ∂r/∂λ stands for Bᵀ, here and below.
 
 Linearization. Let δ_n = (w, v', v̇', λ', a')_n, with q' = q w̃ (eq. 32). Differentiating the step (eqs. 24–29, §6.2),
 
@@ -33,7 +33,7 @@ multipliers μ of the rows (named like them)
     μ.w    + K_tᵀ μ.a + Bᵀ μ.lam/(βh²) = c.w
     μ.v    + C_tᵀ μ.a                  = c.v
     μ.vdot + Mᵀ μ.a                    = c.vdot
-    B μ.a                              = c.lam
+    B μ.a                              = c.lam      (∂r/∂λᵀ μ.a where forces depend on λ)
     −βh² Tᵀ μ.w − γh μ.v − c μ.vdot    = c.a
 
 Elimination of the first three leaves the transpose of the iteration matrix, which the continuous method of §7 does not
@@ -67,6 +67,7 @@ from lgsens.dynamics import (
     factorized,
     mass_matrix,
     mass_scale,
+    multiplier_jacobian,
     softness,
     tangents,
     times_tangent_operator,
@@ -78,13 +79,24 @@ from lgsens.linear import LU, Factors, Matrix
 
 
 def factorize_iteration_matrix(
-    scheme: AbstractAlpha, system: AbstractSystem, tangents: Tangents, mass, x, h, kind: Any = LU
+    scheme: AbstractAlpha,
+    system: AbstractSystem,
+    tangents: Tangents,
+    mass,
+    x,
+    h,
+    kind: Any = LU,
+    upper: Matrix | None = None,
 ) -> Factors:
-    """The factors of S above: one LU, which serves Newton, the DDM, and transposed, the AVM. Or its `Inverse`."""
+    """The factors of S above: one LU, which serves Newton, the DDM, and transposed, the AVM. Or its `Inverse`.
+
+    `upper`: ∂r/∂λ; None: Jᵀ."""
     jacobian = tangents.constraint_jacobian
     stiffness, lower = times_tangent_operator(system, x, (tangents.stiffness, jacobian))
     dynamic = scheme.inertia_factor * mass + (scheme.gamma * h) * tangents.damping + (scheme.beta * h**2) * stiffness
-    return factorized(system, dynamic, jacobian.T, lower, mass_scale(mass), kind, softness(system))
+    return factorized(
+        system, dynamic, jacobian.T if upper is None else upper, lower, mass_scale(mass), kind, softness(system)
+    )
 
 
 class Index3Step(AbstractStep):
@@ -109,8 +121,11 @@ class Index3Step(AbstractStep):
     def factors(self, motion, lam, kind=LU):
         shared, (_, t, h) = self.shared, self.node
         at_state = tangents(shared.system, motion.q, motion.v, motion.vdot, lam, t)
-        factors = factorize_iteration_matrix(shared.scheme, shared.system, at_state, shared.mass, motion.x, h, kind)
-        return factors, margin_of(factors, at_state.constraint_jacobian, shared.scale)
+        jacobian = at_state.constraint_jacobian
+        upper = multiplier_jacobian(shared.system, jacobian, motion.q, motion.v, lam, t)
+        matrices = at_state, shared.mass
+        factors = factorize_iteration_matrix(shared.scheme, shared.system, *matrices, motion.x, h, kind, upper)
+        return factors, margin_of(factors, jacobian, shared.scale)
 
     def change(self, du, dlam):
         return jnp.abs(du)
@@ -226,7 +241,8 @@ class Index3(AbstractEquations):
         system, h = self.system, node.h
         x = increment(self.scheme, previous, state.a, h)
         at_state = tangents(system, state.q, state.v, state.vdot, state.lam, node.t)
-        factors = factorize_iteration_matrix(self.scheme, system, at_state, self.mass, x, h)
+        upper = multiplier_jacobian(system, at_state.constraint_jacobian, state.q, state.v, state.lam, node.t)
+        factors = factorize_iteration_matrix(self.scheme, system, at_state, self.mass, x, h, upper=upper)
         return Index3LinearizedStep(x, at_state, factors)
 
     def margin(self, state, t):

@@ -42,7 +42,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import AbstractSystem, State, constraint_velocity, mass_scale
+from lgsens.dynamics import AbstractSystem, State, constraint_velocity, mass_scale, multiplier_jacobian
 from lgsens.integrate._alpha import AbstractAlpha, AbstractStep, advance
 from lgsens.integrate._linearized import Node
 from lgsens.linear import LU, Factors
@@ -86,6 +86,7 @@ class LevelTangents(NamedTuple):
     stiffness: Float[Array, "k k"]  # K_t
     damping: Float[Array, "k k"]  # C_t
     jacobian: Float[Array, "m k"]  # J
+    upper: Float[Array, "k m"]  # ∂r/∂λ: Jᵀ, unless forces depend on λ
     rate_stiffness: Float[Array, "c k"]  # V
 
 
@@ -142,8 +143,11 @@ class LevelStep(AbstractStep):
 
     def tangents(self, q, v, vdot, lam, t) -> LevelTangents:
         system, counts = self.shared.system, self.shared.counts
-        k_t, c_t, jacobian = system.tangents(q, v, vdot, lam[: counts.multipliers], t)
-        return LevelTangents(k_t, c_t, jacobian, by_configuration(system, lambda q: counts.rate(system, q, v, t), q))
+        lam = lam[: counts.multipliers]
+        k_t, c_t, jacobian = system.tangents(q, v, vdot, lam, t)
+        upper = multiplier_jacobian(system, jacobian, q, v, lam, t)
+        by_place = by_configuration(system, lambda q: counts.rate(system, q, v, t), q)
+        return LevelTangents(k_t, c_t, jacobian, upper, by_place)
 
     def factors(self, motion, lam, kind=LU):
         at_state = self.tangents(motion.q, motion.v, motion.vdot, lam, self.node.t)
@@ -152,7 +156,7 @@ class LevelStep(AbstractStep):
     def factorized(self, at_state: LevelTangents, x, kind: Any = LU) -> LevelFactors:
         """The factors of S₂."""
         scheme, mass, counts, h = self.shared.scheme, self.shared.mass, self.shared.counts, self.node.h
-        k_t, c_t, jacobian, rate_stiffness = at_state
+        k_t, c_t, jacobian, border, rate_stiffness = at_state
         k, p, b, m = mass.shape[0], counts.positions, counts.both, counts.multipliers
         scale = mass_scale(mass)
         position, gain = scheme.beta * h**2, (scheme.beta * h**2) / (scheme.gamma * h)
@@ -163,7 +167,7 @@ class LevelStep(AbstractStep):
         by_v = jnp.concatenate([scheme.inertia_factor * mass + (scheme.gamma * h) * c_t, jacobian[:b]])
         inside = jnp.concatenate([by_v + by_x[: k + b], by_nu[: k + b]], axis=1)
         rows = jnp.concatenate([jnp.ones(k, scale.dtype), jnp.broadcast_to(scale, b)])[:, None]
-        upper = jnp.concatenate([jacobian.T, jnp.zeros((b, m), scale.dtype)])
+        upper = jnp.concatenate([border, jnp.zeros((b, m), scale.dtype)])
         below = by_x[k + b :] + jnp.concatenate([jnp.zeros_like(jacobian[:p]), jacobian[p:]])
         lower = jnp.concatenate([below, by_nu[k + b :]], axis=1)
         return LevelFactors(Factors.of(rows * inside, upper, lower, scale, kind=kind), scale, m)

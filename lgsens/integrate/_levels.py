@@ -74,7 +74,7 @@ class LevelLinearizedStep(AbstractLinearizedStep):
     def forward(self, shared, node, previous, loads, row):
         scheme, counts, group, h, x = shared.scheme, shared.counts, shared.system.group, node.h, self.x
         position, velocity = scheme.beta * h**2, scheme.gamma * h
-        k_t, c_t, _, rate_stiffness = self.tangents
+        k_t, c_t, *_, rate_stiffness = self.tangents
         of_positions, of_rates = self._jacobians(counts)
         dy = shared.inverse_mass @ (self.curvature @ previous.w + loads.correction)
         dx = h * previous.v + (h**2 * (0.5 - scheme.beta)) * previous.a + loads.x + position * dy
@@ -98,7 +98,7 @@ class LevelLinearizedStep(AbstractLinearizedStep):
         m = counts.multipliers
         position, velocity = scheme.beta * h**2, scheme.gamma * h
         alpha_m, alpha_f = scheme.alpha_m, scheme.alpha_f
-        k_t, c_t, _, rate_stiffness = self.tangents
+        k_t, c_t, *_, rate_stiffness = self.tangents
         of_positions, of_rates = self._jacobians(counts)
         turned = position * group.tangent_rmv(x, c.w)
         mu_a, mu_lam = self.factors.solve(

@@ -42,6 +42,7 @@ from lgsens.dynamics import (
     equations_of_motion,
     factorized_accelerations,
     require_independent,
+    require_linear,
 )
 from lgsens.integrate._grid import earlier, later
 from lgsens.integrate._scheme import AbstractScheme, Stages, Stats
@@ -111,6 +112,7 @@ class RadauIIA(AbstractScheme):
 
     def complete(self, system, state):
         require_independent(system, "RadauIIA")
+        require_linear(system, "RadauIIA")
         three = lambda leaf: jnp.zeros((3, *leaf.shape), leaf.dtype)
         mu = state.lam[: len(state.lam) - system.num_velocity_rows]
         return dataclasses.replace(state, inner=RadauStages(*map(three, (state.v, state.v, state.lam, mu))))

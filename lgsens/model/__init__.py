@@ -1,6 +1,7 @@
 """Rigid bodies, joints and forces: one implementation of the abstract system (paper, §3 and §9)."""
 
 from lgsens.model._body import RigidBody as RigidBody, lumped as lumped
+from lgsens.model._bushing import Bushing as Bushing
 from lgsens.model._checks import invalid_numbers as invalid_numbers
 from lgsens.model._constraints import (
     AbstractClosedFormConstraint as AbstractClosedFormConstraint,
@@ -8,10 +9,12 @@ from lgsens.model._constraints import (
     AbstractRows as AbstractRows,
     AbstractVelocityConstraint as AbstractVelocityConstraint,
     Coincidence as Coincidence,
+    ConstraintSum as ConstraintSum,
     Distance as Distance,
     InPlane as InPlane,
     Orthogonality as Orthogonality,
 )
+from lgsens.model._contacts import TyreLoad as TyreLoad
 from lgsens.model._controls import (
     Actuator as Actuator,
     ControlSignals as ControlSignals,
@@ -27,7 +30,6 @@ from lgsens.model._coordinates import (
 from lgsens.model._curves import CurveSpringDamper as CurveSpringDamper
 from lgsens.model._drivers import (
     Angle as Angle,
-    Displacement as Displacement,
     RotationDriver as RotationDriver,
     TranslationDriver as TranslationDriver,
 )
@@ -36,13 +38,17 @@ from lgsens.model._forces import (
     AbstractForce as AbstractForce,
     AppliedForce as AppliedForce,
     Attached as Attached,
-    Bushing as Bushing,
     Gravity as Gravity,
     SpringDamper as SpringDamper,
     TyreSpring as TyreSpring,
 )
 from lgsens.model._frames import Frame as Frame, motion_at as motion_at
 from lgsens.model._free import ALL_FREE as ALL_FREE
+from lgsens.model._friction import (
+    JointFriction as JointFriction,
+    LuGreFriction as LuGreFriction,
+    SlidingFriction as SlidingFriction,
+)
 from lgsens.model._joint_forces import joint_wrenches as joint_wrenches
 from lgsens.model._joints import (
     AbstractJoint as AbstractJoint,
@@ -54,6 +60,7 @@ from lgsens.model._joints import (
     SphericalJoint as SphericalJoint,
     UniversalJoint as UniversalJoint,
 )
+from lgsens.model._linked_bar import LinkedAntiRollBar as LinkedAntiRollBar
 from lgsens.model._loads import (
     AbstractClosedFormLoad as AbstractClosedFormLoad,
     AbstractDynamicLoad as AbstractDynamicLoad,
@@ -62,8 +69,8 @@ from lgsens.model._loads import (
     LineForce as LineForce,
     LoadTangents as LoadTangents,
     SpringDamperLoad as SpringDamperLoad,
-    TyreLoad as TyreLoad,
 )
+from lgsens.model._measured import measured as measured
 from lgsens.model._model import Model as Model
 from lgsens.model._on_merged_bodies import carried as carried
 from lgsens.model._relative import (
@@ -103,5 +110,6 @@ from lgsens.model._vehicle_forces import (
     AntiRollBar as AntiRollBar,
     BumpStop as BumpStop,
     Drag as Drag,
+    PlaneContact as PlaneContact,
     TorsionSpringDamper as TorsionSpringDamper,
 )

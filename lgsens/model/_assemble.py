@@ -101,7 +101,8 @@ def _assemble(
                 constraints.append(Placed(StackRow(of, row.index), a, b, name, kept, i, more))
     loads, free = [], [body.coordinates for body in ordered]
     for name, force in sorted(forces.items()):
-        for load, *ends in force.loads(moving if force.on_merged else bodies):
+        acting = force.on(joints)
+        for load, *ends in acting.loads(moving if force.on_merged else bodies):
             a, b = (places[end] for end in ends)
             own = carriers(num_states(load))
             if own and a.body is b.body is None:
@@ -112,7 +113,7 @@ def _assemble(
             if own or a.body != b.body or (a.body is not None and not load.balanced):
                 here = tuple(range(len(free), len(free) + len(own)))
                 element = carried(load, a.offset, b.offset)
-                loads.append(Placed(element, number[a.body], number[b.body], name, carriers=here))
+                loads.append(Placed(element, number[a.body], number[b.body], name, carriers=here, joint=acting.reads))
                 free.extend(own)
     kinds = [
         (jnp.shape(body.inertia) if body.inertia is not None else None, body.pivot is None, body.mass.dtype)

@@ -9,7 +9,8 @@ An element holds numbers only (no names): elements of one type are stacked and e
 """
 
 import abc
-from collections.abc import Set
+from collections.abc import Iterable, Set
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -242,6 +243,57 @@ class InPlane(AbstractClosedFormConstraint):
         stiffness += embedded(skew(self.axis_a) @ skew(a.local_axis(d)), ROTATION_A, ROTATION_A)
         stiffness += separation_stiffness(a, b, self.point_a, self.point_b, a.axis(self.axis_a))
         return stiffness * lam[0]
+
+
+class ConstraintSum(AbstractClosedFormConstraint):
+    """A sum of constraints of one row each, less a prescribed s: Φ = Σ Φ_i − s(t); λ is that of each of them."""
+
+    parts: tuple[AbstractClosedFormConstraint, ...]
+    prescribed: Prescribed | None = None
+
+    drawn = None
+
+    @property
+    def num_rows(self):
+        return 1
+
+    @property
+    def relative(self):
+        return self.prescribed is None
+
+    @property
+    def acts_on(self):
+        return self.parts[0].acts_on
+
+    @property
+    def coupled(self):
+        return self.parts[0].coupled
+
+    @property
+    def driven(self):
+        return number_of(self.prescribed)
+
+    def violable(self, free):
+        return self.parts[0].violable(free)
+
+    def value(self, a, b, t):
+        value = total(part.value(a, b, t) for part in self.parts)
+        return value if self.prescribed is None else value - at_time(self.prescribed, t)
+
+    def jacobian(self, a, b, t):
+        return total(part.jacobian(a, b, t) for part in self.parts)
+
+    def force(self, a, b, lam, t):
+        return total(part.force(a, b, lam, t) for part in self.parts)
+
+    def geometric_stiffness(self, a, b, lam, t):
+        return total(part.geometric_stiffness(a, b, lam, t) for part in self.parts)
+
+
+def total(parts: Iterable[Array]) -> Any:
+    """The sum of one array or more."""
+    first, *others = parts
+    return sum(others, first)
 
 
 class Distance(AbstractClosedFormConstraint):

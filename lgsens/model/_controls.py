@@ -10,10 +10,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import number_field, point_field, require
+from lgsens._validate import number_field, point_field, require_positive
 from lgsens.model._constraints import AbstractConstraint
 from lgsens.model._elements import body_fixed
 from lgsens.model._forces import AbstractForce, Attached, _distance, _frame
@@ -186,11 +185,6 @@ class _AbstractAlong(AbstractForce):
         return (Attached(self._load(rows[0]), a, b),)
 
 
-def _positive(what: str, name: str, value) -> None:
-    if value is not None:
-        require(lambda value: np.all(value > 0), f"{what}: `{name}` must be positive, got {value}.", value)
-
-
 def _require_driver(what: str, along) -> None:
     if not isinstance(along, AbstractJoint):
         raise ValueError(
@@ -221,7 +215,7 @@ class Actuator(_AbstractAlong):
 
     def __check_init__(self):
         _require_driver("Actuator", self.along)
-        _positive("Actuator", "time_constant", self.time_constant)
+        require_positive(self, "time_constant")
         if self.command is None:
             raise ValueError("Actuator: `command` is missing; give a number [N] or [N m], or a signal.")
 
@@ -256,7 +250,7 @@ class PIDController(_AbstractAlong):
 
     def __check_init__(self):
         _require_driver("PIDController", self.along)
-        _positive("PIDController", "time_constant", self.time_constant)
+        require_positive(self, "time_constant")
 
     def _load(self, along):
         if self.integral is None and self.time_constant is None:
@@ -291,7 +285,7 @@ class MaxwellElement(AbstractForce):
     initial: Float[Array, ""] | None = number_field("initial", default=None)
 
     def __check_init__(self):
-        _positive("MaxwellElement", "damping", self.damping)
+        require_positive(self, "damping")
 
     @property
     def bodies(self):

@@ -66,6 +66,7 @@ class CurveSpringDamper(AbstractForce):
 
     The force is as smooth as its curves, its tangents one derivative less. Points must not meet. `Trajectory.force`
     gives a `LineForce`. Raises `ValueError` for what is no signal, for neither of two curves and for wrong shapes.
+    Source: Dixon, The Shock Absorber Handbook (2nd ed. 2007); of the curves Fritsch & Butland (1984).
     """
 
     a: str | None = eqx.field(static=True)

@@ -5,42 +5,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens._validate import axis_field, point_field
-from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint, InPlane
+from lgsens.model._constraints import AbstractConstraint, ConstraintSum, InPlane
 from lgsens.model._elements import body_fixed
 from lgsens.model._frames import TURNING_A, TURNING_B, Frame, normals
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._relative import ANGLE, DISPLACEMENT, frames_along, frames_at
 from lgsens.model._signals import Prescribed, at_time, number_of, prepared, prescribed_field
-
-
-class Displacement(AbstractClosedFormConstraint):
-    """The line between two points has a prescribed component along an axis of a: Φ = α·d − s(t); λ is a force [N].
-
-    But for s it is `InPlane`, and so are its tangents.
-    """
-
-    line: InPlane
-    prescribed: Prescribed
-
-    @property
-    def num_rows(self):
-        return 1
-
-    @property
-    def driven(self):
-        return number_of(self.prescribed)
-
-    def value(self, a, b, t):
-        return self.line.value(a, b, t) - at_time(self.prescribed, t)
-
-    def jacobian(self, a, b, t):
-        return self.line.jacobian(a, b, t)
-
-    def force(self, a, b, lam, t):
-        return self.line.force(a, b, lam, t)
-
-    def geometric_stiffness(self, a, b, lam, t):
-        return self.line.geometric_stiffness(a, b, lam, t)
 
 
 class Angle(AbstractConstraint):
@@ -110,7 +80,7 @@ class TranslationDriver(AbstractJoint):
     def constraints(self, a: Frame, b: Frame):
         unit = self.axis / jnp.linalg.norm(self.axis)
         line = InPlane(a.local_point(self.at), b.local_point(self.at), a.local_axis(unit))
-        return (Displacement(line, _or_zero(self.value, unit.dtype)),)
+        return (ConstraintSum((line,), _or_zero(self.value, unit.dtype)),)
 
 
 class RotationDriver(AbstractJoint):

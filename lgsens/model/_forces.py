@@ -3,27 +3,27 @@
 import abc
 import dataclasses
 from collections.abc import Mapping
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._validate import number_field, point_field
+from lgsens._validate import number_field, point_field, require_positive
 from lgsens.model._body import RigidBody
+from lgsens.model._contacts import TyreLoad
 from lgsens.model._frames import Frame, ground_frame
+from lgsens.model._joints import AbstractJoint
 from lgsens.model._loads import (
     AbstractDynamicLoad,
     AbstractLoad,
-    BushingLoad,
     PointForce,
     SpringDamperLoad,
-    TyreLoad,
     Weight,
 )
 from lgsens.model._roads import FlatRoad
 from lgsens.model._signals import AbstractSignal, prepared, signal_field
-from lgsens.model._turning_loads import FollowingForce, FullBushingLoad, RotationLoad
+from lgsens.model._turning_loads import FixedMoment, FollowingForce, LoadSum
 
 
 class Attached(NamedTuple):
@@ -48,11 +48,13 @@ class AbstractForce(eqx.Module):
     velocity [ẋ, Ω], ẋ in the inertial frame, Ω in that of the body. `lgsens.testing.check_force` checks a force.
 
     `preload_shape` is that of its `preload`, in which its force is linear, for `static_preload`; None: it has none.
-    `on_merged` says whether its loads on bodies that fixed joints merge are one load on what they are merged to.
+    `on_merged` says whether its loads on bodies that fixed joints merge are one load on what they are merged to;
+    `reads` is the name of the joint whose multipliers its loads depend on (`AbstractDynamicLoad`), None for almost all.
     """
 
     preload_shape: ClassVar[tuple[int, ...] | None] = None
     on_merged: ClassVar[bool] = False
+    reads: ClassVar[Any] = None
 
     @property
     @abc.abstractmethod
@@ -62,6 +64,10 @@ class AbstractForce(eqx.Module):
     def with_preload(self, preload) -> "AbstractForce":
         """The same element with this preload in the reference configuration."""
         return dataclasses.replace(self, preload=preload)
+
+    def on(self, joints: Mapping[str, AbstractJoint]) -> "AbstractForce":
+        """The same element, given the joints of the model, one of which it may act in."""
+        return self
 
     @abc.abstractmethod
     def loads(self, bodies: Mapping[str, RigidBody]) -> tuple[Attached, ...]:
@@ -166,61 +172,6 @@ class SpringDamper(AbstractForce):
         return (Attached(load, self.a, self.b),)
 
 
-class Bushing(AbstractForce):
-    """A rubber bushing in place of a joint: a spring and damper along, and about, each of three axes fixed to body a.
-
-        g = g₀ + K u + C u̇,     u the vector from the point on a to the point on b, in the frame of a
-        m = m₀ + K_r φ + C_r φ̇,     φ the rotation vector of b in a, |φ| < π, along the same axes
-
-    Arguments:
-        a, b: names of the two bodies; None is the ground.
-        at: where it is in the reference configuration [m], inertial frame, shape (3,): both points are there.
-        stiffness: the spring stiffnesses [N/m] along x, y and z of the inertial frame in the reference
-            configuration, shape (3,). The axes turn with a.
-        damping: the damping along the same axes [N s/m], shape (3,).
-        preload: the force g₀ that pulls b to a in the reference configuration [N], inertial frame, shape (3,).
-        rotational_stiffness, rotational_damping: K_r [N m/rad] and C_r [N m s/rad] about x, y and z of the inertial
-            frame in the reference configuration, shape (3,); None: 0.
-        rotational_preload: the moment m₀ that turns b back there [N m], inertial frame, shape (3,); None: 0.
-
-    With none of the last three it resists no rotation, and costs nothing for it. The moments do the work −m·φ̇: on b
-    acts −m but for terms of second order in φ. A force between bodies that is stiffer by orders than the others makes
-    explicit integrators take as many more steps; generalized-α does not mind. Raises `ValueError` for wrong shapes.
-    """
-
-    a: str | None = eqx.field(static=True)
-    b: str | None = eqx.field(static=True)
-    at: Float[Array, "3"] = point_field("at")
-    stiffness: Float[Array, "3"] = point_field("stiffness")
-    damping: Float[Array, "3"] = point_field("damping", default=(0.0, 0.0, 0.0))
-    preload: Float[Array, "3"] = point_field("preload", default=(0.0, 0.0, 0.0))
-    rotational_stiffness: Float[Array, "3"] | None = point_field("rotational_stiffness", default=None)
-    rotational_damping: Float[Array, "3"] | None = point_field("rotational_damping", default=None)
-    rotational_preload: Float[Array, "3"] | None = point_field("rotational_preload", default=None)
-
-    @property
-    def bodies(self):
-        return (self.a, self.b)
-
-    preload_shape = (3,)
-
-    def loads(self, bodies):
-        a, b = (_frame(bodies, name, self.at.dtype) for name in (self.a, self.b))
-        back = a.orientation.T
-        load = BushingLoad(
-            point_a=a.local_point(self.at),
-            point_b=b.local_point(self.at),
-            stiffness=(back * self.stiffness[None]) @ a.orientation,
-            damping=(back * self.damping[None]) @ a.orientation,
-            preload=a.local_axis(self.preload),
-        )
-        about = self.rotational_stiffness, self.rotational_damping, self.rotational_preload
-        if any(numbers is not None for numbers in about):
-            about = (jnp.zeros_like(self.at) if numbers is None else numbers for numbers in about)
-            load = FullBushingLoad(load, RotationLoad(back, b.orientation.T, *about))
-        return (Attached(load, self.a, self.b),)
-
-
 class TyreSpring(AbstractForce):
     """A tyre as a vertical spring on a road: F_z = F₀ + k (z_road(t) + ℓ₀ − z), on a point of a body.
 
@@ -232,10 +183,12 @@ class TyreSpring(AbstractForce):
         free_radius: height ℓ₀ of the wheel centre over the road at which the tyre is free [m], shape ().
         preload: force F₀ in the reference configuration on a road of height 0 [N], shape (). ℓ₀ is then the
             reference height of the wheel centre.
+        rounding: w [m], shape (), > 0, of a tyre that lifts off: within ±w of the height at which it is free its force
+            passes to zero with two continuous derivatives, and outside it is F_z or none, no less. None: see below.
 
     Give `free_radius` or `preload`, not both; with neither the tyre is free in the reference
-    configuration. The spring also pulls: bound its force from below (eq. 48) to keep contact. z is vertical.
-    Raises `ValueError` for both, or wrong shapes. Source: Sonneville & Brüls (2014), §9.
+    configuration. Without `rounding` the spring also pulls: bound its force from below (eq. 48) to keep contact. z is
+    vertical. Raises `ValueError` for both, a rounding ≤ 0 or wrong shapes. Source: Sonneville & Brüls (2014), §9.
     """
 
     body: str = eqx.field(static=True)
@@ -244,8 +197,10 @@ class TyreSpring(AbstractForce):
     road: AbstractSignal = signal_field("road", default_factory=FlatRoad)
     free_radius: Float[Array, ""] | None = number_field("free_radius", default=None)
     preload: Float[Array, ""] | None = number_field("preload", default=None)
+    rounding: Float[Array, ""] | None = number_field("rounding", default=None)
 
     def __check_init__(self):
+        require_positive(self, "rounding")
         if self.free_radius is not None and self.preload is not None:
             raise ValueError(
                 "TyreSpring: give `free_radius` or `preload`, not both: each determines the other "
@@ -268,6 +223,7 @@ class TyreSpring(AbstractForce):
             free_radius=self.at[2] if self.free_radius is None else self.free_radius,
             preload=jnp.zeros((), self.at.dtype) if self.preload is None else self.preload,
             road=prepared(self.road),
+            rounding=self.rounding,
         )
         return (Attached(load, None, self.body),)
 
@@ -277,14 +233,15 @@ def _one() -> FlatRoad:
 
 
 class AppliedForce(AbstractForce):
-    """A given force on a point of a body and a given moment on it, times a signal: s(t) f and s(t) m.
+    """A given force on a point of a body and given moments on it, times a signal: s(t) f, s(t) m and s(t) m₀.
 
     Arguments:
         body: name of the body.
         at: point of application in the reference configuration [m], inertial frame, shape (3,); None: the
             centre of mass.
         force: the force f [N], inertial frame, shape (3,).
-        moment: the moment m [N m], body frame, shape (3,).
+        moment: the moment m [N m], body frame, shape (3,), which turns with the body.
+        fixed_moment: the moment m₀ [N m], inertial frame, shape (3,), which does not; None: 0.
         signal: the factor s(t) [–], an `AbstractSignal` (default: 1).
         follows: whether the force turns with the body; f is then that in the reference configuration.
 
@@ -295,6 +252,7 @@ class AppliedForce(AbstractForce):
     at: Float[Array, "3"] | None = point_field("at", default=None)
     force: Float[Array, "3"] = point_field("force", default=(0.0, 0.0, 0.0))
     moment: Float[Array, "3"] = point_field("moment", default=(0.0, 0.0, 0.0))
+    fixed_moment: Float[Array, "3"] | None = point_field("fixed_moment", default=None)
     signal: AbstractSignal = signal_field("signal", default_factory=_one)
     follows: bool = eqx.field(static=True, default=False, kw_only=True)
 
@@ -307,4 +265,6 @@ class AppliedForce(AbstractForce):
         kind, force = (FollowingForce, frame.local_axis(self.force)) if self.follows else (PointForce, self.force)
         at = bodies[self.body].position if self.at is None else self.at
         load = kind(frame.local_point(at), force, self.moment, prepared(self.signal))
+        if self.fixed_moment is not None:
+            load = LoadSum((load, FixedMoment(self.fixed_moment, load.signal)))
         return (Attached(load, None, self.body),)

@@ -56,7 +56,8 @@ class AbstractJoint(eqx.Module):
     A joint of one's own has these two names, leaves for its numbers, and `constraints`. It is `assembled` if the
     reference configuration satisfies it by construction; others are assembled before the motion starts. It is `rigid`
     if its bodies move as one, which `Model(merge_fixed=True)` makes of them. `coordinates` are those that it leaves its
-    bodies, functions of the pose of its frame on b in that on a (`lgsens.model.Coordinate`), for `Trajectory.joint`.
+    bodies, functions of the pose of its frame on b in that on a (`lgsens.model.Coordinate`), for `Trajectory.joint`;
+    `slips` are the velocities [ẋ, ω], 0 … 5, of that frame in that on a with which its surfaces slip, for friction.
     """
 
     a: eqx.AbstractVar[str | None]
@@ -64,6 +65,7 @@ class AbstractJoint(eqx.Module):
     assembled: ClassVar[Any] = False
     rigid: ClassVar[bool] = False
     coordinates: ClassVar[tuple[Coordinate, ...]] = ()
+    slips: ClassVar[tuple[int, ...]] = ()
 
     @property
     def others(self) -> tuple[str, ...]:
@@ -113,6 +115,7 @@ class SphericalJoint(AbstractJoint):
 
     assembled = True
     coordinates = ROTATION_VECTOR
+    slips = (3, 4, 5)
     frames = frames_at
 
     def constraints(self, a, b):
@@ -137,6 +140,7 @@ class RevoluteJoint(AbstractJoint):
 
     assembled = True
     coordinates = (ANGLE,)
+    slips = (3,)
     frames = frames_at
 
     @property
@@ -220,6 +224,7 @@ class PrismaticJoint(AbstractJoint):
 
     assembled = True
     coordinates = (DISPLACEMENT,)
+    slips = (0,)
     frames = frames_at
 
     def constraints(self, a, b):
@@ -249,6 +254,7 @@ class CylindricalJoint(AbstractJoint):
 
     assembled = True
     coordinates = (ANGLE, DISPLACEMENT)
+    slips = (0, 3)
     frames = frames_at
 
     def constraints(self, a, b):

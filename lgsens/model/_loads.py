@@ -17,7 +17,6 @@ from jaxtyping import Array, Float
 from lgsens.liegroups import cross, skew
 from lgsens.model._elements import AbstractElement, body_fixed
 from lgsens.model._frames import (
-    BODY_B,
     BODY_DIM,
     ROTATION,
     ROTATION_A,
@@ -62,11 +61,13 @@ class AbstractDynamicLoad(AbstractElement):
     """A force between two bodies that depends on states of its own, which obey ż = g(q, v, z, t).
 
     A state is the velocity of a coordinate with unit mass, of which an element has as many as states: then Q and g
-    together are one generalized force, and autodiff gives the tangents of both. `states` are their names, one or more;
-    `balanced` as in `AbstractLoad`.
+    together are one generalized force, and autodiff gives the tangents of both. `states` are their names; `balanced` as
+    in `AbstractLoad`. A load that depends on the multipliers of a joint (`AbstractForce.reads`) says in its `reads` how
+    many each basic constraint of the joint has: they follow the states in z.
     """
 
     states: ClassVar[Any]
+    reads: ClassVar[Any] = ()
     balanced: ClassVar[bool] = False
     drawn = "spring"
 
@@ -111,7 +112,7 @@ def num_states(load: Any) -> int:
 def generalized_force(load: Any, a: Frame, b: Frame, va, vb, t, *z) -> Float[Array, " n"]:
     """Q, and where there are states z the force g on their carriers, n = 12 + 6 for each three of them."""
     force = load.force(a, b, va, vb, t, *z)
-    if not z:
+    if not num_states(load):
         return force
     rate = load.rate(a, b, va, vb, t, *z)
     zeros = jnp.zeros(BODY_DIM * (2 + len(carriers(rate.shape[0]))), force.dtype)
@@ -255,6 +256,11 @@ class BushingLoad(AbstractClosedFormLoad):
         gradient = jnp.concatenate([-back, skew(r), back, -back @ b.orientation @ skew(self.point_b)], axis=1)
         return r, gradient
 
+    def stretch(self, a, b, va, vb) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """u and u̇."""
+        r, gradient = self._gradient(a, b)
+        return r - self.point_a, gradient @ jnp.concatenate([va, vb])
+
     def _tension(self, r, gradient, va, vb):
         """g, on a, in the frame of a."""
         rate = gradient @ jnp.concatenate([va, vb])
@@ -284,38 +290,6 @@ class BushingLoad(AbstractClosedFormLoad):
         )
         position = gradient.T @ (self.stiffness @ gradient + self.damping @ rate) + geometric
         return LoadTangents(-position, -gradient.T @ self.damping @ gradient)
-
-
-class TyreLoad(AbstractClosedFormLoad):
-    """A vertical spring between the road and a point of b: F_z = F₀ + k (z_road(t) − z + ℓ₀), along the inertial z.
-
-    With e_z the vertical, d the point and D_b = [I, −R_b X̃_b] its gradient: Q_b = F_z D_bᵀ e_z,
-    ∂Q/∂q = −k D_bᵀ e_z e_zᵀ D_b + D_q(Dᵀ f)|_{f = F_z e_z}.
-    """
-
-    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
-    stiffness: Float[Array, ""]
-    free_radius: Float[Array, ""]
-    preload: Float[Array, ""]
-    road: AbstractSignal
-
-    drawn = "wheel"
-
-    def measure(self, a, b, va, vb, t) -> Float[Array, ""]:
-        return self.preload + self.stiffness * (self.road(t) + self.free_radius - b.point(self.point_b)[2])
-
-    def _vertical(self, a, b):
-        up = jnp.asarray([0.0, 0.0, 1.0], self.point_b.dtype)
-        return jnp.concatenate([jnp.zeros(BODY_B.start, up.dtype), up, cross(self.point_b, b.orientation[2])])
-
-    def force(self, a, b, va, vb, t):
-        return self.measure(a, b, va, vb, t) * self._vertical(a, b)
-
-    def tangents(self, a, b, va, vb, t):
-        vertical = self._vertical(a, b)
-        force = self.measure(a, b, va, vb, t) * jnp.asarray([0.0, 0.0, 1.0], vertical.dtype)
-        geometric = separation_stiffness(a, b, jnp.zeros_like(self.point_b), self.point_b, force)
-        return LoadTangents(geometric - self.stiffness * jnp.outer(vertical, vertical), None)
 
 
 class PointForce(AbstractClosedFormLoad):

@@ -119,7 +119,7 @@ class Model(eqx.Module):
             self._check_connection(f"Joint {name!r}", (joint.a, joint.b))
             self._check_connection(f"Joint {name!r}", joint.others)
         for name, force in self.forces.items():
-            self._check_connection(f"Force {name!r}", force.bodies)
+            self._check_connection(f"Force {name!r}", force.on(self.joints).bodies)
         self._check_duplicates()
         if self._groups is not None and all(group.name is None for group in self._groups):
             raise ValueError("Model: fixed joints hold all bodies on the ground; let at least one of them move.")
@@ -167,6 +167,11 @@ class Model(eqx.Module):
             system = assemble(bodies, frames, self.joints, self.forces)
         else:
             system = assemble_merged(bodies, frames, self.joints, self.forces, self._groups)
+        if system.reads_multipliers and self.redundant == "minimum_norm":
+            raise ValueError(
+                "Model: friction from the forces of a joint needs multipliers that are unique, and redundant="
+                "'minimum_norm' does not have them; remove the redundant equations, or take own_forces=False."
+            )
         return dataclasses.replace(
             system, linear_solver=self.linear_solver, minimum_norm=self.redundant == "minimum_norm"
         )

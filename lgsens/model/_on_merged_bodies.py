@@ -147,6 +147,10 @@ class _CarriedDynamicLoad(AbstractDynamicLoad):
     def states(self):
         return self.element.states
 
+    @property
+    def reads(self):
+        return self.element.reads
+
     def force(self, a, b, va, vb, t, z):
         return _carried_force(self, a, b, va, vb, t, z)
 

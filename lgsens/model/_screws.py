@@ -5,6 +5,7 @@ from there to where it is needs to be known: it is small, whatever the number of
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -16,13 +17,22 @@ from lgsens.model._frames import Frame, normals
 from lgsens.model._free import TRANSLATIONS, single_rotation
 from lgsens.model._joints import AbstractJoint, CylindricalJoint
 from lgsens.model._relative import ANGLE, DISPLACEMENT, frames_at
+from lgsens.model._signals import (
+    AbstractSignal,
+    Prescribed,
+    at_time,
+    prepared,
+    prescribed_field,
+    require_ratio,
+)
 from lgsens.model._stack import constraint_force, constraint_jacobian, constraint_stiffness
 
 
 class Advance(AbstractClosedFormConstraint):
-    """b advances along an axis of a as it turns about another: Φ = s − ρ θ; λ is a force [N].
+    """b advances along an axis of a as it turns about another: Φ = s − ρ θ, or s − f(θ); λ is a force [N].
 
-    s as in `InPlane`, and θ the angle about the normal of `first_a` and `second_a`, from the turn at which s = ρ θ.
+    s as in `InPlane`, and θ the angle about the normal of `first_a` and `second_a`, that which is nearest to s/ρ. With
+    B and K of s and of θ, f′ = ρ without a curve: B_s − f′ B_θ and K_s − f′ K_θ − λ f″ B_θᵀB_θ.
     """
 
     point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
@@ -31,7 +41,8 @@ class Advance(AbstractClosedFormConstraint):
     first_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
     second_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
     first_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
-    per_radian: Float[Array, ""]  # ρ [m/rad]
+    per_radian: Prescribed  # ρ [m/rad]
+    travel: AbstractSignal | None  # f [m] over θ [rad]
 
     drawn = None
 
@@ -46,18 +57,27 @@ class Advance(AbstractClosedFormConstraint):
     def _line(self) -> InPlane:
         return InPlane(self.point_a, self.point_b, self.axis_a)
 
-    def _angle(self, from_angle) -> Angle:
-        return Angle(self.first_a, self.second_a, self.first_b, from_angle)
+    def _angle(self, from_angle: Array | float = 0.0) -> Angle:
+        return Angle(self.first_a, self.second_a, self.first_b, jnp.asarray(from_angle, self.first_a.dtype))
+
+    def _state(self, a, b, t):
+        """ρ, s and θ − s/ρ."""
+        per_radian, s = at_time(self.per_radian, t), self._line().value(a, b, t)[0]
+        return per_radian, s, self._angle(s / per_radian).value(a, b, t)[0]
 
     def value(self, a, b, t):
-        s = self._line().value(a, b, t)[0]
-        return -self.per_radian * self._angle(s / self.per_radian).value(a, b, t)
+        per_radian, s, rest = self._state(a, b, t)
+        return (-per_radian * rest if self.travel is None else s - self.travel(s / per_radian + rest))[None]
 
-    def _tangent(self, of, *arguments):
-        """Φ is linear in s and θ: of each what is asked."""
-        return of(self._line(), *arguments) - self.per_radian * of(
-            self._angle(jnp.zeros_like(self.per_radian)), *arguments
-        )
+    def _slopes(self, a, b, t):
+        """f′ and f″, or ρ and None."""
+        if self.travel is None:
+            return at_time(self.per_radian, t), None
+        per_radian, s, rest = self._state(a, b, t)
+        return jax.jvp(jax.grad(self.travel), (s / per_radian + rest,), (jnp.ones_like(s),))
+
+    def _tangent(self, of, a, b, *rest):
+        return of(self._line(), a, b, *rest) - self._slopes(a, b, rest[-1])[0] * of(self._angle(), a, b, *rest)
 
     def jacobian(self, a, b, t):
         return self._tangent(constraint_jacobian, a, b, t)
@@ -66,14 +86,18 @@ class Advance(AbstractClosedFormConstraint):
         return self._tangent(constraint_force, a, b, lam, t)
 
     def geometric_stiffness(self, a, b, lam, t):
-        return self._tangent(constraint_stiffness, a, b, lam, t)
+        stiffness, bend = self._tangent(constraint_stiffness, a, b, lam, t), self._slopes(a, b, t)[1]
+        if bend is None:
+            return stiffness
+        (row,) = constraint_jacobian(self._angle(), a, b, t)
+        return stiffness - lam[0] * bend * jnp.outer(row, row)
 
 
-def _advance(a: Frame, b: Frame, at, along, axis, per_radian) -> Advance:
+def _advance(a: Frame, b: Frame, at, along, axis, per_radian, travel=None) -> Advance:
     _, first, second = normals(axis)
     points = a.local_point(at), b.local_point(at)
     axes = a.local_axis(along / jnp.linalg.norm(along)), a.local_axis(first), a.local_axis(second)
-    return Advance(*points, *axes, b.local_axis(first), per_radian)
+    return Advance(*points, *axes, b.local_axis(first), prepared(per_radian), prepared(travel))
 
 
 class ScrewJoint(AbstractJoint):
@@ -101,6 +125,7 @@ class ScrewJoint(AbstractJoint):
 
     assembled = True
     coordinates = (ANGLE, DISPLACEMENT)
+    slips = (0, 3)
     frames = frames_at
 
     @property
@@ -118,7 +143,7 @@ class ScrewJoint(AbstractJoint):
 
 
 class RackAndPinionJoint(AbstractJoint):
-    """The pinion `b` rolls along the rack `a`: its centre advances by s = r θ along the rack; 1 equation.
+    """The pinion `b` rolls along the rack `a`: its centre advances by s = r θ, or s = f(θ), along the rack; 1 equation.
 
     θ is its angle about `axis`, seen from the rack. A rack that slides in a housing, in which the pinion turns, moves
     by −s. Other joints hold the pinion's axis and the rack.
@@ -128,10 +153,15 @@ class RackAndPinionJoint(AbstractJoint):
         at: centre of the pinion in the reference configuration [m], inertial frame, shape (3,).
         axis: direction of its axis, inertial frame, shape (3,), any length > 0.
         direction: direction of the rack, inertial frame, shape (3,), any length > 0; at any angle to `axis`.
-        radius: r [m], shape (): travel per radian, negative for the other sense, not zero; any number of turns.
+        radius: r [m], shape (): travel per radian, negative for the other sense, not zero; any number of turns. Or a
+            signal of time: s, not its rate, is r(t) θ at every instant.
+        travel: f [m] over θ [rad] of a rack of variable ratio f′(θ), a signal of the angle in place of time, with two
+            continuous derivatives (`Sampled(angles, travels, "cubic")`); None: r θ. `radius` is its mean ratio then:
+            of the angles θ + 2πn that the poses do not tell apart that nearest to s/r is taken, so f departs from r θ
+            by less than π r. Unless f(0) = 0 the mechanism is assembled before it moves.
 
     The multiplier is the force of `b` on `a` along the rack [N]. Raises `ValueError` for a wrong shape, a zero
-    direction or a zero radius.
+    direction, a missing or zero radius, or a travel that is no signal. Source: Haug (1989), §3.4.
     """
 
     a: str | None = eqx.field(static=True)
@@ -139,14 +169,23 @@ class RackAndPinionJoint(AbstractJoint):
     at: Float[Array, "3"] = point_field("at")
     axis: Float[Array, "3"] = axis_field("axis")
     direction: Float[Array, "3"] = axis_field("direction")
-    radius: Float[Array, ""] = number_field("radius")
+    radius: Prescribed | None = prescribed_field("radius")
+    travel: AbstractSignal | None = eqx.field(default=None, kw_only=True, metadata={"over": "angle"})
 
     def __check_init__(self):
-        require_nonzero("RackAndPinionJoint", "radius", self.radius, " m; give the travel per radian")
+        require_ratio("RackAndPinionJoint", "radius", self.radius, " m; give the travel per radian")
+        if not isinstance(self.travel, AbstractSignal | None):
+            raise ValueError(
+                f"RackAndPinionJoint: `travel` must be a signal of the angle, got {self.travel!r}; a constant ratio is "
+                "`radius`."
+            )
 
-    assembled = True
+    @property
+    def assembled(self):
+        return self.travel is None
+
     coordinates = (ANGLE,)
     frames = frames_at
 
     def constraints(self, a, b):
-        return (_advance(a, b, self.at, self.direction, self.axis, self.radius),)
+        return (_advance(a, b, self.at, self.direction, self.axis, self.radius, self.travel),)

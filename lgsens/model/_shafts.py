@@ -5,22 +5,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_count, axis_field, number_field, point_field, require, require_nonzero
+from lgsens._validate import as_count, axis_field, point_field, require
 from lgsens.liegroups import cross
-from lgsens.model._constraints import AbstractClosedFormConstraint, AbstractConstraint, Orthogonality
+from lgsens.model._constraints import AbstractConstraint, ConstraintSum, Orthogonality
 from lgsens.model._elements import body_fixed
 from lgsens.model._frames import normals
-from lgsens.model._free import ROTATIONS
 from lgsens.model._joints import AbstractJoint, _coincidence
 from lgsens.model._relative import ROTATION_VECTOR, frames_at
+from lgsens.model._signals import Prescribed, at_time, prepared, prescribed_field, require_ratio
 
 
 class Gearing(AbstractConstraint):
     """Two gears have turned in the ratio ρ against the line d between them: Φ = φ_b − ρ φ_a; λ is a moment on b [N m].
 
-    With x along d in the reference configuration and orthogonal to the axis, and y = e × x, both fixed to a gear, that
-    gear has turned by φ = −atan2(y·d, x·d). Poses tell angles
-    but for whole turns, and Φ but for those of `teeth` times itself: these cancel if `teeth` times ρ is an integer.
+    d may be given, fixed in the inertial frame. With x along d in the reference configuration and orthogonal to the
+    axis, and y = e × x, both fixed to a gear, that gear has turned by φ = −atan2(y·d, x·d). Poses tell angles but for
+    whole turns, and Φ but for those of `teeth` times itself: these cancel if `teeth` times ρ is an integer.
     """
 
     point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
@@ -29,7 +29,8 @@ class Gearing(AbstractConstraint):
     second_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
     first_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
     second_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
-    ratio: Float[Array, ""]
+    line: Float[Array, "3"] | None
+    ratio: Prescribed
     teeth: int = eqx.field(static=True)
 
     drawn = None
@@ -40,17 +41,19 @@ class Gearing(AbstractConstraint):
 
     @property
     def relative(self):
-        return True
+        return self.line is None
 
     def value(self, a, b, t):
-        d = b.point(self.point_b) - a.point(self.point_a)
+        d = b.point(self.point_b) - a.point(self.point_a) if self.line is None else self.line
         turned = lambda frame, x, y: -jnp.arctan2(jnp.sum(frame.axis(y) * d), jnp.sum(frame.axis(x) * d))
-        angle = turned(b, self.first_b, self.second_b) - self.ratio * turned(a, self.first_a, self.second_a)
-        return (jnp.arctan2(jnp.sin(self.teeth * angle), jnp.cos(self.teeth * angle)) / self.teeth)[None]
+        ratio = at_time(self.ratio, t)
+        angle = turned(b, self.first_b, self.second_b) - ratio * turned(a, self.first_a, self.second_a)
+        turn = 2.0 * jnp.pi / self.teeth
+        return (angle - turn * jnp.round(angle / turn))[None]
 
 
 class GearJoint(AbstractJoint):
-    """Two gears turn in a fixed ratio, φ_b = ρ φ_a; 1 equation.
+    """Two gears turn in a ratio, φ_b = ρ φ_a; 1 equation.
 
     Their angles are seen from the line between their centres, so from what carries both, which may move, too: sun and
     planet roll on each other. Other joints hold the axes.
@@ -61,12 +64,15 @@ class GearJoint(AbstractJoint):
             the line between which has any direction but those of the axes.
         axis_a, axis_b: directions of their axes, inertial frame, shape (3,), any length > 0.
         ratio: ρ, shape (): turns of `b` about `axis_b` for one of `a` about `axis_a`; of an external pair with
-            parallel axes −n_a/n_b for n_a and n_b teeth.
+            parallel axes −n_a/n_b for n_a and n_b teeth. Or a signal of time: the angles, not their rates, have its
+            ratio at every instant, as a drive of variable ratio has it that is shifted with `a` near the reference.
         teeth: n_b or another count for which ratio · teeth is an integer: gears then turn any number of times. With
             another ratio, and for the derivative by the ratio, `a` is within half a turn of the reference.
+        line: a direction, fixed in the inertial frame, shape (3,), from which the angles are seen instead: of gears on
+            one axis, or any that a third part connects, in a housing that does not turn; None: that of the centres.
 
     The multiplier is the moment of `b` on the mesh about its axis [N m]: its negative drives `b`. Raises `ValueError`
-    for a wrong shape, a zero axis, centres along an axis, a zero ratio, or a count below 1.
+    for a wrong shape, a zero axis, a line along an axis, a zero ratio, or a count below 1. Source: Haug (1989), §3.4.
     """
 
     a: str | None = eqx.field(static=True)
@@ -75,84 +81,47 @@ class GearJoint(AbstractJoint):
     at_b: Float[Array, "3"] = point_field("at_b")
     axis_a: Float[Array, "3"] = axis_field("axis_a")
     axis_b: Float[Array, "3"] = axis_field("axis_b")
-    ratio: Float[Array, ""] = number_field("ratio")
+    ratio: Prescribed | None = prescribed_field("ratio")
     teeth: int = eqx.field(static=True, default=1, kw_only=True)
+    line: Float[Array, "3"] | None = point_field("line", default=None)
 
     def __check_init__(self):
-        require_nonzero("GearJoint", "ratio", self.ratio, "; a gear that does not turn is fixed by another joint")
+        require_ratio("GearJoint", "ratio", self.ratio, "; a gear that does not turn is fixed by another joint")
         as_count(self.teeth, "teeth")
         for name, axis in (("axis_a", self.axis_a), ("axis_b", self.axis_b)):
             require(
-                lambda a, b, e: np.linalg.norm(np.cross(b - a, e)) > 1e-6 * np.linalg.norm(b - a) * np.linalg.norm(e),
-                f"GearJoint: the line from `at_a` {self.at_a} to `at_b` {self.at_b} is along `{name}` {axis}; give the "
-                "centres of the gears, each on its own axis.",
-                self.at_a,
-                self.at_b,
+                lambda d, e: np.linalg.norm(np.cross(d, e)) > 1e-6 * np.linalg.norm(d) * np.linalg.norm(e),
+                f"GearJoint: the line from `at_a` {self.at_a} to `at_b` {self.at_b}, or `line` {self.line}, is along "
+                f"`{name}` {axis}; give the centres of the gears, each on its own axis, and of gears on one axis a "
+                "`line` across it.",
+                self._line,
                 axis,
             )
 
     assembled = True
 
+    @property
+    def _line(self):
+        return self.at_b - self.at_a if self.line is None else self.line
+
     def constraints(self, a, b):
-        d = self.at_b - self.at_a
+        d = self._line
         marks = []
         for frame, axis in ((a, self.axis_a), (b, self.axis_b)):
             second = cross(axis, d)
             first = cross(second, axis)
             marks += [frame.local_axis(mark / jnp.linalg.norm(mark)) for mark in (first, second)]
         centres = a.local_point(self.at_a), b.local_point(self.at_b)
-        return (Gearing(*centres, *marks, ratio=self.ratio, teeth=self.teeth),)
-
-
-class NoTwist(AbstractClosedFormConstraint):
-    """b is bent against a, and not twisted: Φ = (y_a·x_b − x_a·y_b)/2; λ is a moment [N m].
-
-    With x, y orthogonal to a shaft of each body, the rotation between both is exp(ñ) with n orthogonal to the shaft
-    where its skew part has no entry of x and y. `xy` is −x_a·y_b/2 and `yx` is y_a·x_b/2.
-    """
-
-    xy: Orthogonality
-    yx: Orthogonality
-
-    drawn = None
-
-    @property
-    def num_rows(self):
-        return 1
-
-    @property
-    def relative(self):
-        return True
-
-    @property
-    def acts_on(self):
-        return self.xy.acts_on
-
-    @property
-    def coupled(self):
-        return self.xy.coupled
-
-    def violable(self, free):
-        return (bool(free & {*ROTATIONS}),)
-
-    def value(self, a, b, t):
-        return self.xy.value(a, b, t) + self.yx.value(a, b, t)
-
-    def jacobian(self, a, b, t):
-        return self.xy.jacobian(a, b, t) + self.yx.jacobian(a, b, t)
-
-    def force(self, a, b, lam, t):
-        return self.xy.force(a, b, lam, t) + self.yx.force(a, b, lam, t)
-
-    def geometric_stiffness(self, a, b, lam, t):
-        return self.xy.geometric_stiffness(a, b, lam, t) + self.yx.geometric_stiffness(a, b, lam, t)
+        return (Gearing(*centres, *marks, line=self.line, ratio=prepared(self.ratio), teeth=self.teeth),)
 
 
 class ConstantVelocityJoint(AbstractJoint):
     """Two shafts meet in a point and turn alike whatever the angle between them; 4 equations.
 
     One is turned into the direction of the other about an axis orthogonal to both, without twist: both see each other
-    mirrored in the plane between them, so their angular velocities along themselves are equal.
+    mirrored in the plane between them, so their angular velocities along themselves are equal. With x, y orthogonal to
+    a shaft of each body, the rotation between both is exp(ñ) with n orthogonal to the shaft where its skew part has no
+    entry of x and y: (y_a·x_b − x_a·y_b)/2 = 0.
 
     Arguments:
         a, b: names of the two bodies; None is the ground.
@@ -162,6 +131,7 @@ class ConstantVelocityJoint(AbstractJoint):
 
     The multipliers are the force of `b` on `a` [N], and the moment about the shafts [N m] for a straight joint, 2/(1 +
     cos β) of it at an angle β. Raises `ValueError` for a wrong shape, a zero axis, or shafts at a right angle or more.
+    Source: Seherr-Thoss, Schmelz & Aucktor, Universal Joints and Driveshafts (2nd ed. 2006), chapter 2.
     """
 
     a: str | None = eqx.field(static=True)
@@ -192,4 +162,4 @@ class ConstantVelocityJoint(AbstractJoint):
         (x_a, y_a), (x_b, y_b) = across_a, map(turned, across_a)
         pairs = ((-0.5 * x_a, y_b), (0.5 * y_a, x_b))
         xy, yx = (Orthogonality(a.local_axis(of_a), b.local_axis(of_b)) for of_a, of_b in pairs)
-        return (_coincidence(a, b, self.at), NoTwist(xy, yx))
+        return (_coincidence(a, b, self.at), ConstraintSum((xy, yx)))

@@ -33,7 +33,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float, number_field, require
+from lgsens._validate import as_float, number_field, require, require_nonzero
 
 _KINDS = ("linear", "cubic", "monotone")
 
@@ -274,8 +274,8 @@ def at_time(value: Prescribed, t) -> Float[Array, ""]:
     return value(t) if isinstance(value, AbstractSignal) else value
 
 
-def number_of(value: Prescribed) -> Float[Array, ""] | None:
-    """A number; None: a signal."""
+def number_of(value: Prescribed | None) -> Float[Array, ""] | None:
+    """A number; None: a signal, or nothing."""
     return None if isinstance(value, AbstractSignal) else value
 
 
@@ -284,6 +284,14 @@ def _no_signal(name: str, what: str, value: Any) -> ValueError:
         f"`{name}` must be {what} (Harmonic, Polynomial, Ramp, Sampled, or a subclass of AbstractSignal, whose numbers "
         f"are leaves), got {value!r}."
     )
+
+
+def require_ratio(what: str, name: str, value: Prescribed | None, advice: str) -> None:
+    """Raise `ValueError` for the ratio of a transmission that is missing, or a number and zero."""
+    if value is None:
+        raise ValueError(f"{what}: `{name}` is missing; give a number, or a signal.")
+    if not isinstance(value, AbstractSignal):
+        require_nonzero(what, name, value, advice)
 
 
 def signal_field(name: str, **default: Any) -> Any:

@@ -5,7 +5,7 @@ vmapped kernel, so what is compiled grows with the number of element types, not 
 """
 
 from collections.abc import Sequence
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.liegroups import Pose, R3xSO3
+from lgsens.linear import chosen
 from lgsens.model._constraints import (
     AbstractClosedFormConstraint,
     AbstractConstraint,
@@ -40,7 +41,7 @@ Element = TypeVar("Element", AbstractRows, AbstractLoad | AbstractDynamicLoad)
 class Placed(NamedTuple, Generic[Element]):
     """An element or a `StackRow`, the numbers of its two bodies (None: the ground), the name of its owner; of a
     constraint, which of its equations are kept, which one of its joint's it is, and further bodies; of a load, what
-    carries its states.
+    carries its states, and the joint whose multipliers it reads.
     """
 
     element: Element | StackRow
@@ -50,6 +51,7 @@ class Placed(NamedTuple, Generic[Element]):
     kept: tuple[bool, ...] = ()
     place: int = 0
     carriers: tuple[int, ...] = ()
+    joint: str | None = None
 
 
 class AtEnds(NamedTuple):
@@ -71,7 +73,8 @@ class Stack(eqx.Module, Generic[Element]):
     owners: tuple[str, ...] = eqx.field(static=True)
     kept: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
     places: tuple[int, ...] = eqx.field(static=True)
-    carriers: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())  # or others; as `a` and `b`
+    carriers: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())  # of states, or others; as `a` and `b`
+    joints: tuple[str, ...] = eqx.field(static=True, default=())  # whose multipliers its elements read, if any
 
     def __check_init__(self):
         name, acts_on = type(self.elements).__name__, self.elements.acts_on
@@ -100,12 +103,15 @@ class Stack(eqx.Module, Generic[Element]):
         ends = self.ends
         return entries_at(arrays, ends.own[ends.places(ends.acts_on)])
 
-    def states(self, twist: Float[Array, "N 6"]) -> tuple[Float[Array, "e s"], ...]:
-        """The states of its elements, if these have any, from [ẋ, Ω] of the bodies."""
-        if not self.carriers:
-            return ()
-        translations = [twist[np.asarray(of), : ROTATION.start] for of in self.carriers]
-        return (jnp.concatenate(translations, axis=1)[:, : num_states(self.elements)],)
+    def inputs(self, twist: Float[Array, "N 6"], lam, read: np.ndarray) -> tuple[Float[Array, "e s"], ...]:
+        """The states of its elements, from [ẋ, Ω] of the bodies, and the multipliers that they `read`, if any."""
+        parts = []
+        if self.carriers:
+            translations = [twist[np.asarray(of), : ROTATION.start] for of in self.carriers]
+            parts.append(jnp.concatenate(translations, axis=1)[:, : num_states(self.elements)])
+        if read.size:
+            parts.append(chosen(lam, read))
+        return (jnp.concatenate(parts, axis=1),) if len(parts) > 1 else tuple(parts)
 
     def others(self, q: Pose) -> tuple[Frame, ...]:
         """The frames of the further bodies of constraints (`AbstractJoint.others`)."""
@@ -118,12 +124,15 @@ class Stack(eqx.Module, Generic[Element]):
         found = Ends(self.a, self.b, self.owners, self.kept, acts_on=self.elements.acts_on)
         if not isinstance(self.elements, AbstractRows):
             places = places_of_states(num_states(self.elements))
-            return found._replace(carriers=self.carriers, acts_on=(*found.acts_on, *places))
-        velocity, relative = isinstance(self.elements, AbstractVelocityConstraint), self.elements.relative
+            read = tuple((joint, cast(Any, self.elements).reads) for joint in self.joints)
+            return found._replace(carriers=self.carriers, acts_on=(*found.acts_on, *places), read=read)
+        velocity = isinstance(self.elements, AbstractVelocityConstraint)
         if self.carriers:
             every = tuple(range(BODY_DIM * (2 + len(self.carriers))))
-            return found._replace(carriers=self.carriers, acts_on=every, coupled=(every,), velocity=velocity)
-        return found._replace(relative=relative, coupled=self.elements.coupled, velocity=velocity)
+            found = found._replace(carriers=self.carriers, acts_on=every)
+            return found._replace(coupled=(every,), velocity=velocity, nth=self.places)
+        relative, coupled = self.elements.relative, self.elements.coupled
+        return found._replace(relative=relative, coupled=coupled, velocity=velocity, nth=self.places)
 
     def only(self, i: int) -> "Stack[Element]":
         """The stack of one of its elements."""
@@ -131,7 +140,7 @@ class Stack(eqx.Module, Generic[Element]):
         a, b = (None if side is None else side[own] for side in (self.a, self.b))
         elements = jax.tree.map(lambda leaf: leaf[own], self.elements)
         carriers = tuple(of[own] for of in self.carriers)
-        return Stack(elements, a, b, self.owners[own], self.kept[own], self.places[own], carriers)
+        return Stack(elements, a, b, self.owners[own], self.kept[own], self.places[own], carriers, self.joints[own])
 
     def map(self, function, ends: AtEnds, extra: Sequence[Any] = ()):
         """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra, *others)` for each; `ends`: of `at_ends`.
@@ -199,6 +208,7 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
                 kept=tuple(m.kept for m in members),
                 places=tuple(m.place for m in members),
                 carriers=tuple(zip(*(m.carriers for m in members))),
+                joints=tuple(m.joint for m in members if m.joint is not None),
             )
         )
     return tuple(sorted(stacks, key=lambda stack: stack.ends.velocity))
@@ -275,7 +285,15 @@ def load_tangents(element: AbstractLoad | AbstractDynamicLoad, a: Frame, b: Fram
     velocity = jax.jacfwd(lambda x: force(a, b, va + x[BODY_A], vb + x[BODY_B], *z))(zero)
     if z:
         wide = jnp.zeros((len(position), len(position)), zero.dtype)
-        by_states = jax.jacfwd(lambda z: force(a, b, va, vb, z))(*z)
         position, velocity = (wide.at[:, : 2 * BODY_DIM].set(part) for part in (position, velocity))
-        velocity = velocity.at[:, np.asarray(places_of_states(len(*z)))].set(by_states)
+        if count := num_states(element):
+            by_states = jax.jacfwd(lambda z: force(a, b, va, vb, z))(*z)[:, :count]
+            velocity = velocity.at[:, np.asarray(places_of_states(count))].set(by_states)
     return LoadTangents(position, velocity)
+
+
+def load_by_multipliers(element: AbstractDynamicLoad, a: Frame, b: Frame, va, vb, t, z) -> Float[Array, "n r"]:
+    """∂Q/∂λ, and ∂g/∂λ, of one element that reads multipliers."""
+    states, lam = jnp.split(z, [num_states(element)])
+    at = lambda lam: generalized_force(element, a, b, va, vb, t, jnp.concatenate([states, lam]))
+    return jax.jacfwd(at)(lam)

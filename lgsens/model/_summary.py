@@ -63,7 +63,7 @@ def summarize(
         [(name, type(joint).__name__, _ends((joint.a, joint.b)), equations[name]) for name, joint in joints.items()]
     )
     lines += [f"Force elements ({len(forces)}): type, bodies"]
-    lines += _columns([(name, type(force).__name__, _ends(force.bodies)) for name, force in forces.items()])
+    lines += _columns([(name, type(force).__name__, _ends(force.on(joints).bodies)) for name, force in forces.items()])
     totals = [
         ("Unknown coordinates", coordinates),
         ("Constraint equations", len(constraint_names)),

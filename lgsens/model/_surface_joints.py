@@ -33,6 +33,7 @@ class PlanarJoint(AbstractJoint):
 
     assembled = True
     coordinates = (*IN_PLANE, ANGLE)
+    slips = (1, 2, 3)
     frames = frames_at
 
     @property

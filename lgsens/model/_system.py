@@ -1,5 +1,6 @@
 """The multibody system: an `AbstractSystem` on (R³ × SO(3))^N or a subgroup of it, assembled by element type."""
 
+import dataclasses
 from functools import partial
 from typing import Any
 
@@ -25,6 +26,7 @@ from lgsens.model._stack import (
     constraint_force,
     constraint_jacobian,
     constraint_stiffness,
+    load_by_multipliers,
     load_tangents,
     square_blocks,
     state_coordinates,
@@ -218,9 +220,6 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             for owner, places in zip(stack.owners, state_coordinates(stack, self.index))
         }
 
-    def mass_matrix(self):
-        return self.sparse_mass_matrix().dense()
-
     def sparse_mass_matrix(self):
         translation = self.mass[:, None, None] * jnp.eye(ROTATION.start, dtype=self.mass.dtype)[None]
         none = jnp.zeros_like(translation)
@@ -249,6 +248,11 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         """Whether a body has three rotations: Ω × J Ω of one about a body axis has no component along it."""
         return bool((self.index[:, ROTATION] >= 0).all(axis=1).any())
 
+    def _acting(self, q, twist, lam, t, patterns):
+        """Each stack of loads, its ends, what its elements are given besides, and its pattern."""
+        for stack, ends, read, pattern in zip(self.loads, at_ends(self.loads, q, twist), self.topology.read, patterns):
+            yield stack, ends, (t, *stack.inputs(twist, lam, read.rows)), pattern
+
     @_traced_once
     def residual(self, q, v, vdot, lam, t):
         q, twist, acceleration = self._placed(q), self.twists(v), self.twists(vdot)
@@ -260,8 +264,8 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             moment = moment + jax.vmap(cross)(spin, turned(self.inertia, spin))
         topology = self.topology
         forces = [(jnp.concatenate([force, moment], axis=1), topology.mass.rows)]
-        for stack, ends, coordinates in zip(self.loads, at_ends(self.loads, q, twist), topology.forces):
-            force = stack.map(generalized_force, ends, (t, *stack.states(twist)))
+        for stack, ends, inputs, coordinates in self._acting(q, twist, lam, t, topology.forces):
+            force = stack.map(generalized_force, ends, inputs)
             forces.append((-stack.acting(force), coordinates))
         for stack, ends, pattern in zip(self.constraints, at_ends(self.constraints, q), topology.jacobian):
             force = stack.map(constraint_force, ends, (chosen(lam, pattern.rows), t))
@@ -308,9 +312,6 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         ]
         return SparseMatrix(tuple(parts), (self.topology.num_constraints, self.group.dim), self.mass.dtype)
 
-    def tangents(self, q, v, vdot, lam, t):
-        return Tangents(*(matrix.dense() for matrix in self.sparse_tangents(q, v, vdot, lam, t)))
-
     @_traced_once
     def sparse_tangents(self, q, v, vdot, lam, t):
         q, twist, topology = self._placed(q), self.twists(v), self.topology
@@ -320,9 +321,9 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             momentum = jnp.einsum("nij,nj->ni", self.inertia, spin)
             gyroscopic = jax.vmap(skew)(spin) @ self.inertia - jax.vmap(skew)(momentum)
             damping.append(Blocks(gyroscopic, topology.gyroscopic))
-        for stack, ends, pattern in zip(self.loads, at_ends(self.loads, q, twist), topology.loads):
+        for stack, ends, inputs, pattern in self._acting(q, twist, lam, t, topology.loads):
             own = stack.ends.own
-            position, velocity = stack.map(load_tangents, ends, (t, *stack.states(twist)))
+            position, velocity = stack.map(load_tangents, ends, inputs)
             if position is not None:
                 stiffness.append(Blocks(-square_blocks(position, own), pattern))
             if velocity is not None:
@@ -333,18 +334,16 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
             stiffness.extend(Blocks(square_blocks(block, places), pattern) for places, pattern in coupled)
         return Tangents(self._square(stiffness), self._square(damping), self.sparse_constraint_jacobian(q, t))
 
-    def measure(self, force: str, q, v, t):
-        """The `measure` of the load of the force element `force` at each of the stacked poses, velocities and times."""
-        found = [stack.only(i) for stack in self.loads for i, owner in enumerate(stack.owners) if owner == force]
-        if not found:
-            known = {owner for stack in self.loads for owner in stack.owners}
-            raise ValueError(f"`force`: {suggestion(force, known)}.")
-        if len(found) > 1:
-            raise ValueError(f"`force`: {force!r} acts on {len(found)} bodies and has no single value.")
+    @property
+    def reads_multipliers(self):
+        return any(read.rows.size for read in self.topology.read)
 
-        def at_time(q, v, t):
-            twist = self.twists(v)
-            (ends,) = at_ends(found, self._placed(q), twist)
-            return found[0].map(lambda e, *args: e.measure(*args), ends, (t, *found[0].states(twist)))
-
-        return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(at_time)(q, v, t))
+    @_traced_once
+    def multiplier_jacobian(self, q, v, lam, t):
+        transposed, twist, topology = self.sparse_constraint_jacobian(q, t), self.twists(v), self.topology
+        for stack, ends, inputs, pattern in self._acting(self._placed(q), twist, lam, t, topology.read):
+            if pattern.rows.size:
+                columns = jnp.swapaxes(stack.map(load_by_multipliers, ends, inputs), 1, 2)
+                part = Blocks(-stack.acting(columns), pattern)
+                transposed = dataclasses.replace(transposed, parts=(*transposed.parts, part))
+        return transposed.T

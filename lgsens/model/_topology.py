@@ -22,6 +22,8 @@ class Ends(NamedTuple):
     acts_on: tuple[int, ...] = ALL  # likewise, and of loads
     velocity: bool = False  # of constraints, whether their rows have velocity level only
     carriers: tuple[tuple[int, ...], ...] = ()  # of loads with states: the bodies that carry them
+    nth: tuple[int, ...] = ()  # of constraints: which of its joint's each is
+    read: tuple[tuple[str, tuple[int, ...]], ...] = ()  # of loads: the joint whose multipliers each reads
 
     @property
     def _sides(self) -> list[tuple[int, tuple[int, ...]]]:
@@ -67,10 +69,25 @@ class Topology:
             for rows, ends in zip(self.rows, constraints)
         ]
         self.forces = [self.coordinates(ends)[:, ends.places(ends.acts_on)] for ends in loads]
+        self.read = [Pattern(self._read(ends), own) for ends, own in zip(loads, self.forces)]
 
     def coordinates(self, ends: Ends) -> np.ndarray:
         """The coordinates of each element's bodies, shape (elements, 6 or 12); −1 where a body has none."""
         return self.index[ends.slots].reshape(len(ends.owners), -1)
+
+    def _read(self, ends: Ends) -> np.ndarray:
+        """Where the multipliers are that each load reads, shape (elements, rows of its joint); −1 for those that the
+        joint does not have between its bodies."""
+        own = {
+            (owner, place): rows
+            for of, rows_of in zip(self._constraints, self.rows)
+            for owner, place, rows in zip(of.owners, of.nth, rows_of)
+        }
+        found = [
+            [row for i, count in enumerate(counts) for row in own.get((joint, i), (-1,) * count)]
+            for joint, counts in ends.read
+        ]
+        return np.asarray(found, np.int32)
 
     def _square(self, ends: Ends) -> Pattern:
         coordinates = self.coordinates(ends)

@@ -3,13 +3,16 @@
 A generalized force along s(q) is Q = −(∂s/∂q)ᵀ f, whose power is −f ṡ: with f = f(s) it has a potential.
 """
 
-from typing import NamedTuple
+import dataclasses
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens.liegroups import SO3, cross, skew, turn, turn_back
+from lgsens.model._constraints import total
 from lgsens.model._drivers import Angle
 from lgsens.model._elements import body_fixed
 from lgsens.model._frames import BODY_B, ROTATION, ROTATION_B, TRANSLATION_B, TURNING_A, TURNING_B, embedded
@@ -24,6 +27,51 @@ class HingeMoment(NamedTuple):
     angle: Float[Array, ""]
     rate: Float[Array, ""]
     moment: Float[Array, ""]
+
+
+Curves = tuple[AbstractSignal | None, AbstractSignal | None, AbstractSignal | None]
+
+
+def osculating(curves: Curves | None, x: Float[Array, "3"]) -> tuple[Any, Any]:
+    """Values and slopes of three curves, each at its entry of x; zero where there is none."""
+    if curves is None:
+        return 0.0, 0.0
+    at = lambda curve, x: (jnp.zeros_like(x),) * 2 if curve is None else jax.jvp(curve, (x,), (jnp.ones_like(x),))
+    return tuple(map(jnp.stack, zip(*(at(curve, x[i]) for i, curve in enumerate(curves)))))
+
+
+class CurveBushingLoad(AbstractClosedFormLoad):
+    """A `BushingLoad` with curves f_i(u_i) and g_i(u̇_i) besides, along the columns of a triad in the frame of a.
+
+    At every state it has the force and both tangents of the linear bushing that osculates it there, with f_i′ and g_i′
+    among its rates and the rest in its preload.
+    """
+
+    linear: BushingLoad
+    triad: Float[Array, "3 3"]
+    springs: Curves | None
+    dampers: Curves | None
+
+    balanced = True
+    drawn = "joint"
+
+    def fixed(self, kind, bodies="ab"):
+        return self.linear.fixed(kind, bodies)
+
+    def _osculating(self, a, b, va, vb) -> BushingLoad:
+        of, triad = self.linear, self.triad
+        u, rate = (turn_back(triad, x) for x in of.stretch(a, b, va, vb))
+        (push, stiffness), (drag, damping) = osculating(self.springs, u), osculating(self.dampers, rate)
+        along = lambda rates: (triad * (jnp.ones_like(u) * rates)[None]) @ triad.T
+        preload = turn(triad, push + drag - stiffness * u - damping * rate)
+        own = {"stiffness": along(stiffness), "damping": along(damping), "preload": preload}
+        return dataclasses.replace(of, **{name: getattr(of, name) + more for name, more in own.items()})
+
+    def force(self, a, b, va, vb, t):
+        return self._osculating(a, b, va, vb).force(a, b, va, vb, t)
+
+    def tangents(self, a, b, va, vb, t):
+        return self._osculating(a, b, va, vb).tangents(a, b, va, vb, t)
 
 
 class TorsionLoad(AbstractLoad):
@@ -63,7 +111,8 @@ class TorsionLoad(AbstractLoad):
 
 
 class RotationLoad(AbstractLoad):
-    """Springs and dampers against the rotation φ of b in a, by its vector: m = m₀ + K φ + C φ̇, E = ½ φᵀKφ + m₀ᵀφ.
+    """Springs and dampers against the rotation φ of b in a, by its vector: m = m₀ + K φ + C φ̇, E = ½ φᵀKφ + m₀ᵀφ;
+    and f_i(φ_i), g_i(φ̇_i) more where there are curves.
 
     The columns of `triad_a` and `triad_b`, in the frames of the bodies, are three axes that coincide in the reference
     configuration; φ = log S with S = (R_a T_a)ᵀ R_b T_b, whose angular velocity in `triad_b` is ω = T(φ) φ̇. So on b
@@ -75,6 +124,8 @@ class RotationLoad(AbstractLoad):
     stiffness: Float[Array, "3"]
     damping: Float[Array, "3"]
     preload: Float[Array, "3"]
+    springs: Curves | None = None
+    dampers: Curves | None = None
 
     balanced = True
     drawn = None
@@ -88,31 +139,38 @@ class RotationLoad(AbstractLoad):
         to_b = group.compose(self.triad_b.T, group.compose(b.orientation.T, group.compose(a.orientation, self.triad_a)))
         phi = group.log(to_b.T)
         spin = turn_back(self.triad_b, vb[ROTATION]) - turn(to_b, turn_back(self.triad_a, va[ROTATION]))
-        m = self.preload + self.stiffness * phi + self.damping * group.tangent_inv_mv(phi, spin)
+        rate = group.tangent_inv_mv(phi, spin)
+        m = self.preload + self.stiffness * phi + self.damping * rate
+        m += osculating(self.springs, phi)[0] + osculating(self.dampers, rate)[0]
         on_a = group.tangent_inv_mv(-phi, m)  # T(φ)ᵀ = T(−φ)
         zero = jnp.zeros_like(m)
         moment_a = turn(self.triad_a, turn_back(to_b, on_a))
         return jnp.concatenate([zero, moment_a, zero, -turn(self.triad_b, on_a)])
 
 
-class FullBushingLoad(AbstractClosedFormLoad):
-    """A `BushingLoad` that resists rotations, too."""
+class LoadSum(AbstractClosedFormLoad):
+    """Several loads at one place, as one; what is fixed to bodies and drawn is of the first."""
 
-    translation: BushingLoad
-    rotation: RotationLoad
+    parts: tuple[AbstractLoad, ...]
 
-    balanced = True
-    drawn = "joint"
+    @property
+    def balanced(self):
+        return all(part.balanced for part in self.parts)
+
+    @property
+    def drawn(self):
+        return self.parts[0].drawn
 
     def fixed(self, kind, bodies="ab"):
-        return self.translation.fixed(kind, bodies)
+        return self.parts[0].fixed(kind, bodies)
 
     def force(self, a, b, va, vb, t):
-        return self.translation.force(a, b, va, vb, t) + self.rotation.force(a, b, va, vb, t)
+        return total(part.force(a, b, va, vb, t) for part in self.parts)
 
     def tangents(self, a, b, va, vb, t):
-        both = (load_tangents(load, a, b, va, vb, t) for load in (self.translation, self.rotation))
-        return LoadTangents(*(one + other for one, other in zip(*both)))
+        every = zip(*(load_tangents(part, a, b, va, vb, t) for part in self.parts))
+        given = ([part for part in parts if part is not None] for parts in every)
+        return LoadTangents(*(total(parts) if parts else None for parts in given))
 
 
 class FollowingForce(AbstractClosedFormLoad):
@@ -131,6 +189,25 @@ class FollowingForce(AbstractClosedFormLoad):
     def tangents(self, a, b, va, vb, t):
         by_turns = -self.signal(t) * (b.orientation @ skew(self.vector))
         return LoadTangents(embedded(by_turns, TRANSLATION_B, ROTATION_B), None)
+
+
+class FixedMoment(AbstractClosedFormLoad):
+    """A moment s(t) m on b of a fixed direction: s Rᵀm in the frame of b, and δ(Rᵀm) = (Rᵀm)~ δθ."""
+
+    moment: Float[Array, "3"]
+    signal: AbstractSignal
+
+    drawn = None
+
+    @property
+    def acts_on(self):
+        return TURNING_B
+
+    def force(self, a, b, va, vb, t):
+        return self.signal(t) * embedded(b.local_axis(self.moment), ROTATION_B)
+
+    def tangents(self, a, b, va, vb, t):
+        return LoadTangents(self.signal(t) * embedded(skew(b.local_axis(self.moment)), ROTATION_B, ROTATION_B), None)
 
 
 class DragLoad(AbstractLoad):

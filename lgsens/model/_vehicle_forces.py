@@ -1,4 +1,4 @@
-"""Forces of hinges and vehicles: torsion springs and motors, anti-roll bars, stops, drag."""
+"""Forces of hinges and vehicles: torsion springs and motors, anti-roll bars, stops, contact, drag."""
 
 import dataclasses
 
@@ -6,7 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._validate import axis_field, number_field, point_field, require
+from lgsens._validate import axis_field, number_field, point_field, require, require_positive
+from lgsens.model._contacts import PlaneContactLoad
 from lgsens.model._curves import CurveLoad
 from lgsens.model._forces import AbstractForce, Attached, _distance, _frame
 from lgsens.model._frames import normals
@@ -38,7 +39,8 @@ class TorsionSpringDamper(AbstractForce):
         motor: the moment M(t) on b [N m], a number, shape (), or a signal; None: no motor.
 
     Give `free_angle` or `preload`, not both. `Trajectory.force` gives the angle [rad], its rate [rad/s] and the moment
-    on b [N m]. Raises `ValueError` for both, a zero axis, or wrong shapes.
+    on b [N m]. Raises `ValueError` for both, a zero axis, or wrong shapes. Source: Haug (1989), chapter 6 (rotational
+    spring-damper-actuator).
     """
 
     a: str | None = eqx.field(static=True)
@@ -88,7 +90,8 @@ class AntiRollBar(AbstractForce):
         damping: c [N m s/rad], shape ().
 
     `Trajectory.force` gives the angle [rad], its rate [rad/s] and the moment on b [N m]. Raises `ValueError` for a
-    wrong shape, a zero axis, or dimensions that no bar has.
+    wrong shape, a zero axis, or dimensions that no bar has. Source: Milliken & Milliken, Race Car Vehicle Dynamics
+    (1995), chapter 21.
     """
 
     a: str | None = eqx.field(static=True)
@@ -156,7 +159,8 @@ class BumpStop(AbstractForce):
         rebound: whether it is a rebound stop, which pulls the points together: x = max(0, ℓ − ℓ₀ − gap).
 
     `Trajectory.force` gives its `LineForce`, of negative tension where it pushes. Raises `ValueError` for wrong shapes,
-    a rounding or progression ≤ 0, or points that coincide.
+    a rounding or progression ≤ 0, or points that coincide. Source, of what it is for: Blundell & Harty, The Multibody
+    Systems Approach to Vehicle Dynamics (2004), chapter 4; the formula is of this library.
     """
 
     a: str | None = eqx.field(static=True)
@@ -170,9 +174,7 @@ class BumpStop(AbstractForce):
     rebound: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def __check_init__(self):
-        for name, value in (("rounding", self.rounding), ("progression", self.progression)):
-            if value is not None:
-                require(lambda x: x > 0, f"BumpStop: `{name}` must be positive, got {value} m.", value)
+        require_positive(self, "rounding", "progression")
         require(
             lambda a, b: (a != b).any(),
             f"BumpStop: `at_a` and `at_b` coincide at {self.at_a}, so the stop has no direction; move one end.",
@@ -191,6 +193,58 @@ class BumpStop(AbstractForce):
         return (Attached(CurveLoad(*points, curve, None, length, jnp.zeros_like(length)), self.a, self.b),)
 
 
+class PlaneContact(AbstractForce):
+    """A point of `b` on a plane of `a`, into which it may be pressed and from which it may lift off.
+
+        F = k ⌈x⌉_w ⌈1 + c ẋ⌉_½  along the normal,     x how far it is in the plane
+
+    with ⌈x⌉_w = max(x, 0) but for |x| < w, where it passes from one to the other with two continuous derivatives. So
+    two of F are continuous; F grows while the point goes in, is less while it comes out, and never pulls.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at: the point of `b` in the reference configuration [m], inertial frame, shape (3,).
+        axis: normal of the plane, which turns with `a`, out of it, inertial frame, shape (3,), any length > 0.
+        gap: distance of the point from the plane there [m], shape (); negative where it is pressed into it.
+        stiffness: k [N/m], shape ().
+        rounding: w [m], shape (), > 0.
+        damping: c [s/m], shape (): of a speed v ≪ 1/c about the part 2 c v/3 is lost in an impact.
+        coefficient: μ of friction [–], shape (), the force μ F u/√(u² + u₀²) against the slip u; None: none.
+        slip_speed: u₀ [m/s], shape (), > 0, given with `coefficient`.
+
+    `Trajectory.force` gives F [N]. Raises `ValueError` for wrong shapes, a zero axis, a rounding or speed ≤ 0, and one
+    of coefficient and speed without the other. Source: Hunt & Crossley (1975), doi:10.1115/1.3423596.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at: Float[Array, "3"] = point_field("at")
+    axis: Float[Array, "3"] = axis_field("axis")
+    gap: Float[Array, ""] = number_field("gap", default=0.0)
+    stiffness: Float[Array, ""] = number_field("stiffness")
+    rounding: Float[Array, ""] = number_field("rounding")
+    damping: Float[Array, ""] = number_field("damping", default=0.0)
+    coefficient: Float[Array, ""] | None = number_field("coefficient", default=None)
+    slip_speed: Float[Array, ""] | None = number_field("slip_speed", default=None)
+
+    def __check_init__(self):
+        require_positive(self, "rounding", "slip_speed")
+        if (self.coefficient is None) != (self.slip_speed is None):
+            raise ValueError("PlaneContact: give both `coefficient` and `slip_speed`, or neither.")
+
+    @property
+    def bodies(self):
+        return (self.a, self.b)
+
+    def loads(self, bodies):
+        a, b = (_frame(bodies, name, self.gap.dtype) for name in (self.a, self.b))
+        unit = self.axis / jnp.linalg.norm(self.axis)
+        places = a.local_point(self.at - self.gap * unit), a.local_axis(unit), b.local_point(self.at)
+        numbers = self.stiffness, self.damping, self.rounding, self.coefficient, self.slip_speed
+        load = PlaneContactLoad(*places, *numbers)
+        return (Attached(load, self.a, self.b),)
+
+
 class Drag(AbstractForce):
     """Drag of the air on a point of a body: F = −½ ρ A |u| u, u the velocity of the point less that of the wind.
 
@@ -201,7 +255,8 @@ class Drag(AbstractForce):
         density: ρ [kg/m³], shape ().
         wind: [m/s], inertial frame, shape (3,).
 
-    Its derivatives are continuous, its second ones but for u = 0. Raises `ValueError` for wrong shapes.
+    Its derivatives are continuous, its second ones but for u = 0. Raises `ValueError` for wrong shapes. Source:
+    Hoerner, Fluid-Dynamic Drag (1965), chapter 1.
     """
 
     body: str = eqx.field(static=True)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from lgsens._validate import require_setting
-from lgsens.dynamics import State, require_independent
+from lgsens.dynamics import State, require_independent, require_linear
 from lgsens.integrate import AbstractScheme, GeneralizedAlpha, Stats, Variation, earlier, states_of, with_first
 from lgsens.linear import LinearEquations, linear_solve
 from lgsens.sensitivity._continuous_adjoint import Cotangents, continuous_adjoint_sweep
@@ -183,6 +183,7 @@ class ContinuousAdjoint(eqx.Module):
 def _require_positions(method: str, parameters: Parameters) -> None:
     """Raise `ValueError` where the constraints of a motion are not those of the paper: of positions, independent."""
     require_independent(parameters.system, method)
+    require_linear(parameters.system, method)
     if parameters.system.num_velocity_rows:
         raise ValueError(
             f"{method} integrates the differentiated equations of motion with constraints of position level only: "

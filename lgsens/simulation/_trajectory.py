@@ -16,7 +16,7 @@ from lgsens._brief import brief, listed, roster, shown
 from lgsens._validate import as_float, is_concrete, suggestion
 from lgsens.dynamics import RESULTS, AbstractSystem, State
 from lgsens.integrate import Stages
-from lgsens.model import AbstractJoint, Frame, MultibodySystem, joint_wrenches, motion_at
+from lgsens.model import AbstractJoint, Frame, MultibodySystem, joint_wrenches, measured, motion_at
 from lgsens.simulation._joint_motion import JointMotion, joint_motion
 from lgsens.simulation._tables import to_csv, to_pandas, to_xarray
 
@@ -190,12 +190,12 @@ class AbstractMotion(eqx.Module):
         Raises `ValueError` for an unknown name, or one of several loads (gravity).
         """
         states, t = self._kinematics()
-        system, q, v, _ = self._multibody().of_parts(states.q, states.v, states.vdot)
-        measure = partial(system.measure, name)
+        at = states.q, states.v, states.vdot, states.lam, t
+        measure = partial(measured, self._multibody(), name)
         if jnp.ndim(t) == 0:
-            stacked = measure(*jax.tree.map(lambda leaf: leaf[None], (q, v, t)))
+            stacked = measure(*jax.tree.map(lambda leaf: leaf[None], at))
             return jax.tree.map(lambda leaf: leaf[0], stacked)
-        return measure(q, v, t)
+        return measure(*at)
 
 
 class AbstractRun(AbstractMotion):

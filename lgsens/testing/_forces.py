@@ -28,7 +28,7 @@ Potential = Callable[[Any, Frame, Frame, Any], Float[Array, ""]]
 
 
 class _AtStates(AbstractLoad):
-    """A load with states, of which these are given."""
+    """A load with states, of which these are given, as are the multipliers that it reads."""
 
     load: AbstractDynamicLoad
     states: Float[Array, " s"]
@@ -76,7 +76,9 @@ def check_force(
     states = jnp.asarray(np.random.default_rng(seed).uniform(0.5, 1.5, 64))
 
     def at_states(load: Any) -> AbstractLoad:
-        return _AtStates(load, states[: len(load.states)]) if isinstance(load, AbstractDynamicLoad) else load
+        if not isinstance(load, AbstractDynamicLoad):
+            return load
+        return _AtStates(load, states[: len(load.states) + sum(load.reads)])
 
     if isinstance(force, AbstractLoad | AbstractDynamicLoad):
         scene_bodies = scene.bodies("ab")

@@ -174,6 +174,7 @@ def test_motion_of_bodies_and_what_elements_measure(system):
     reach = np.linalg.norm(top.position - top.pivot)  # the centre of mass stays on a sphere
     close(np.linalg.norm(instant.body("top").position - top.pivot), reach, 20)
     # ℓ̇ of the spring is the derivative of its length
-    length = lambda q, v: system.measure("spring", *jax.tree.map(lambda x: x[None], (q, v, point.t)))
+    spring = lambda *at: lg.model.measured(system, "spring", *jax.tree.map(lambda x: x[None], (*at, point.t)))
+    length = lambda q, v: spring(q, v, state.vdot, state.lam)
     along = jax.jit(lambda s: length(system.group.retract(point.q, s * point.v), point.v).length[0])
     close(instant.force("spring").rate, jax.jvp(along, (jnp.zeros(()),), (jnp.ones(()),))[1], 100, scale=10.0)

@@ -1,0 +1,40 @@
+"""What force elements measure along a motion."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from lgsens._validate import suggestion
+from lgsens.model._stack import at_ends
+from lgsens.model._system import MultibodySystem
+
+
+def measured(system: MultibodySystem, force: str, q, v, vdot, lam, t) -> Any:
+    """The `measure` of the load of the force element `force`, along a leading axis of states and times."""
+    whole, placed, twists, _ = system.of_parts(q, v, vdot)
+    found = [
+        (stack.only(i), read.rows[i : i + 1])
+        for stack, read in zip(whole.loads, whole.topology.read)
+        for i, owner in enumerate(stack.owners)
+        if owner == force
+    ]
+    if not found:
+        known = {owner for stack in whole.loads for owner in stack.owners}
+        raise ValueError(f"`force`: {suggestion(force, known)}.")
+    if len(found) > 1:
+        raise ValueError(f"`force`: {force!r} acts on {len(found)} bodies and has no single value.")
+
+    ((stack, read),) = found
+    if read.size and whole is not system:
+        (joint,) = stack.joints
+        own = system.multiplier(joint, q, v, vdot, lam, t)
+        none = jnp.zeros((*lam.shape[:-1], len(whole.constraint_names)), lam.dtype)
+        lam = none.at[..., whole.multiplier_rows(joint)].set(own)
+
+    def at_time(q, v, lam, t):
+        twist = whole.twists(v)
+        (ends,) = at_ends([stack], whole._placed(q), twist)
+        return stack.map(lambda e, *args: e.measure(*args), ends, (t, *stack.inputs(twist, lam, read)))
+
+    return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(at_time)(placed, twists, lam, t))

@@ -1,0 +1,129 @@
+"""Transmissions of variable ratio: a rack by a curve over the angle, a rack and gears by a signal of time."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import close, says
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+import lgsens as lg
+from lgsens.model import Frame
+from lgsens.testing import check_joint
+
+X, Y, ORIGIN = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 0.0)
+AT, AT_B = (0.3, -0.7, 1.1), (0.9, 0.2, 0.4)
+AXIS, AXIS_B = (1.0, 2.0, -0.5), (0.8, 1.0, -1.0)
+RADIUS, SWELL = 0.01, 2e-4
+TRAVEL = lg.Polynomial((0.0, RADIUS, 0.0, SWELL))  # f = r θ + ε θ³, of which πr is reached at 5.4 rad
+RATIO = lg.Harmonic(amplitude=0.2, frequency=0.3, offset=-1.5)
+GEARS = {"at_a": AT, "at_b": AT_B, "axis_a": AXIS, "axis_b": AXIS_B}
+JOINTS = {
+    "rack by a curve": lg.RackAndPinionJoint(
+        "a", "b", at=AT, axis=AXIS, direction=AXIS_B, radius=0.4, travel=lg.Polynomial((0.0, 0.3, 0.05, 0.1))
+    ),
+    "rack by time": lg.RackAndPinionJoint(
+        "a", "b", at=AT, axis=AXIS, direction=AXIS_B, radius=lg.Harmonic(amplitude=0.1, frequency=0.3, offset=0.4)
+    ),
+    "gears on one axis": lg.GearJoint(
+        "a", "b", at_a=AT, at_b=AT, axis_a=AXIS, axis_b=AXIS, ratio=3.0, teeth=1, line=AXIS_B
+    ),
+    "gears by time": lg.GearJoint("a", "b", **GEARS, ratio=RATIO),
+}
+
+
+QUICK = ("rack by a curve",)
+
+
+@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in JOINTS])
+def test_joints_are_what_they_say(name):
+    check_joint(JOINTS[name], t=0.7).raise_if_failed()
+
+
+def test_values_over_many_turns():
+    """Φ = s − f(θ), s − r(t) θ and φ_b − ρ(t) φ_a at poses by hand."""
+    ground, t, time = Frame(np.zeros(3), np.eye(3)), 0.7, jnp.asarray(0.7)
+    about_y = lambda angle: jnp.asarray(Rotation.from_rotvec([0, angle, 0]).as_matrix())
+    placed = lambda s, angle: Frame(jnp.array([s, 0.0, 0.0]), about_y(angle))
+    rack = {"at": ORIGIN, "axis": Y, "direction": X}
+    for angle in (-5.0, -0.4, 0.0, 2.0, 4.9):
+        (element,) = lg.RackAndPinionJoint("a", "b", **rack, radius=RADIUS, travel=TRAVEL).constraints(ground, ground)
+        s = RADIUS * angle + SWELL * angle**3 + 1e-3
+        close(element.value(ground, placed(s, angle), time), [1e-3], 1e3, scale=0.1)
+    radius = lg.Ramp(start=0.02, end=0.05, duration=2.0)
+    x = t / 2.0
+    exact = 0.02 + 0.03 * (10 * x**3 - 15 * x**4 + 6 * x**5)
+    for angle in (-40.0, 0.3, 25.0):
+        (element,) = lg.RackAndPinionJoint("a", "b", **rack, radius=radius).constraints(ground, ground)
+        close(element.value(ground, placed(exact * angle + 1e-3, angle), time), [1e-3], 1e3, scale=2.0)
+    (element,) = lg.GearJoint("a", "b", at_a=ORIGIN, at_b=X, axis_a=Y, axis_b=Y, ratio=RATIO).constraints(
+        ground, placed(1.0, 0.0)
+    )
+    ratio = -1.5 + 0.2 * np.sin(2 * np.pi * 0.3 * t)
+    phi = element.value(placed(0.0, 0.8), placed(1.0, ratio * 0.8 + 0.01), time)
+    close(phi, [0.01], 1e3, scale=1.0)
+    on_axis = {"at_a": ORIGIN, "at_b": ORIGIN, "axis_a": Y, "axis_b": Y, "ratio": 3.0, "line": X}
+    (element,) = lg.GearJoint("a", "b", **on_axis).constraints(ground, ground)
+    for angle in (-9.0, 0.5, 20.0):
+        close(element.value(placed(0.0, angle), placed(0.0, 3.0 * angle + 0.01), time), [0.01], 1e3, scale=60.0)
+
+
+def steering(travel):
+    """A pinion that is driven, and its rack in a guide."""
+    body = lambda at: lg.RigidBody(1.0, (0.1, 0.1, 0.1), position=at)
+    joints = {
+        "hinge": lg.RevoluteJoint(None, "pinion", at=ORIGIN, axis=Y),
+        "guide": lg.PrismaticJoint(None, "rack", at=(0.0, 0.0, -0.1), axis=X),
+        "mesh": lg.RackAndPinionJoint("rack", "pinion", at=ORIGIN, axis=Y, direction=X, radius=RADIUS, travel=travel),
+        "wheel": lg.RotationDriver(None, "pinion", axis=Y),
+    }
+    return lg.Model({"pinion": body(ORIGIN), "rack": body((0.0, 0.0, -0.1))}, joints)
+
+
+@pytest.mark.slow
+def test_rack_follows_its_curve():
+    """Position, rate and moment of the wheel over two turns and more, against SciPy's spline through the samples."""
+    angles = np.linspace(-7.0, 7.0, 29)
+    turns = np.concatenate([np.linspace(0.0, 6.8, 9), np.linspace(6.0, -6.8, 15)])  # by less than half a turn each
+    samples = RADIUS * angles + 2e-3 * np.sin(angles)
+    curve = CubicSpline(angles, samples, bc_type="natural")
+
+    @eqx.filter_jit
+    def run(values):
+        model = steering(lg.Sampled(angles, values, "cubic"))
+        model = eqx.tree_at(lambda m: m.forces, model, {})
+        model = lg.Model(model.bodies, model.joints, {"load": lg.AppliedForce("rack", force=(5.0, 0.0, 0.0))})
+        motion = lg.kinematics(model, {"wheel": turns}, rates={"wheel": 3.0})
+        return motion.body("rack").position[:, 0], motion.body("rack").velocity[:, 0], motion.multiplier("wheel")[:, 0]
+
+    position, rate, moment = run(jnp.asarray(samples))
+    close(position, -curve(turns), 1e4)
+    close(rate, -3.0 * curve(turns, 1), 1e5)
+    # power: M ω = −(F − m ẍ) ẋ, the multiplier is what drives, reversed
+    push = 5.0 + curve(turns, 2) * 9.0
+    close(moment, -push * curve(turns, 1), 1e6)
+
+
+@pytest.mark.slow
+def test_gradient_by_the_curve():
+    """The place of the rack by the coefficients of its curve: −θ^i."""
+
+    def place(coefficients):
+        model = steering(lg.Polynomial(coefficients))
+        return lg.kinematics(model, {"wheel": jnp.array([2.0])}).body("rack").position[-1, 0]
+
+    found = jax.jit(jax.grad(place))(jnp.array([0.0, RADIUS, 0.0, SWELL]))
+    close(found, [-1.0, -2.0, -4.0, -8.0], 1e4)
+
+
+def test_bad_input():
+    for more, message in (
+        ({"radius": RADIUS, "travel": 0.3}, "RackAndPinionJoint: `travel` must be a signal of the angle, got 0.3"),
+        ({}, "RackAndPinionJoint: `radius` is missing"),
+    ):
+        with pytest.raises(ValueError, match=says(message)):
+            lg.RackAndPinionJoint("a", "b", at=AT, axis=AXIS, direction=X, **more)
+    with pytest.raises(ValueError, match=says("GearJoint: `ratio` is missing")):
+        lg.GearJoint("a", "b", **GEARS)
