@@ -104,8 +104,8 @@ def error_estimate(trajectory: Trajectory, integrator: AbstractIntegrator = Gene
         valid,
     )
     scheme = integrator.scheme
-    plain = isinstance(scheme, GeneralizedAlpha) and not scheme.stabilized and integrator.equal_steps
-    if plain and not trajectory.system.reads_multipliers:  # else `_start` has other equations
+    linear = not trajectory.system.reads_multipliers  # as `_start` takes them to be
+    if isinstance(scheme, GeneralizedAlpha) and not scheme.stabilized and integrator.equal_steps and linear:
         found = _estimated(scheme, trajectory)
     else:
         found = refined_error(scheme, trajectory)
