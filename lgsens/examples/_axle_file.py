@@ -77,17 +77,17 @@ def mounts(
 
 
 def _mount(table: Reader, count: int, at: Array | None = None) -> Mount:
-    stiffness = [table.triples(key, count) for key in RATES[:2]]
-    damping = [table.triples(key, count) if key in table else jnp.zeros_like(stiffness[0]) for key in RATES[2:]]
-    for key, values in zip(RATES, (*stiffness, *damping)):
-        if not np.all(values > 0 if key in RATES[:2] else values >= 0):
-            bound = "positive" if key in RATES[:2] else "zero or positive"
-            raise table.fail(key, f"must be {bound}, got {np.asarray(values).tolist()}; a soft rate is a small number.")
+    rates = {key: table.triples(key, count) for key in RATES[:2]}
+    rates |= {key: table.triples(key, count) for key in RATES[2:] if key in table}
+    for key, values in rates.items():
+        positive = key == "stiffness" or (key == "rotational_stiffness" and count == 1)  # two points hold a link
+        if not np.all(values > 0 if positive else values >= 0):
+            bound = "positive, else a body can move freely" if positive else "zero or positive"
+            raise table.fail(key, f"must be {bound}, got {np.asarray(values).tolist()}; give small numbers for soft.")
     axes = table.directions("axes") if "axes" in table else None
-    preloads: tuple[Any, Any] = (None, None)
     if "preload" in table or "rotational_preload" in table:
-        preloads = table.triples("preload", count), table.triples("rotational_preload", count)
-    return Mount(stiffness[0], damping[0], stiffness[1], damping[1], axes, *preloads, at=at)
+        rates |= {key: table.triples(key, count) for key in ("preload", "rotational_preload")}
+    return Mount(**rates, axes=axes, at=at)
 
 
 def axle_members(root: Reader, kilogram: float, links: Collection[str]) -> dict[str, Any]:

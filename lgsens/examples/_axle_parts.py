@@ -27,7 +27,7 @@ class Mount(eqx.Module):
 
     Attributes:
         stiffness, damping: along its axes [N/m], [N s/m], shape (3,), or (2, 3): of the two bushings of a hinge.
-        rotational_stiffness, rotational_damping: about them [N m/rad], [N m s/rad], of the same shape; None: 0.
+        rotational_stiffness, rotational_damping: about them [N m/rad], [N m s/rad], of the same shape. None: 0.
         axes: the first of them, and a direction in the plane of the first and the second, shape (2, 3); None: x, y, z.
         preload, rotational_preload: the force [N] that pulls the joint's second body to its first at the design
             position, and the moment [N m] that turns it back, in x, y and z, shape (3,) or (2, 3); None: those with
@@ -36,7 +36,7 @@ class Mount(eqx.Module):
     """
 
     stiffness: Float[Array, "*two 3"]
-    damping: Float[Array, "*two 3"]
+    damping: Float[Array, "*two 3"] | None = None
     rotational_stiffness: Float[Array, "*two 3"] | None = None
     rotational_damping: Float[Array, "*two 3"] | None = None
     axes: Float[Array, "2 3"] | None = None

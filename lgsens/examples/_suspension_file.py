@@ -108,8 +108,8 @@ def members(document: dict, path: str) -> dict[str, Any]:
         )
     bars = [link for link in links.values() if link.inertia is None]
     bump = root.table("bump")
-    root.only((*TABLES, *OF_AXLE))  # after what is missing: a table that is spelled wrong is both
     struts = {key: _strut(key, root.table(key), bodies, rate, carriers) for key, rate in RATES.items()}
+    root.only((*TABLES, *OF_AXLE))  # after what is missing: a table that is spelled wrong is both
     stops = {key: stop(root.table(key), key, bodies, struts["damper"], carriers) for key in STOPS if key in root}
     return {
         "name": str(document.get("name", Path(path).stem)),
