@@ -9,6 +9,14 @@ from scipy.spatial.transform import Rotation
 Z = np.array([0.0, 0.0, 1.0])
 
 
+def corner_of(document: dict[str, Any]) -> dict[str, Any]:
+    """The corner of an axle's file, as it is written: chassis for subframe and rack, and no table of the axle."""
+    to_chassis = lambda table: {"chassis" if key in ("subframe", "rack") else key: of for key, of in table.items()}
+    axle = ("subframe", "rack", "anti_roll_bar", "bushings", "bump_stop", "rebound_stop")
+    corner = {key: table for key, table in document.items() if key not in axle}
+    return corner | {"links": {name: to_chassis(link) for name, link in document.get("links", {}).items()}}
+
+
 def points_of(value) -> np.ndarray:
     return np.atleast_2d(np.asarray(value, float))
 

@@ -94,7 +94,8 @@ class QuarterCar(eqx.Module):
     def _check(self, name: str) -> None:
         """Raise `ValueError` for what moves or stands as no car does."""
         struts = {"spring": self.spring, "damper": self.damper}
-        ratios = motion_ratios(name, self.wheel.centre, self.links, self.joints, struts)
+        with jax.ensure_compile_time_eval():  # of numbers that are known, inside `jit` too
+            ratios = motion_ratios(name, self.wheel.centre, self.links, self.joints, struts)
         push = self.spring.push()
         if not ratios or push is None:
             return
