@@ -1,6 +1,5 @@
 """Axles: what is mirrored, what carries what, that they rest, and what their files may say."""
 
-import copy
 import json
 import tomllib
 from importlib import resources
@@ -13,6 +12,7 @@ import pytest
 from helpers import says
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
+from suspension_closures import changed
 
 import lgsens as lg
 from lgsens.examples import Axle, QuarterCar, shipped
@@ -137,7 +137,7 @@ class SemiTrailing:
     def bar(self, travel):
         """The angle about y by which the lever has turned: the drop link keeps its length."""
         end, length = turned(self.end, self.hinge, self.angle(travel)), np.linalg.norm(self.end - self.lever)
-        about = np.stack([self.bearing, self.bearing + [0.0, 1.0, 0.0]])
+        about = np.stack([self.bearing, self.bearing + np.array([0.0, 1.0, 0.0])])
         gap = lambda angle: np.linalg.norm(turned(self.lever, about, angle) - end) - length
         return brentq(gap, -0.3, 0.3, xtol=1e-15)
 
@@ -239,3 +239,185 @@ def test_stiff_bushings_become_joints(name):
     # a/k + b/k²: 2 % of the first for mounts that move the wheel by 1 % of what it moves
     assert left[1] / left[0] == pytest.approx(1 / 3, rel=0.02)
     assert left[2] / left[1] == pytest.approx(1 / 3, rel=0.02 / 3)
+
+
+def test_one_number_is_of_both_sides():
+    """The derivative by the left corner's spring seat: that of both seats of two-sided axles, and differences."""
+    axle = Axle.load("semi_trailing_arm")
+    seat = lambda a: a.left.spring.ends["chassis"]
+    other = lambda a: a.other.spring.ends["chassis"]
+    outward = jnp.asarray([0.3, 1.0, -0.5])
+
+    @eqx.filter_jit
+    def push(axle):
+        """Of the left spring and, weighted so that sides differ, of the right one."""
+        forces = axle.model(compliant=False).forces
+        return forces["left_spring"].preload + 0.5 * forces["right_spring"].preload
+
+    def slope(axle, where, direction):
+        moved = lambda h: push(eqx.tree_at(where, axle, where(axle) + h * direction))
+        return jax.jvp(moved, (jnp.zeros(()),), (jnp.ones(()),))[1], moved
+
+    both, moved = slope(axle, seat, outward)
+    pair = axle.two_sided()
+    sides = [slope(pair, where, d)[0] for where, d in ((seat, outward), (other, jnp.asarray(FLIP) @ outward))]
+    # one linear system, of condition 1e4
+    assert float(both) == pytest.approx(float(sum(sides)), rel=1e-10)
+    assert float(sides[0]) == pytest.approx(2.0 * float(sides[1]), rel=1e-10)
+    h = 1e-3
+    # h⁴/30 of a fifth derivative with arms of 0.2 m: 1e-12/30/0.2⁴ = 2e-11; round-off 1e-16/h times a condition of 1e4
+    points = [float(moved(i * h)) for i in (-2, -1, 1, 2)]
+    difference = (points[0] - 8 * points[1] + 8 * points[2] - points[3]) / (12 * h)
+    assert float(both) == pytest.approx(difference, rel=1e-8)
+
+
+def test_preloads_that_are_given():
+    """They stay as they are, turned into the axes of the bushing, and mirrored: forces S f, moments −S m."""
+    axle = Axle.load("semi_trailing_arm")
+    force, moment = jnp.asarray([100.0, 20.0, -3.0]), jnp.asarray([4.0, 5.0, 6.0])
+    where = lambda a: (a.left.mounts["pivot"].preload, a.left.mounts["pivot"].rotational_preload)
+    given = eqx.tree_at(where, axle, (force, moment), is_leaf=lambda leaf: leaf is None)
+    for side, s in (("left", np.eye(3)), ("right", FLIP)):
+        car = getattr(given, side)
+        for _, bushing in car.mounts["pivot"].elements("it", "chassis", f"{side}_knuckle", car.joints["pivot"].at):
+            np.testing.assert_allclose(bushing.triad @ bushing.preload, s @ force, rtol=1e-14)
+            handed = np.linalg.det(s) * s @ moment
+            np.testing.assert_allclose(bushing.triad @ bushing.rotational_preload, handed, rtol=1e-14)
+
+
+# What is refused: the file, where in it, what is put there (None: it goes), and what the message says.
+MISTAKES = {
+    "table that is none": (
+        "mcpherson",
+        {"anti_rollbar": {}},
+        ("key 'anti_rollbar'", "is no key of this table", "'anti_roll_bar'"),
+    ),
+    "bushing of no joint": (
+        "multi_link",
+        {"bushings.upper_arm_chassis": {"stiffness": [1.0, 1.0, 1.0]}},
+        ("key 'bushings.upper_arm_chassis'", "there is no such joint", "'upper_arm_subframe'"),
+    ),
+    "bushing that slides": (
+        "mcpherson",
+        {"bushings.slider": {"stiffness": [1.0, 1.0, 1.0]}},
+        ("key 'bushings.slider.stiffness'", "'slider' slides", "leave it a joint"),
+    ),
+    "bushing without rotations": (
+        "mcpherson",
+        {"bushings.strut_chassis.rotational_stiffness": None},
+        ("key 'bushings.strut_chassis.rotational_stiffness'", "is missing"),
+    ),
+    "bushing that is free": (
+        "mcpherson",
+        {"bushings.strut_chassis.rotational_stiffness": [1.0, 1.0, 0.0]},
+        ("key 'bushings.strut_chassis.rotational_stiffness'", "positive, else a body can move freely", "0.0]"),
+    ),
+    "rate below zero": (
+        "mcpherson",
+        {"bushings.control_arm_chassis.damping": [-1.0, 1.0, 0.0]},
+        ("key 'bushings.control_arm_chassis.damping'", "zero or positive", "[-1.0, 1.0, 0.0]"),
+    ),
+    "two rates of one": (
+        "multi_link",
+        {"bushings.tie_rod_subframe.stiffness": [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]},
+        ("key 'bushings.tie_rod_subframe.stiffness'", "must be three numbers"),
+    ),
+    "axes that are one": (
+        "semi_trailing_arm",
+        {"bushings.pivot.axes": [[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]},
+        ("key 'bushings.pivot.axes'", "two different directions", "[2.0, 0.0, 0.0]"),
+    ),
+    "key of a mount": (
+        "multi_link",
+        {"subframe.mounts.rear.place": [0.0, 0.0, 0.0]},
+        ("key 'subframe.mounts.rear.place'", "is no key of this table", "'at'"),
+    ),
+    "half a preload": (
+        "semi_trailing_arm",
+        {"bushings.pivot.preload": [1.0, 0.0, 0.0]},
+        ("key 'bushings.pivot.rotational_preload'", "is missing"),
+    ),
+    "link on two that are one": (
+        "multi_link",
+        {"links.tie_rod.chassis": [-0.257, 0.2, -0.116]},
+        ("key 'links.tie_rod.subframe'", "'chassis'", "one body to a corner", "hold on to one of them"),
+    ),
+    "link on no rack": (
+        "multi_link",
+        {"links.tie_rod.rack": [-0.257, 0.2, -0.116]},
+        ("key 'links.tie_rod.rack'", "is no body", "'subframe'"),
+    ),
+    "link of a name that is taken": (
+        "multi_link",
+        {"links.drop_link": {"chassis": [0.0, 0.4, 0.1], "knuckle": [0.1, 0.8, 0.2], "mass": 1.0}},
+        ("key 'links.drop_link'", "is a name of its own"),
+    ),
+    "rack on no subframe": (
+        "mcpherson",
+        {"rack.on": "subframe"},
+        ("key 'rack.on'", "one of ['chassis']", "'subframe'"),
+    ),
+    "rack of two ratios": (
+        "mcpherson",
+        {"rack.ratio": 0.01},
+        ("key 'rack.c_factor'", "2π times `ratio`", "one of them"),
+    ),
+    "rack without mass": ("mcpherson", {"rack.mass": None}, ("key 'rack.mass'", "is missing")),
+    "bar of two rates": (
+        "mcpherson",
+        {"anti_roll_bar.stiffness": 400.0},
+        ("key 'anti_roll_bar.stiffness'", "follows from the bar's dimensions", "'diameter'"),
+    ),
+    "bar of no rate": (
+        "mcpherson",
+        {"anti_roll_bar.diameter": None, "anti_roll_bar.length": None},
+        ("key 'anti_roll_bar.diameter'", "is missing"),
+    ),
+    "bar of a bore": (
+        "mcpherson",
+        {"anti_roll_bar.bore": 0.03},
+        ("key 'anti_roll_bar.diameter'", "need `diameter` > `bore`", "0.03"),
+    ),
+    "bar without drop link": (
+        "mcpherson",
+        {"anti_roll_bar.knuckle": None},
+        ("key 'anti_roll_bar.lever'", "one body of ['control_arm', 'knuckle'", "got []"),
+    ),
+    "lever along the bar": (
+        "mcpherson",
+        {"anti_roll_bar.lever": [0.33, 0.72, -0.13]},
+        ("key 'anti_roll_bar.lever'", "has no length across y", "[0.33, 0.72,"),
+    ),
+    "drop link along the lever": (
+        "mcpherson",
+        {"anti_roll_bar.knuckle": [-0.2, 0.8, -0.13]},
+        ("key 'anti_roll_bar.lever'", "goes along it", "cannot turn it"),
+    ),
+    "stop on one": (
+        "semi_trailing_arm",
+        {"bump_stop.knuckle": [0.3, 0.8, 0.1]},
+        ("key 'bump_stop.knuckle'", "one point on each of two bodies", "those of the damper"),
+    ),
+    "stop without rounding": (
+        "semi_trailing_arm",
+        {"rebound_stop.rounding": 0.0},
+        ("key 'rebound_stop.rounding'", "positive", "0.0"),
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_what_no_axle_is(mistake, tmp_path):
+    name, changes, parts = MISTAKES[mistake]
+    path = tmp_path / "mine.json"
+    path.write_text(json.dumps(changed(document(name), changes)), encoding="utf-8")
+    with pytest.raises(ValueError, match=says("Hardpoint file", "mine.json", *parts)):
+        Axle.load(path)
+
+
+def test_settings_that_there_are_not():
+    axle = Axle.load("five_link_suspension")
+    with pytest.raises(ValueError, match="`chassis` must be 'held' or 'guided', got 'heave'"):
+        axle.model(chassis="heave")
+    with pytest.raises(ValueError, match="`links` must be 'bodies' or 'rods', got 'ropes'"):
+        axle.model(links="ropes")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers import says
 from scipy.interpolate import PchipInterpolator
-from suspension_closures import Closure, corner_of, motion_ratio
+from suspension_closures import Closure, changed, corner_of, motion_ratio
 
 from lgsens.cli._main import main
 from lgsens.examples import QuarterCar, shipped
@@ -410,20 +410,6 @@ MISTAKES = {
         ),
     ),
 }
-
-
-def changed(scene, changes):
-    scene = copy.deepcopy(scene)
-    for place, value in changes.items():
-        *tables, key = place.split(".")
-        table = scene
-        for name in tables:
-            table = table[name]
-        if value is None:
-            del table[key]
-        else:
-            table[key] = value
-    return scene
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)

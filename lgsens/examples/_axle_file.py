@@ -142,4 +142,9 @@ def _bar(root: Reader, table: Reader, kilogram: float, links: Collection[str]) -
             "the lever has no length across y, or the drop link goes along it or along y and cannot turn it; "
             f"got bearing, end of lever and end of drop link {np.asarray(jnp.stack([bearing, lever, end])).tolist()}.",
         )
-    return Bar(bearing, lever, ends, table.number("mass", kilogram), section, _carrier(root, table))
+    bar = Bar(bearing, lever, ends, table.number("mass", kilogram), section, _carrier(root, table))
+    try:
+        bar.element("left", "right")
+    except ValueError as error:
+        raise table.fail("diameter", str(error)) from error
+    return bar
