@@ -12,7 +12,7 @@ import pytest
 from helpers import says
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
-from suspension_closures import changed
+from suspension_closures import Closure, changed, corner_of
 
 import lgsens as lg
 from lgsens.examples import Axle, QuarterCar, shipped
@@ -107,7 +107,7 @@ def driven(axle, **settings):
         for side, at in axle.wheel_centres.items()
     }
     rig = lg.Model(model.bodies, model.joints | up, model.forces)
-    return lambda left, right: lg.kinematics(rig, {"left": left, "right": right})
+    return lambda left, right, **others: lg.kinematics(rig, {"left": left, "right": right, **others})
 
 
 def turned(point, hinge, angle):
@@ -182,6 +182,29 @@ def test_every_axle_moves_as_its_corners(name, links):
         wheel = motion.body(f"{side}_wheel")
         np.testing.assert_allclose(wheel.position @ flip, corner.position, rtol=0, atol=1e-12)
         np.testing.assert_allclose(flip @ wheel.orientation @ flip, corner.orientation, rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_the_rack_steers_both_wheels():
+    """Rack to the left by up to 20 mm: as the closure whose tie rod begins there, on the right its mirror image."""
+    way = np.array([-0.02, 0.005, 0.02])
+    motion = driven(Axle.load("mcpherson"))(np.zeros(3), np.zeros(3), steering=way)
+
+    def wheel(shift):
+        closure = Closure(corner_of(document("mcpherson")))
+        closure.chassis[-1] += [0.0, shift, 0.0]  # of the tie rod, which comes after the two of the control arm
+        unknowns = closure.solve(0.0)
+        return closure.centre + unknowns[:3], Rotation.from_rotvec(unknowns[3:]).as_matrix()
+
+    for side, flip, sign in (("left", np.eye(3), 1.0), ("right", FLIP, -1.0)):
+        found = motion.body(f"{side}_wheel")
+        for i, shift in enumerate(way):
+            at, turn = wheel(sign * shift)
+            over = np.array([0.0, 0.0, 0.336])  # the closure's z is that of the file
+            # SciPy ends at 1e-14 m of closure, over arms of 0.2 m
+            np.testing.assert_allclose(found.position[i], flip @ (at + over), rtol=0, atol=1e-12)
+            np.testing.assert_allclose(found.orientation[i], flip @ turn @ flip, rtol=0, atol=1e-12)
+    assert np.abs(np.asarray(found.orientation[0]) - np.eye(3)).max() > 0.1
 
 
 # At rest.
