@@ -313,7 +313,10 @@ def test_one_number_is_of_both_sides():
 
 
 def test_preloads_that_are_given():
-    """They stay as they are, turned into the axes of the bushing, and mirrored: forces S f, moments −S m."""
+    """They stay as they are, turned into the axes of the bushing, and mirrored: forces S f, moments −S m.
+
+    Nor do they change what springs and tyres bear.
+    """
     axle = Axle.load("semi_trailing_arm")
     force, moment = jnp.asarray([100.0, 20.0, -3.0]), jnp.asarray([4.0, 5.0, 6.0])
     where = lambda a: (a.left.mounts["pivot"].preload, a.left.mounts["pivot"].rotational_preload)
@@ -324,6 +327,9 @@ def test_preloads_that_are_given():
             np.testing.assert_allclose(bushing.triad @ bushing.preload, s @ force, rtol=1e-14)
             handed = np.linalg.det(s) * s @ moment
             np.testing.assert_allclose(bushing.triad @ bushing.rotational_preload, handed, rtol=1e-14)
+    forces = given.model(tyres=True).forces
+    np.testing.assert_array_equal(forces["right_pivot_2"].preload, bushing.preload)
+    assert float(forces["left_tyre"].preload) == pytest.approx(9.81 * float(axle.mass) / 2, rel=1e-12)
 
 
 # What is refused: the file, where in it, what is put there (None: it goes), and what the message says.

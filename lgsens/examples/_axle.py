@@ -99,9 +99,9 @@ class Axle(eqx.Module):
             tyres: whether the wheels stand on a road, on `TyreSpring`s at their centres.
 
         The preloads of springs, tyres and bushings are those with which the whole car, guided and on tyres, rests:
-        of those that do, the bushings' are of least energy (`static_preload`). Bushings with preloads of their own keep
-        them, and the car then rests elsewhere. Raises `ValueError` for an unknown kind of chassis or links, and as
-        `QuarterCar.model`.
+        of those that do, the bushings' are of least energy (`static_preload`). Bushings with preloads of their own then
+        take these, and where they are others, the car rests elsewhere. Raises `ValueError` for an unknown kind of
+        chassis or links, and as `QuarterCar.model`.
         """
         check_choice("chassis", chassis, ("held", "guided"))
         check_choice("links", links, ("bodies", "rods"))
@@ -112,7 +112,7 @@ class Axle(eqx.Module):
         forces: dict[str, Any] = {"gravity": Gravity((0.0, 0.0, -GRAVITY))}
         bodies: dict[str, Any] = {}
         ends: dict[str, list[Any]] = {name: [] for name in shared}
-        sought = []
+        sought, given = [], {}
         for side, car in cars.items():
             mounts, held = car.mounts if compliant else {}, () if self.bar is None else (self.bar.link,)
             scene = corner_scene(car, wheel="locked", links=links, side=side, mounts=mounts, held=held)
@@ -121,7 +121,7 @@ class Axle(eqx.Module):
                 ends[body] += masses
             tyre = TyreSpring(f"{side}_wheel", at=car.wheel.centre, stiffness=car.tyre_stiffness)
             forces[f"{side}_tyre"] = tyre
-            sought += [f"{side}_tyre", *scene.sought]
+            sought, given = [*sought, f"{side}_tyre", *scene.sought], given | scene.given
             if self.bar is not None:
                 bar = self.bar if side == "left" else reflected(self.bar)
                 bodies[f"{side}_anti_roll_bar"] = bar.half().body()
@@ -130,7 +130,7 @@ class Axle(eqx.Module):
             forces["anti_roll_bar"] = self.bar.element("left_anti_roll_bar", "right_anti_roll_bar")
         bodies |= {name: part.body(ends[name]) for name, part in shared.items() if name != "chassis"}
         frame = lambda free: {"chassis": shared["chassis"].body(ends["chassis"], free)}
-        forces = static_preload(Model(bodies | frame("z rx"), joints, forces), sought)[0].forces
+        forces = static_preload(Model(bodies | frame("z rx"), joints, forces), sought)[0].forces | given
         forces = {name: force for name, force in forces.items() if tyres or not name.endswith("_tyre")}
         return Model(bodies | frame(() if chassis == "held" else "z rx"), joints, forces)
 

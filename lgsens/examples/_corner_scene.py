@@ -18,7 +18,8 @@ class CornerScene(NamedTuple):
 
     Attributes:
         ends: by body that it shares with others, masses [kg] and places [m] of ends of rods on it.
-        sought: its forces whose preloads are not given.
+        sought: its forces whose preloads hold the car; those of `given` among them.
+        given: its bushings that have preloads of their own.
     """
 
     bodies: dict[str, RigidBody]
@@ -26,6 +27,7 @@ class CornerScene(NamedTuple):
     forces: dict[str, AbstractForce]
     ends: dict[str, list[tuple[Array, Array]]]
     sought: list[str]
+    given: dict[str, AbstractForce]
 
 
 def connections(
@@ -79,7 +81,7 @@ def corner_scene(
     parts = {"knuckle": car.knuckle, "wheel": car.wheel}
     parts |= {name: link.part(car.link_radius) for name, link in car.links.items() if name not in rods}
     ends: dict[str, list[tuple[Array, Array]]] = {}
-    joints, forces, sought = {}, {}, [own + "spring"]
+    joints, forces, sought, given = {}, {}, [own + "spring"], {}
     hub: dict[str, Any] = {"at": car.bearing} | ({"axis": ALONG_Y} if wheel == "hinged" else {})
     joints[f"{own}hub"] = (RevoluteJoint if hub.keys() > {"at"} else FixedJoint)(own + "knuckle", own + "wheel", **hub)
     for name, rod in rods.items():
@@ -98,8 +100,9 @@ def corner_scene(
         a, b = map(named(""), place.between)
         bushings = dict(mount.elements(own + name, a, b, place.at))
         forces |= bushings
-        sought += bushings if mount.preload is None else ()
+        sought += bushings
+        given |= {} if mount.preload is None else bushings
     bodies = {own + name: part.body(ends.pop(own + name, ())) for name, part in parts.items()}
     forces |= {own + key: strut.element(key, named=named(key)) for key, strut in struts.items()}
     forces |= {own + key: stop.element(named(key)) for key, stop in car.stops.items()}
-    return CornerScene(bodies, joints, forces, ends, sought)
+    return CornerScene(bodies, joints, forces, ends, sought, given)
