@@ -1,10 +1,15 @@
-"""Rubber bushings: rates or curves along and about three axes."""
+"""Rubber bushings in place of joints: rates or curves along and about three axes."""
+
+import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import point_field
+from lgsens._validate import as_float, point_field, require
+from lgsens.liegroups import cross
 from lgsens.model._forces import AbstractForce, Attached, _frame
 from lgsens.model._loads import BushingLoad
 from lgsens.model._signals import AbstractSignal, prepared
@@ -20,23 +25,26 @@ class Bushing(AbstractForce):
     Arguments:
         a, b: names of the two bodies; None is the ground.
         at: where it is in the reference configuration [m], inertial frame, shape (3,): both points are there.
-        stiffness: the spring stiffnesses [N/m] along x, y and z of the inertial frame in the reference
-            configuration, shape (3,). The axes turn with a.
+        stiffness: the spring stiffnesses [N/m] along its axes in the reference configuration, shape (3,). The axes turn
+            with a.
         damping: the damping along the same axes [N s/m], shape (3,).
-        preload: the force g₀ that pulls b to a in the reference configuration [N], inertial frame, shape (3,).
-        rotational_stiffness, rotational_damping: K_r [N m/rad] and C_r [N m s/rad] about x, y and z of the inertial
-            frame in the reference configuration, shape (3,); None: 0.
-        rotational_preload: the moment m₀ that turns b back there [N m], inertial frame, shape (3,); None: 0.
+        preload: the force g₀ that pulls b to a in the reference configuration [N], along the same axes, shape (3,).
+        rotational_stiffness, rotational_damping: K_r [N m/rad] and C_r [N m s/rad] about the same axes, shape (3,);
+            None: 0.
+        rotational_preload: the moment m₀ that turns b back there [N m], about the same axes, shape (3,); None: 0.
         springs, dampers: curves in place of rates, or added to them: of each axis f_i [N] over u_i [m] and g_i over
             u̇_i [m/s], a signal of it in place of time, or None; three of them; None: none.
             `Sampled(places, forces, "monotone")` goes through points, C¹, and straight on outside of them.
         rotational_springs, rotational_dampers: likewise, moments [N m] over φ_i [rad] and φ̇_i [rad/s].
+        axes: the first of its axes, and a direction in the plane of the first and the second, inertial frame, shape
+            (2, 3), any lengths > 0; None: x, y and z of the inertial frame.
 
     With nothing rotational it resists no rotation, and costs nothing for it, nor for curves that it does not have. It
     is as smooth as its curves, its tangents one derivative less. The moments do the work −m·φ̇: on b acts −m but for
     terms of second order in φ. A force between bodies that is stiffer by orders than the others makes explicit
-    integrators take as many more steps; generalized-α does not mind. Raises `ValueError` for wrong shapes, and for
-    curves that are not three signals or None. Source: Masarati & Morandini (2010), doi:10.1007/s11044-010-9194-y.
+    integrators take as many more steps; generalized-α does not mind. Raises `ValueError` for wrong shapes, axes that
+    are none, and curves that are not three signals or None. Source: Masarati & Morandini (2010),
+    doi:10.1007/s11044-010-9194-y.
     """
 
     a: str | None = eqx.field(static=True)
@@ -52,6 +60,9 @@ class Bushing(AbstractForce):
     dampers: Curves | None = eqx.field(default=None, kw_only=True)
     rotational_springs: Curves | None = eqx.field(default=None, kw_only=True)
     rotational_dampers: Curves | None = eqx.field(default=None, kw_only=True)
+    axes: Float[Array, "2 3"] | None = eqx.field(
+        default=None, kw_only=True, converter=lambda axes: None if axes is None else as_float(axes, (2, 3), "`axes`")
+    )
 
     def __check_init__(self):
         for name in ("springs", "dampers", "rotational_springs", "rotational_dampers"):
@@ -66,22 +77,58 @@ class Bushing(AbstractForce):
                     f"Bushing: `{name}` must be a tuple of three, each a signal (Sampled, Polynomial, …) or None, got "
                     f"{curves!r}; constant rates are `stiffness` and `damping`."
                 )
+        require(
+            lambda axes: np.linalg.norm(np.cross(*axes)) > 1e-6 * np.prod(np.linalg.norm(axes, axis=1)),
+            f"Bushing: `axes` {self.axes} lie along each other or are zero; give two directions.",
+            np.eye(2, 3) if self.axes is None else self.axes,
+        )
 
     @property
     def bodies(self):
         return (self.a, self.b)
 
-    preload_shape = (3,)
+    @property
+    def _turns(self) -> bool:
+        """Whether it resists rotation."""
+        return self.rotational_stiffness is not None or self.rotational_springs is not None
+
+    @property
+    def preload_shape(self):
+        return (6,) if self._turns else (3,)
+
+    def with_preload(self, preload):
+        if not self._turns:
+            return dataclasses.replace(self, preload=preload)
+        return dataclasses.replace(self, preload=preload[:3], rotational_preload=preload[3:])
+
+    @property
+    def preload_rates(self):
+        if not self._turns:
+            return None
+        slopes = self.stiffness + _slopes(self.springs, self.at.dtype)
+        turning = jnp.zeros_like(self.at) if self.rotational_stiffness is None else self.rotational_stiffness
+        return jnp.concatenate([slopes, turning + _slopes(self.rotational_springs, self.at.dtype)])
+
+    @property
+    def triad(self) -> Float[Array, "3 3"]:
+        """Unit vectors along its axes as columns, inertial frame."""
+        first, second = jnp.eye(2, 3, dtype=self.at.dtype) if self.axes is None else self.axes
+        third = cross(first, second)
+        columns = jnp.stack([first, cross(third, first), third], axis=1)
+        return columns / jnp.linalg.norm(columns, axis=0, keepdims=True)
 
     def loads(self, bodies):
         a, b = (_frame(bodies, name, self.at.dtype) for name in (self.a, self.b))
-        back = a.orientation.T
+        triads = [frame.orientation.T for frame in (a, b)]
+        if self.axes is not None:
+            triads = [triad @ self.triad for triad in triads]
+        back = triads[0]
         load = BushingLoad(
             point_a=a.local_point(self.at),
             point_b=b.local_point(self.at),
-            stiffness=(back * self.stiffness[None]) @ a.orientation,
-            damping=(back * self.damping[None]) @ a.orientation,
-            preload=a.local_axis(self.preload),
+            stiffness=(back * self.stiffness[None]) @ back.T,
+            damping=(back * self.damping[None]) @ back.T,
+            preload=back @ self.preload,
         )
         ready = lambda curves: None if curves is None else tuple(map(prepared, curves))
         if self.springs is not None or self.dampers is not None:
@@ -90,5 +137,12 @@ class Bushing(AbstractForce):
         curves = {"springs": ready(self.rotational_springs), "dampers": ready(self.rotational_dampers)}
         if any(numbers is not None for numbers in (*about, *curves.values())):
             k, c, m = (jnp.zeros_like(self.at) if numbers is None else numbers for numbers in about)
-            load = LoadSum((load, RotationLoad(back, b.orientation.T, k, c, m, **curves)))
+            load = LoadSum((load, RotationLoad(triads[0], triads[1], k, c, m, **curves)))
         return (Attached(load, self.a, self.b),)
+
+
+def _slopes(curves: Curves | None, dtype) -> Float[Array, "3"]:
+    """The rates of curves where they begin to yield."""
+    zero, one = jnp.zeros((), dtype), jnp.ones((), dtype)
+    slope = lambda curve: zero if curve is None else jax.jvp(prepared(curve), (zero,), (one,))[1]
+    return jnp.stack([slope(curve) for curve in curves or (None, None, None)])

@@ -48,11 +48,13 @@ class AbstractForce(eqx.Module):
     velocity [ẋ, Ω], ẋ in the inertial frame, Ω in that of the body. `lgsens.testing.check_force` checks a force.
 
     `preload_shape` is that of its `preload`, in which its force is linear, for `static_preload`; None: it has none.
+    `preload_rates` are those with which its members grow as it yields; None: it takes what equilibrium asks of it.
     `on_merged` says whether its loads on bodies that fixed joints merge are one load on what they are merged to;
     `reads` is the name of the joint whose multipliers its loads depend on (`AbstractDynamicLoad`), None for almost all.
     """
 
-    preload_shape: ClassVar[tuple[int, ...] | None] = None
+    preload_shape: ClassVar[Any] = None
+    preload_rates: ClassVar[Any] = None
     on_merged: ClassVar[bool] = False
     reads: ClassVar[Any] = None
 

@@ -82,9 +82,7 @@ def differences(f):
 
 
 @pytest.mark.slow  # `test_radau.py` has a scheme of this kind in the quick run
-@pytest.mark.parametrize(
-    "integrator", [pytest.param(MIDPOINT, id="equal"), pytest.param(GIVEN, id="given")]
-)
+@pytest.mark.parametrize("integrator", [pytest.param(MIDPOINT, id="equal"), pytest.param(GIVEN, id="given")])
 def test_both_modes_on_every_grid(integrator):
     f = lambda p: psi(p, integrator=integrator)
     expected = differences(f)
