@@ -22,7 +22,7 @@ from lgsens.model._loads import (
     Weight,
 )
 from lgsens.model._roads import FlatRoad
-from lgsens.model._signals import AbstractSignal, prepared, signal_field
+from lgsens.model._signals import AbstractSignal, Constant, prepared, signal_field
 from lgsens.model._turning_loads import FollowingForce, FullBushingLoad, RotationLoad
 
 
@@ -62,6 +62,10 @@ class AbstractForce(eqx.Module):
     def with_preload(self, preload) -> "AbstractForce":
         """The same element with this preload in the reference configuration."""
         return dataclasses.replace(self, preload=preload)
+
+    def with_factor(self, factor) -> "AbstractForce | None":
+        """The same element multiplied by a number in place of a signal; None: no signal multiplies it."""
+        return None
 
     @abc.abstractmethod
     def loads(self, bodies: Mapping[str, RigidBody]) -> tuple[Attached, ...]:
@@ -297,6 +301,9 @@ class AppliedForce(AbstractForce):
     moment: Float[Array, "3"] = point_field("moment", default=(0.0, 0.0, 0.0))
     signal: AbstractSignal = signal_field("signal", default_factory=_one)
     follows: bool = eqx.field(static=True, default=False, kw_only=True)
+
+    def with_factor(self, factor):
+        return dataclasses.replace(self, signal=Constant(value=factor))
 
     @property
     def bodies(self):

@@ -14,7 +14,7 @@ from lgsens.model._drivers import Angle
 from lgsens.model._elements import body_fixed
 from lgsens.model._frames import BODY_B, ROTATION, ROTATION_B, TRANSLATION_B, TURNING_A, TURNING_B, embedded
 from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, BushingLoad, LoadTangents
-from lgsens.model._signals import AbstractSignal, Prescribed, at_time
+from lgsens.model._signals import AbstractSignal, Prescribed, at_time, constant_of
 from lgsens.model._stack import constraint_jacobian, load_tangents
 
 
@@ -122,6 +122,10 @@ class FollowingForce(AbstractClosedFormLoad):
     vector: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
     moment: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
     signal: AbstractSignal
+
+    @property
+    def driven(self):
+        return constant_of(self.signal)
 
     def force(self, a, b, va, vb, t):
         zero = jnp.zeros(BODY_B.start, self.vector.dtype)
