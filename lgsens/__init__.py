@@ -121,6 +121,7 @@ _NAMESPACES = (
     "examples",
     "optimize",
     "plotting",
+    "rigs",
     "testing",
 )  # imported when first used: optax and matplotlib take their time
 

@@ -170,12 +170,12 @@ def factorizations(jaxpr) -> int:
 
 def test_one_factorization_for_all_parameters():
     """The derivative by every number of the model adds one factorization, a batch over the positions."""
-    from lgsens.analysis._kinematics import _Drive, _drivers
+    from lgsens.analysis._driven import Drive, drivers
 
     system = driven_four_bar().system()
     values = jnp.asarray(ANGLES[:5, None])
-    where = (_drivers(system)["motor"],)
-    place = lambda system: positions(_Drive(system, where), values, jnp.zeros(5)).q.position[:, 1]
+    where = (drivers(system)["motor"],)
+    place = lambda system: positions(Drive(system, where), values, jnp.zeros(5)).q.position[:, 1]
     forward = jax.make_jaxpr(place)(system).jaxpr
     backward = jax.make_jaxpr(lambda s: jax.vjp(place, s)[1](jnp.ones((5, 3))))(system).jaxpr
     assert factorizations(backward) == factorizations(forward) + 1

@@ -21,6 +21,7 @@ RANKS = (
     ("criteria",),
     ("analysis",),
     ("sweeps", "examples"),
+    ("rigs",),
     ("plotting",),
     ("accuracy", "optimize", "testing"),
     ("cli",),
