@@ -54,41 +54,33 @@ class StaticPath(NamedTuple):
     pivot: Float[Array, " n"]  # the smallest pivot of the scaled K over the largest: 0 where it is singular
 
 
-class _Scaled(NamedTuple):
-    """K in units in which coordinates and multipliers are of order one: lengths of the scene, rad, and `force`."""
+class _Factors(NamedTuple):
+    """K in factors, in units in which coordinates and multipliers are of order one: lengths of the scene, rad, `force`."""
 
+    lu: LU
     coordinate: Float[Array, " k"]
     force: Float[Array, ""]  # J, the size of K_t in these units
+
+    def residual(self, force, violation):
+        return jnp.concatenate([force * self.coordinate / self.force, violation])
 
     def parts(self, y):
         k = self.coordinate.shape[0]
         return y[:k] * self.coordinate, y[k:] * self.force
 
-    def residual(self, force, violation):
-        return jnp.concatenate([force * self.coordinate / self.force, violation])
 
-    def unknowns(self, w, lam):
-        return jnp.concatenate([w / self.coordinate, lam / self.force])
-
-    def matrix(self, tangents):
-        jacobian = tangents.constraint_jacobian * self.coordinate[None, :]
-        stiffness = tangents.stiffness * self.coordinate[None, :] * (self.coordinate / self.force)[:, None]
-        corner = jnp.zeros((jacobian.shape[0],) * 2, jacobian.dtype)
-        return jnp.block([[stiffness, jacobian.T], [jacobian, corner]])
-
-
-def _tangents(system, q, lam, t):
+def _matrix(drive: AbstractDrive, values, q, lam, t):
+    """K and its units."""
+    system = drive.at(values)
     zero = jnp.zeros_like(system.reference()[1])
-    return system.tangents(q, zero, zero, lam, t)
-
-
-def _scaling(drive: AbstractDrive, t) -> _Scaled:
-    system = lax.stop_gradient(drive.system)
-    scale = system.coordinate_scale()
-    q, v = system.reference()
-    stiffness = _tangents(system, q, jnp.zeros(len(system.constraint_names), v.dtype), t).stiffness
-    size = jnp.max(jnp.abs(stiffness * scale[None, :] * scale[:, None]))
-    return _Scaled(scale, jnp.where(size > 0, size, 1.0))
+    tangents = system.tangents(q, zero, zero, lam, t)
+    scale = lax.stop_gradient(drive.system.coordinate_scale())
+    stiffness = tangents.stiffness * scale[None, :] * scale[:, None]
+    size = lax.stop_gradient(jnp.max(jnp.abs(stiffness)))
+    size = jnp.where(size > 0, size, 1.0)
+    jacobian = tangents.constraint_jacobian * scale[None, :]
+    corner = jnp.zeros((jacobian.shape[0],) * 2, jacobian.dtype)
+    return jnp.block([[stiffness / size, jacobian.T], [jacobian, corner]]), (scale, size)
 
 
 def _residual(drive: AbstractDrive, values, q, lam, t):
@@ -107,8 +99,7 @@ def _response(drive: AbstractDrive, values, rates, q, lam, w, lam_rate, t):
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
     """y and z at each point; the points `starts` are found from the first one, that one from the reference."""
-    group, scaled = drive.system.group, _scaling(drive, t)
-    system, (home, v) = drive.system, drive.system.reference()
+    group, system, (home, v) = drive.system.group, drive.system, drive.system.reference()
     k, m, dtype = v.shape[0], len(system.constraint_names), v.dtype
     n, precise = values.shape[0], float(jnp.finfo(dtype).eps) ** 0.5
     begins = jnp.zeros(n, bool).at[jnp.asarray((0, *starts))].set(True)
@@ -118,23 +109,23 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
     rates = jnp.concatenate([rates, ahead[:, None]], axis=1)
 
     def factorize(s, q, lam):
-        return LU.of(scaled.matrix(_tangents(drive.at(s), q, lam, t)))
+        matrix, units = _matrix(drive, s, q, lam, t)
+        return _Factors(LU.of(matrix), *units)
 
-    def move(q, lam, step):
-        w, change = scaled.parts(step)
+    def move(q, lam, w, change):
         return group.retract(q, w), lam + change
 
     def newton(s, q, lam, factors, stale):
         def body(carry):
             q, lam, factors, stale, size, iteration, _ = carry
             factors = lax.cond(stale, lambda: factorize(s, q, lam), lambda: factors)
-            step = -factors.solve(scaled.residual(*_residual(drive, s, q, lam, t)))
+            step = -factors.lu.solve(factors.residual(*_residual(drive, s, q, lam, t)))
             left = jnp.max(jnp.abs(step))
             # Far from the solution a full step may leave the branch: at most 0.2 rad or a fifth of the scene at a time.
-            q, lam = move(q, lam, step * jnp.minimum(1.0, 0.2 / jnp.maximum(jnp.max(jnp.abs(step[:k])), 0.2)))
+            step = step * jnp.minimum(1.0, 0.2 / jnp.maximum(jnp.max(jnp.abs(step[:k])), 0.2))
+            q, lam = move(q, lam, *factors.parts(step))
             small = left <= precise
-            done = small & stale
-            return q, lam, factors, small | (left > _SLOW * size), left, iteration + 1, done
+            return q, lam, factors, small | (left > _SLOW * size), left, iteration + 1, small & stale
 
         def unfinished(carry):
             *_, iteration, done = carry
@@ -146,29 +137,29 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
 
     def respond(s, rates, q, lam, factors):
         def refine(z, _):
-            parts = jax.vmap(lambda z, rate: _response(drive, s, rate, q, lam, *scaled.parts(z), t))
-            left = jax.vmap(scaled.residual)(*parts(z, rates))
-            return z - factors.solve(left.T).T, None
+            left = jax.vmap(lambda z, rate: _response(drive, s, rate, q, lam, *factors.parts(z), t))(z, rates)
+            return z - factors.lu.solve(jax.vmap(factors.residual)(*left).T).T, None
 
-        return scan(refine, jnp.zeros((rates.shape[0], k + m), dtype), None, length=2)[0]
+        z = scan(refine, jnp.zeros((rates.shape[0], k + m), dtype), None, length=2)[0]
+        return jax.vmap(factors.parts)(z)
 
     def follow(carry, row):
         home, before, factors, held = carry
         s, rates, begins, first = row
         q, lam = jax.tree.map(lambda far, near: jnp.where(begins, far, near), home, before)
         q, lam, factors, done = newton(s, q, lam, factors, begins | ~held)
-        z = respond(s, rates, q, lam, factors)
+        w, lam_rate = respond(s, rates, q, lam, factors)
         keep = lambda new, old: jnp.where(done, new, old)
-        after = jax.tree.map(keep, move(q, lam, z[-1]), before)
+        after = jax.tree.map(keep, move(q, lam, w[-1], lam_rate[-1]), before)
         home = jax.tree.map(lambda new, old: jnp.where(first & done, new, old), (q, lam), home)
-        pivots = jnp.abs(jnp.diagonal(factors.lu))
-        w, lam_rate = jax.vmap(scaled.parts)(z[:-1])
-        return (home, after, factors, done), (q, lam, w, lam_rate, done.astype(dtype), jnp.min(pivots) / jnp.max(pivots))
+        pivots = jnp.abs(jnp.diagonal(factors.lu.lu))
+        ended = done.astype(dtype), jnp.min(pivots) / jnp.max(pivots)
+        return (home, after, factors, done), (q, lam, w[:-1], lam_rate[:-1], *ended)
 
-    size = k + m
-    whole = jnp.arange(size, dtype=jnp.int32)
+    whole = jnp.arange(k + m, dtype=jnp.int32)
     start = home, jnp.zeros(m, dtype)
-    factors = LU(jnp.zeros((size, size), dtype), whole, whole)
+    none = LU(jnp.zeros((k + m, k + m), dtype), whole, whole)
+    factors = _Factors(none, jnp.ones(k, dtype), jnp.ones((), dtype))
     rows = values, rates, begins, jnp.arange(n) == 0
     return scan(follow, (start, start, factors, jnp.zeros((), bool)), rows)[1]
 
@@ -178,16 +169,17 @@ def _path_jvp(starts, primals, tangents):
     drive, values, rates, t = primals
     drive_dot, values_dot, rates_dot, t_dot = tangents
     q, lam, w, lam_rate, *ended = _path(starts, *primals)
-    group, scaled = drive.system.group, _scaling(drive, t)
+    group = drive.system.group
 
-    def tangent(q, lam, w, lam_rate, s, rate, s_dot, rate_dot):
-        matrix = scaled.matrix(_tangents(drive.at(s), q, lam, t))
-        factors = LU.of(lax.stop_gradient(matrix))
+    def tangent(_, row):
+        q, lam, w, lam_rate, s, rate, s_dot, rate_dot = row
+        matrix, units = _matrix(drive, s, q, lam, t)
+        factors = _Factors(LU.of(lax.stop_gradient(matrix)), *units)
 
         def solve(force, violation):
-            once = lambda transposed: lambda _, b: factors.solve(b[:, None], transposed=transposed)[:, 0]
-            rhs = scaled.residual(force, violation)
-            return scaled.parts(-linear_solve(lambda x: matrix @ x, rhs, once(False), once(True)))
+            once = lambda transposed: lambda _, b: factors.lu.solve(b[:, None], transposed=transposed)[:, 0]
+            rhs = factors.residual(force, violation)
+            return factors.parts(-linear_solve(lambda x: matrix @ x, rhs, once(False), once(True)))
 
         at = lambda drive, s, t: _residual(drive, s, q, lam, t)
         x, mu = solve(*jax.jvp(at, (drive, s, t), (drive_dot, s_dot, t_dot))[1])
@@ -197,10 +189,12 @@ def _path_jvp(starts, primals, tangents):
             of = lambda drive, s, q, lam, t, rate: _response(drive, s, rate, q, lam, w, lam_rate, t)
             return solve(*jax.jvp(of, (drive, s, q, lam, t, rate), (*moved, rate_dot))[1])
 
-        return moved[2], mu, *jax.vmap(change)(w, lam_rate, rate, rate_dot)
+        return None, (moved[2], mu, *jax.vmap(change)(w, lam_rate, rate, rate_dot))
 
+    # One point after the other: what all directions need of one stays in the processor's cache.
     rows = q, lam, w, lam_rate, values, rates, values_dot, rates_dot
-    return (q, lam, w, lam_rate, *ended), (*jax.vmap(tangent)(*rows), *jax.tree.map(jnp.zeros_like, ended))
+    tangents = scan(tangent, None, rows)[1]
+    return (q, lam, w, lam_rate, *ended), (*tangents, *jax.tree.map(jnp.zeros_like, ended))
 
 
 def static_path(

@@ -40,7 +40,8 @@ the velocity of the wheel centre, d = ±ω/|ω| upward and c + ω × v/|ω|² is
 
 Steering. The ratio is the turn of the steering wheel per mean steer angle. Ackermann compares with wheels whose axes
 meet on the line of the other axle, cot δ_o − cot δ_i = b/l for the outer and inner one: the share (cot δ_o − cot δ_i) l/b
-is 1 there and 0 for parallel steering, and it is not determined, NaN, within half a degree of straight ahead.
+is 1 there and 0 for parallel steering, with angles from the middle of the sweep (without static toe). It is not
+determined, NaN, within half a degree of straight ahead.
 
 Sources: ISO 8855:2011 (axes, angles, offsets, roll centre); Gillespie (1992), chapter 7 (anti-features, Ackermann);
 Reimpell, Stoll & Betzler (2001), chapter 3 (steering axis, roll centre, rates).
@@ -58,6 +59,7 @@ from lgsens._validate import number_field
 from lgsens.analysis import Statics
 from lgsens.examples import wheel_plane
 from lgsens.rigs._pads import SIDES, tyre_axes
+from lgsens.rigs._sweeps import RACK
 
 NOT_STEERED = np.radians(0.5)  # within which Ackermann's share is not determined
 
@@ -122,7 +124,7 @@ class AxleCurves(NamedTuple):
         scrub_radius, trail: where it meets the road, from the contact centre [m], shape (n, 2).
         steer_per_rack: derivative of the steer angles by the way of the rack [rad/m], shape (n, 2).
         steering_ratio: turn of the steering wheel per mean steer angle [–], shape (n,).
-        ackermann: share of Ackermann's condition [–], shape (n,).
+        ackermann: share of Ackermann's condition, of sweeps that steer [–], shape (n,).
         force_roll_centre_height: from the forces under lateral ones [m], shape (n,).
         anti_dive, anti_lift, anti_squat: [–], 1 for a car that does not pitch, shape (n,).
     """
@@ -219,7 +221,6 @@ def axle_curves(found: Statics, centres: Float[Array, "2 3"], vehicle: Vehicle) 
         **_steering_axis(combined(spin), combined(velocity), axis, centre, centres, side),
         steer_per_rack=steer,
         steering_ratio=ratio,
-        ackermann=_ackermann(wheels.steer, vehicle.wheelbase / apart),
     )
 
 
@@ -230,6 +231,9 @@ def of_sweep(curves: AxleCurves, shares: tuple[tuple[str, float], ...], centres,
     if lateral := total("lateral"):
         moment = jnp.sum((centres[None, :, 1] + curves.wheels.contact_y) * force, axis=1)
         curves = curves._replace(force_roll_centre_height=-moment / lateral)
+    if dict(shares).get(RACK):
+        y = centres[None, :, 1] + curves.wheels.contact_y
+        curves = curves._replace(ackermann=_ackermann(curves.wheels.steer, vehicle.wheelbase / (y[:, 0] - y[:, 1])))
     lever = vehicle.wheelbase / vehicle.centre_height
     if braking := total("braking"):
         support = vehicle.braking_share * lever * jnp.sum(force, axis=1) / braking
@@ -280,7 +284,7 @@ def _steering_axis(spin, velocity, axis, centre, centres, side) -> dict[str, Arr
 
 def _ackermann(steer, ratio):
     """(cot δ_R − cot δ_L) l/b, alike in both turns; NaN near straight ahead."""
+    steer = steer - steer[len(steer) // 2][None]
     turned = jnp.all(jnp.abs(steer) > NOT_STEERED, axis=1)
-    sines = jnp.prod(jnp.sin(steer), axis=1)
-    share = jnp.sin(steer[:, 0] - steer[:, 1]) / jnp.where(turned, sines, 1.0) * ratio
-    return jnp.where(turned, share, jnp.nan)
+    sines = jnp.where(turned, jnp.prod(jnp.sin(steer), axis=1), 1.0)
+    return jnp.where(turned, jnp.sin(steer[:, 0] - steer[:, 1]) / sines * ratio, jnp.nan)
