@@ -60,9 +60,7 @@ def small_axle(p=None, *, compliant=True, two_sided=False):
         joints[f"{side}_tie"] = lg.DistanceJoint("rack", wheel, at_a=at["tie_rack"], at_b=at["tie_wheel"])
         ends = {"at_a": at["spring_arm"], "at_b": at["spring_top"]}
         lower = f"{side}_lower"
-        forces[f"{side}_spring"] = lg.SpringDamper(
-            lower, None, **ends, stiffness=own["spring"], preload=own["preload"]
-        )
+        forces[f"{side}_spring"] = lg.SpringDamper(lower, None, **ends, stiffness=own["spring"], preload=own["preload"])
         forces[f"{side}_damper"] = lg.SpringDamper(lower, None, **ends, stiffness=0.0, damping=3000.0)
     bar = p[0]["bar"] if two_sided else p["bar"]
     forces["anti_roll_bar"] = lg.TorsionSpringDamper("left_lower", "right_lower", axis=(0.0, 1.0, 0.0), stiffness=bar)

@@ -55,7 +55,7 @@ class StaticPath(NamedTuple):
 
 
 class _Factors(NamedTuple):
-    """K in factors, in units in which coordinates and multipliers are of order one: lengths of the scene, rad, `force`."""
+    """K in factors, in units in which its unknowns are of order one: lengths of the scene, rad, and `force`."""
 
     lu: LU
     coordinate: Float[Array, " k"]

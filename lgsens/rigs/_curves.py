@@ -14,8 +14,8 @@ distance of the contact centres:
     roll centre   ½ Σ P_y P_y′/P_z′  each by the pad of its wheel: over the road, where the normals to the paths of the
                                      contact centres in front view meet the middle of the car, in the mean of both sides
 
-Force-based roll centre. Under lateral forces at the contact centres, with the pads held, springs and body stay where they
-are, and the links alone change the vertical forces by F′; their moment about x is that of Σ F_y′ at the height
+Force-based roll centre. Under lateral forces at the contact centres, with the pads held, springs and body stay where
+they are, and the links alone change the vertical forces by F′; their moment about x is that of Σ F_y′ at the height
 
     h = −Σ P_y F′ / Σ F_y′     along "lateral", in phase:
 
@@ -39,9 +39,9 @@ the velocity of the wheel centre, d = ±ω/|ω| upward and c + ω × v/|ω|² is
     trail (caster offset)  (X − P)·X_T             positive with X in front of P
 
 Steering. The ratio is the turn of the steering wheel per mean steer angle. Ackermann compares with wheels whose axes
-meet on the line of the other axle, cot δ_o − cot δ_i = b/l for the outer and inner one: the share (cot δ_o − cot δ_i) l/b
-is 1 there and 0 for parallel steering, with angles from the middle of the sweep (without static toe). It is not
-determined, NaN, within half a degree of straight ahead.
+meet on the line of the other axle, cot δ_o − cot δ_i = b/l for the outer and inner one: the share (cot δ_o −
+cot δ_i) l/b is 1 there and 0 for parallel steering, with angles from the middle of the sweep (without static toe). It
+is not determined, NaN, within half a degree of straight ahead.
 
 Sources: ISO 8855:2011 (axes, angles, offsets, roll centre); Gillespie (1992), chapter 7 (anti-features, Ackermann);
 Reimpell, Stoll & Betzler (2001), chapter 3 (steering axis, roll centre, rates).
@@ -115,7 +115,8 @@ class AxleCurves(NamedTuple):
         wheels: how the wheels stand.
         rates: their derivatives by `value`: bump and roll steer, compliances.
         track_change, wheelbase_change: of the contact centres [m], in the mean of both sides, shape (n,).
-        roll_angle: of the body over its wheels [rad], positive with the right wheel up, shape (n,).
+        roll_angle, roll_angle_rate: of the body over its wheels [rad], positive with the right wheel up, and its
+            derivative by `value`, shape (n,).
         spring_motion_ratio, damper_motion_ratio: compression per wheel travel [–], shape (n, 2).
         wheel_rate: vertical force per wheel travel [N/m], both wheels moving alike, shape (n, 2).
         roll_rate: moment per roll angle [N m/rad], shape (n,).
@@ -135,6 +136,7 @@ class AxleCurves(NamedTuple):
     track_change: Float[Array, " n"]
     wheelbase_change: Float[Array, " n"]
     roll_angle: Float[Array, " n"]
+    roll_angle_rate: Float[Array, " n"]
     spring_motion_ratio: Float[Array, "n 2"] | None
     damper_motion_ratio: Float[Array, "n 2"] | None
     wheel_rate: Float[Array, "n 2"]
@@ -183,16 +185,19 @@ def axle_curves(found: Statics, centres: Float[Array, "2 3"], vehicle: Vehicle) 
     own = lambda name: jnp.stack([getattr(left, name)[:, 0], getattr(right, name)[:, 1]], axis=1)
     both, against = (jax.tree.map(lambda l, r, sign=sign: sign * l + r, left, right) for sign in (1.0, -1.0))
     y = centres[None, :, 1] + wheels.contact_y
-    apart = y[:, 0] - y[:, 1]
-    rolling = (against.travel[:, 1] - against.travel[:, 0]) / apart
+    difference = lambda of: of[:, 1] - of[:, 0]
+    apart, rise = -difference(y), difference(wheels.travel)
+    rolling = difference(against.travel) / apart
     contact_rise = jnp.stack([by[1, :, 0, -1], by[2, :, 1, -1]], axis=1)
     curves = AxleCurves(
         value=jnp.zeros_like(y[:, 0]),
         wheels=wheels,
         rates=rates[0],
-        track_change=wheels.contact_y[:, 0] - wheels.contact_y[:, 1],
+        track_change=-difference(wheels.contact_y),
         wheelbase_change=(-1.0 if vehicle.rear else 1.0) * jnp.mean(wheels.contact_x, axis=1),
-        roll_angle=jnp.arctan2(wheels.travel[:, 1] - wheels.travel[:, 0], apart),
+        roll_angle=jnp.arctan2(rise, apart),
+        roll_angle_rate=(difference(rates[0].travel) * apart + rise * difference(rates[0].contact_y))
+        / (rise**2 + apart**2),
         spring_motion_ratio=None,
         damper_motion_ratio=None,
         wheel_rate=both.force / both.travel,

@@ -1,9 +1,9 @@
 """What a rig does to a wheel: a pad that lifts its contact centre, and the loads of its tyre.
 
 Let e be the spin axis, to the left, c the wheel centre and P = c − r u the contact centre (`wheel_plane`), which moves
-in the wheel as this turns. A pad without friction prescribes the height of P: as the tangent of the wheel at P is level,
-the constraint force of Φ = P·e_z − z₀ − s is a vertical force at P. Loads have the directions of the tyre axis system of
-ISO 8855: X_T = e × e_z/|…|, the trace of the wheel plane on the road, forward; Z_T up; Y_T to the left.
+in the wheel as this turns. A pad without friction prescribes the height of P: as the tangent of the wheel at P is
+level, the constraint force of Φ = P·e_z − s is a vertical force at P. Loads have the directions of the tyre axis system
+of ISO 8855: X_T = e × e_z/|…|, the trace of the wheel plane on the road, forward; Z_T up; Y_T to the left.
 """
 
 import dataclasses
@@ -47,14 +47,11 @@ def tyre_axes(axis: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 class ContactHeight(AbstractConstraint):
-    """The contact centre of b, at height z₀ in the reference configuration, is s higher; λ is the force on the pad [N].
-
-    Φ = P·e_z − z₀ − s."""
+    """The contact centre of b has the height s over the road, z = 0: Φ = P·e_z − s; λ is the force on the pad [N]."""
 
     centre_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
     axis_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
     radius: Float[Array, ""]
-    height: Float[Array, ""]
     displacement: Float[Array, ""]
 
     drawn = None
@@ -69,7 +66,7 @@ class ContactHeight(AbstractConstraint):
 
     def value(self, a, b, t):
         plane = wheel_plane(b.axis(self.axis_b), b.point(self.centre_b), self.radius)
-        return (plane.contact[2] - self.height - self.displacement)[None]
+        return (plane.contact[2] - self.displacement)[None]
 
 
 class Pad(AbstractJoint):
@@ -93,8 +90,7 @@ class Pad(AbstractJoint):
 
     def constraints(self, a: Frame, b: Frame):
         left = b.local_axis(jnp.asarray([0.0, 1.0, 0.0], self.at.dtype))
-        zero = jnp.zeros_like(self.displacement)
-        return (ContactHeight(b.local_point(self.at), left, self.at[2], zero, self.displacement),)
+        return (ContactHeight(b.local_point(self.at), left, self.at[2], self.displacement),)
 
 
 class TyreWrench(AbstractLoad):
