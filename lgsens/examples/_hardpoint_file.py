@@ -41,6 +41,11 @@ class Reader:
         self._table, self._path, self._keys = table, path, keys
         self._metre, self._road = metre, road
 
+    @property
+    def road(self) -> float:
+        """The height of the road in the document."""
+        return self._road / self._metre
+
     def fail(self, key: str, why: str) -> ValueError:
         return ValueError(f"Hardpoint file {self._path!r}, key {'.'.join((*self._keys, key))!r}: {why}")
 
@@ -54,6 +59,12 @@ class Reader:
 
     def __contains__(self, key: str) -> bool:
         return key in self._table
+
+    def only(self, keys: Collection[str]) -> None:
+        """No other keys are in this table."""
+        for key in self._table:
+            if key not in keys:
+                raise self.fail(key, f"is no key of this table; those are {sorted(keys)}.")
 
     def table(self, key: str) -> "Reader":
         value = self._get(key, lambda value: isinstance(value, dict), "a table")
@@ -74,6 +85,22 @@ class Reader:
         """Three numbers as they are: a direction, moments of inertia."""
         value = self._get(key, lambda value: _are_numbers(value, 3), "three numbers [x, y, z]")
         return as_float(value, (3,), key)
+
+    def triples(self, key: str, count: int = 1) -> Array:
+        """Three numbers, shape (3,); where there are two things to have them also twice three, shape (2, 3)."""
+        value = self._get(
+            key,
+            lambda value: _are_numbers(value, 3) or (count == 2 and _are_points(value)),
+            "three numbers" + (", or two times three, [[…], […]]" if count == 2 else ""),
+        )
+        return as_float(value, None, key)
+
+    def directions(self, key: str) -> Array:
+        """Two directions that are not one, shape (2, 3)."""
+        value = self._get(key, _are_points, "two directions [[x, y, z], [x, y, z]]")
+        if np.linalg.norm(np.cross(*value)) <= 1e-6 * np.prod(np.linalg.norm(value, axis=1)):
+            raise self.fail(key, f"must be two different directions, got {value}.")
+        return as_float(value, (2, 3), key)
 
     def direction(self, key: str) -> Array | None:
         """A vector that is not zero; None: it is left out."""

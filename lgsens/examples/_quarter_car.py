@@ -12,28 +12,25 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, suggestion
 from lgsens.analysis import Kinematics, kinematics
+from lgsens.examples._axle_parts import Mount, Stop
+from lgsens.examples._corner_scene import corner_scene
 from lgsens.examples._hardpoint_file import read
 from lgsens.examples._leverage import motion_ratios
 from lgsens.examples._suspension_curves import SuspensionCurves, suspension_curves
 from lgsens.examples._suspension_file import members
-from lgsens.examples._suspension_parts import Connection, Link, Part, Strut
+from lgsens.examples._suspension_parts import Connection, Link, Part, Strut, reflected
 from lgsens.model import (
     ALL_FREE,
     BumpRoad,
-    Bushing,
-    DistanceJoint,
-    FixedJoint,
     Gravity,
     Model,
     PrismaticJoint,
-    RevoluteJoint,
     TranslationDriver,
     TyreSpring,
     static_preload,
 )
 
 GRAVITY = 9.81  # m/s²
-ALONG_Y: Any = (0.0, 1.0, 0.0)
 ALONG_Z: Any = (0.0, 0.0, 1.0)
 
 
@@ -61,6 +58,9 @@ class QuarterCar(eqx.Module):
     link_radius: Float[Array, ""] | None
     bump_height: Float[Array, ""]
     bump_duration: Float[Array, ""]
+    mounts: dict[str, Mount] = eqx.field(default_factory=dict)  # in its axle, by the joints that they replace
+    stops: dict[str, Stop] = eqx.field(default_factory=dict)
+    carriers: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())  # what holds on to subframe or rack
 
     @staticmethod
     def load(path: str | Path | None = None) -> "QuarterCar":
@@ -80,6 +80,16 @@ class QuarterCar(eqx.Module):
             car = QuarterCar(**members(document, name))
             car._check(f"Hardpoint file {name!r}")
             return car
+
+    def mirrored(self) -> "QuarterCar":
+        """The corner of the other side: its mirror image in the plane y = 0, S = diag(1, −1, 1).
+
+        Points and directions, of hinges and arms too, become S x, inertias S J S: products of inertia with y change
+        their sign, principal moments about the axes of the file stay. Rates, masses and lengths stay. A turn about an
+        axis n is one about −S n, so what was right-handed is left-handed: a screw would change the sign of its pitch.
+        Camber, toe and the other curves, whose signs are those of the wheel's side, are the same.
+        """
+        return reflected(self)
 
     def _check(self, name: str) -> None:
         """Raise `ValueError` for what moves or stands as no car does."""
@@ -177,52 +187,30 @@ class QuarterCar(eqx.Module):
         have or that have no ball joint at the knuckle, and where preloads are sought as `load` for a suspension that
         does not move as one.
         """
-        _check_choice("wheel", wheel, ("hinged", "locked"))
-        _check_choice("chassis", chassis, ("guided", "heave"))
-        _check_choice("links", links, ("bodies", "rods"))
+        check_choice("wheel", wheel, ("hinged", "locked"))
+        check_choice("chassis", chassis, ("guided", "heave"))
+        check_choice("links", links, ("bodies", "rods"))
         jointed = [name for name, link in self.links.items() if "knuckle" in link.balls]
         for name in bushings:
             if name not in jointed:
                 raise ValueError(
                     f"`bushings`: {suggestion(name, jointed)}, the links with a ball joint at the knuckle."
                 )
-        held = {*self.spring.bodies, *self.damper.bodies, *bushings}
-        held |= {end for link in self.links.values() for end in link.ends}
-        held |= {end for joint in self.joints.values() for end in joint.between}
-        rods = {name: link for name, link in self.links.items() if links == "rods" and link.is_bar and name not in held}
-        parts = {"chassis": self.chassis, "knuckle": self.knuckle, "wheel": self.wheel}
-        parts |= {name: link.part(self.link_radius) for name, link in self.links.items() if name not in rods}
-        halves = {name: [(rod.mass / 2, rod.ends[name]) for rod in rods.values() if name in rod.ends] for name in parts}
-        free = {"chassis": "z"} if chassis == "heave" else {}
-        bodies = {name: part.body(halves[name], free.get(name, ALL_FREE)) for name, part in parts.items()}
-        hub: Any = (
-            RevoluteJoint("knuckle", "wheel", at=self.bearing, axis=ALONG_Y)
-            if wheel == "hinged"
-            else FixedJoint("knuckle", "wheel", at=self.bearing)
-        )
-        joints = {"hub": hub} | {name: connection.joint() for name, connection in self.joints.items()}
+        rates = {"stiffness": bushing_stiffness, "damping": bushing_damping}
+        mount = Mount(**{rate: jnp.full(3, value, self.bearing.dtype) for rate, value in rates.items()})
+        scene = corner_scene(self, wheel=wheel, links=links, mounts={f"{name}_knuckle": mount for name in bushings})
+        free = "z" if chassis == "heave" else ALL_FREE
+        bodies = scene.bodies | {"chassis": self.chassis.body(scene.ends.get("chassis", ()), free)}
+        joints = dict(scene.joints)
         if chassis == "guided":
             joints["heave"] = PrismaticJoint(None, "chassis", at=self.chassis.centre, axis=ALONG_Z)
-        for name, link in self.links.items():
-            if name in rods:
-                (a, start), (b, end) = sorted(link.ends.items())
-                joints[name] = DistanceJoint(a, b, at_a=start, at_b=end)
-                continue
-            for connection in link.connections(name):
-                if name not in bushings or connection.between[0] != "knuckle":
-                    joints[f"{name}_{connection.between[0]}"] = connection.joint()
         road = BumpRoad(height=self.bump_height, duration=self.bump_duration)
         tyre = {"stiffness": self.tyre_stiffness, "free_radius": free_radius, "road": road}
-        forces: dict[str, Any] = {
-            "gravity": Gravity((0.0, 0.0, -GRAVITY)),
-            "spring": self.spring.element("spring", free_length),
-            "damper": self.damper.element("damper"),
-            "tyre": TyreSpring("wheel", at=self.wheel.centre, **tyre),
-        }
-        for name in bushings:
-            rates = {"stiffness": bushing_stiffness, "damping": bushing_damping}
-            rates = {rate: jnp.full(3, value, self.bearing.dtype) for rate, value in rates.items()}
-            forces[f"{name}_bushing"] = Bushing("knuckle", name, at=self.links[name].knuckle, **rates)
+        forces = {"gravity": Gravity((0.0, 0.0, -GRAVITY))} | scene.forces
+        forces |= {"tyre": TyreSpring("wheel", at=self.wheel.centre, **tyre)}
+        forces |= {f"{name}_bushing": forces.pop(f"{name}_knuckle") for name in bushings}
+        if free_length is not None:
+            forces["spring"] = self.spring.element("spring", free_length)
         model = Model(bodies, joints, forces)
         if free_length is not None:
             return model
@@ -260,7 +248,7 @@ class QuarterCar(eqx.Module):
         design position. Differentiable by every number of the suspension, exactly. Raises `ValueError` for another
         axle and as `travel`.
         """
-        _check_choice("axle", axle, ("rear", "front"))
+        check_choice("axle", axle, ("rear", "front"))
         return suspension_curves(self.travel(travel, throw=throw), self.wheel.centre, rear=axle == "rear")
 
 
@@ -277,6 +265,7 @@ def stiff_quarter_car(car: QuarterCar, *, wheel: str = "locked", **settings: Any
     return car.model(wheel=wheel, bushings=("wishbone", "guide_link"), **settings)
 
 
-def _check_choice(name: str, value: str, known: tuple[str, str]) -> None:
+def check_choice(name: str, value: str, known: tuple[str, str]) -> None:
+    """One of two settings."""
     if value not in known:
         raise ValueError(f"`{name}` must be {known[0]!r} or {known[1]!r}, got {value!r}.")

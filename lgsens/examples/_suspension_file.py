@@ -20,6 +20,29 @@ y left, z up. TOML, or JSON of the same structure.
     [design]       limits of the design problem, see `DesignLimits`
 
 Of a spring or damper `link`, `link_point`, `chassis_point` mean the same as the names of its two bodies.
+
+Of an axle, in SI units; points are those of the side of the file:
+
+    [subframe]     centre_of_mass, mass, inertia: a body that links, joints and springs may hold on to in place of the
+                   chassis; without mounts it is fixed to it
+    [subframe.mounts.NAME]  at, and the keys of a bushing
+    [rack]         centre_of_mass, mass, inertia: another such body, which slides along axis (left out: y) on the
+                   chassis or on = "subframe"; travel [m], how far either way; ratio, its way per turn of the steering
+                   wheel [m/rad], or c_factor [m per whole turn]
+    [anti_roll_bar]  bearing: a point of its straight middle, along y, where the chassis or on = "subframe" carries it;
+                   lever: the end of its lever, and BODY = [x, y, z], the other end of the drop link on a link or the
+                   knuckle; mass; stiffness [N m/rad] of the whole bar, or diameter, length [m] and, if they are
+                   others than those of a rod of steel, bore [m], shear_modulus [Pa]; damping [N m s/rad]
+    [bushings.NAME]  in place of the joint NAME, LINK_BODY of a link: stiffness, rotational_stiffness [N/m], [N m/rad],
+                   damping, rotational_damping (left out: none), three numbers, or two times three of the two
+                   bushings of a hinge; axes: [[x, y, z], [x, y, z]], the first and the plane of the second (left out:
+                   those of the file); preload, rotational_preload [N], [N m] along the axes of the file, see `Mount`
+                   (left out: those with which the axle rests in the design position)
+    [bump_stop], [rebound_stop]  BODY = [x, y, z] twice (left out: the points of the damper), gap [m], stiffness [N/m],
+                   rounding [m], progression [m]; see `BumpStop`
+
+A corner by itself has stops, and of the rest what is rigid: the chassis takes the place of subframe and rack, joints
+that of bushings, and there is no anti-roll bar.
 """
 
 from pathlib import Path
@@ -31,29 +54,40 @@ import numpy as np
 from jaxtyping import Array
 
 from lgsens._validate import as_float
+from lgsens.examples._axle_file import CARRIERS, OF_AXLE, carried, mounts, stop
 from lgsens.examples._hardpoint_file import Reader
 from lgsens.examples._suspension_parts import ALONG_A_LINE, AT_A_POINT, Connection, Link, Part, Strut
 from lgsens.model import Sampled
 
 LEAST_RADIUS, LARGEST_RADIUS = 0.1, 2.0  # m, loaded radii of tyres
-PARTS = ("chassis", "knuckle", "wheel")
+PARTS = ("chassis", "knuckle", "wheel", *CARRIERS, "anti_roll_bar", "drop_link")
+TABLES = ("name", "units", "road", "links", "joints", "chassis", "knuckle", "wheel", "spring", "damper", "tyre")
+TABLES += ("link_section", "bump", "design")
+RATES = {"spring": "stiffness", "damper": "damping"}
+STOPS = ("bump_stop", "rebound_stop")
 OF_MODEL = ("hub", "heave", "travel")  # joints that there are beside those of the file
 OF_LINK = ("mass", "centre_of_mass", "inertia", "arm", "link_arm")
 
 
-def members(document: dict, path: str) -> dict[str, Any]:
-    """The fields of a `QuarterCar`. Raises `ValueError` naming file and key for what is missing or wrong."""
+def reader(document: dict, path: str) -> tuple[Reader, float]:
+    """The tables of a document, read in metres over the road, and its unit of mass [kg]."""
     root = Reader(document, path)
     units = root.table("units")
     metre, kilogram = float(units.number("length")), float(units.number("mass"))
     road = float(root.table("road").number("height", metre, positive=False)) if "road" in root else 0.0
-    root = Reader(document, path, metre=metre, road=road)
+    return Reader(document, path, metre=metre, road=road), kilogram
+
+
+def members(document: dict, path: str) -> dict[str, Any]:
+    """The fields of a `QuarterCar`. Raises `ValueError` naming file and key for what is missing or wrong."""
+    root, kilogram = reader(document, path)
     tables = root.tables("links")
     for name in sorted({*PARTS, *OF_LINK} & set(tables)):
         raise root.table("links").fail(name, f"is a name of its own; choose another than {[*PARTS, *OF_LINK]}.")
-    bodies = ("chassis", "knuckle", *tables)
-    links = {name: _link(name, table, bodies, kilogram) for name, table in tables.items()}
-    joints = {name: _joint(table, bodies) for name, table in root.tables("joints").items()}
+    bodies = ("chassis", "knuckle", *(body for body in CARRIERS if body in root), *tables)
+    carriers: dict[str, str] = {}
+    links = {name: _link(name, table, bodies, kilogram, carriers) for name, table in tables.items()}
+    joints = {name: _joint(name, table, bodies, carriers) for name, table in root.tables("joints").items()}
     taken = {*OF_MODEL, *links, *(f"{name}_{body}" for name, link in links.items() for body in link.ends)}
     for name in sorted(taken & set(joints)):
         raise root.table("joints").fail(
@@ -68,12 +102,15 @@ def members(document: dict, path: str) -> dict[str, Any]:
     if not LEAST_RADIUS <= float(wheel.centre[2]) <= LARGEST_RADIUS:
         raise root.table("wheel").fail(
             "centre",
-            f"is {float(wheel.centre[2]):.4g} m over the road, which is at z = {road / metre:g} of the file, and no "
+            f"is {float(wheel.centre[2]):.4g} m over the road, which is at z = {root.road:g} of the file, and no "
             f"tyre has a loaded radius outside of {LEAST_RADIUS} to {LARGEST_RADIUS} m; set the key 'road.height' to "
             "the z of the road at the design position.",
         )
     bars = [link for link in links.values() if link.inertia is None]
     bump = root.table("bump")
+    struts = {key: _strut(key, root.table(key), bodies, rate, carriers) for key, rate in RATES.items()}
+    root.only((*TABLES, *OF_AXLE))  # after what is missing: a table that is spelled wrong is both
+    stops = {key: stop(root.table(key), key, bodies, struts["damper"], carriers) for key in STOPS if key in root}
     return {
         "name": str(document.get("name", Path(path).stem)),
         "links": links,
@@ -82,17 +119,19 @@ def members(document: dict, path: str) -> dict[str, Any]:
         "wheel": wheel,
         "chassis": part("chassis", "centre_of_mass"),
         "bearing": root.table("wheel").point("bearing"),
-        "spring": _strut(root.table("spring"), bodies, "stiffness"),
-        "damper": _strut(root.table("damper"), bodies, "damping"),
+        **struts,
         "tyre_stiffness": root.table("tyre").number("stiffness"),
         "link_radius": root.table("link_section").number("radius") if bars else None,
         "bump_height": bump.number("height", positive=False),
         "bump_duration": bump.number("duration"),
+        "mounts": mounts(root, links, joints, carriers),
+        "stops": stops,
+        "carriers": tuple(sorted(carriers.items())),
     }
 
 
-def _link(name: str, table: Reader, bodies: tuple[str, ...], kilogram: float) -> Link:
-    ends = table.ends([body for body in bodies if body != name], OF_LINK)
+def _link(name: str, table: Reader, bodies: tuple[str, ...], kilogram: float, carriers: dict[str, str]) -> Link:
+    ends = carried(table, f"links.{name}", table.ends([body for body in bodies if body != name], OF_LINK), carriers)
     own = "centre_of_mass" in table or "inertia" in table
     if len(ends) < 2 and not own:  # one end makes no bar
         table.point("chassis" if "chassis" not in ends else "knuckle")
@@ -112,15 +151,16 @@ def _link(name: str, table: Reader, bodies: tuple[str, ...], kilogram: float) ->
     return link
 
 
-def _joint(table: Reader, bodies: tuple[str, ...]) -> Connection:
+def _joint(name: str, table: Reader, bodies: tuple[str, ...], carriers: dict[str, str]) -> Connection:
     kind = table.choice("type", [*AT_A_POINT, *ALONG_A_LINE])
     at, wanted = table.points("at"), 1 if kind in AT_A_POINT else 2
     if at.ndim != wanted:
         raise table.fail("at", f"must be {('a point', 'two points, its line,')[wanted - 1]} of a {kind} joint.")
-    return Connection(kind, table.pair("between", bodies), at)
+    a, b = carried(table, f"joints.{name}", dict.fromkeys(table.pair("between", bodies)), carriers)
+    return Connection(kind, (a, b), at)
 
 
-def _strut(table: Reader, bodies: tuple[str, ...], rate: str) -> Strut:
+def _strut(key: str, table: Reader, bodies: tuple[str, ...], rate: str, carriers: dict[str, str]) -> Strut:
     if "link" in table:
         link = table.choice("link", [body for body in bodies if body != "chassis"])
         ends = {link: table.point("link_point"), "chassis": table.point("chassis_point")}
@@ -132,6 +172,7 @@ def _strut(table: Reader, bodies: tuple[str, ...], rate: str) -> Strut:
             raise table.fail(
                 "link", f"it needs one point on each of two bodies of {sorted(bodies)}, got {sorted(ends)}."
             )
+    ends = carried(table, key, ends, carriers)
     if "curve" not in table:
         if "free_length" in table:
             raise table.fail("free_length", "belongs to a `curve`; without one it follows from what the spring bears.")

@@ -1,9 +1,10 @@
 """What a suspension is made of: parts, links, connections, spring and damper, and the elements that they become."""
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -31,6 +32,33 @@ ALONG_A_LINE: dict[str, Any] = {
     "prismatic": PrismaticJoint,
     "revolute": RevoluteJoint,
 }
+VECTORS = {"at", "arms", "axes", "ends", "centre", "arm", "link_arm", "bearing", "lever", "preload"}
+AXIAL = "rotational_preload"
+Tree = TypeVar("Tree")
+
+
+def reflected(tree: Tree) -> Tree:
+    """The mirror image of parts in the plane y = 0, S = diag(1, −1, 1); twice it is what it was.
+
+    Points and directions become S x, tensors S J S: products of inertia with y change their sign, principal moments
+    about the axes of the file stay. Moments and angles are of screws, so a moment becomes −S m: what was right-handed
+    is left-handed. Rates, masses and lengths stay.
+    """
+
+    def leaf(path, value):
+        names = {entry.name for entry in path if isinstance(entry, jax.tree_util.GetAttrKey)}
+        if "inertia" in names:
+            return value if value.ndim == 1 else value.at[1, ::2].multiply(-1.0).at[::2, 1].multiply(-1.0)
+        if AXIAL in names:
+            return value.at[..., ::2].multiply(-1.0)
+        return value.at[..., 1].multiply(-1.0) if names & VECTORS else value
+
+    return jax.tree_util.tree_map_with_path(leaf, tree)
+
+
+def itself(body: str) -> str:
+    """The body of this name is called so."""
+    return body
 
 
 class Part(eqx.Module):
@@ -49,6 +77,13 @@ class Part(eqx.Module):
             inertia = (jnp.diag(inertia) if inertia.ndim == 1 else inertia) + shifted
         return RigidBody(mass=mass, inertia=inertia, position=centre, free=free)
 
+    def joined(self, other: "Part") -> "Part":
+        """Both as one body."""
+        both = jnp.stack([self.mass, other.mass]), jnp.stack([self.centre, other.centre])
+        mass, centre, apart = lumped(*both)
+        own = [part.inertia if part.inertia.ndim == 2 else jnp.diag(part.inertia) for part in (self, other)]
+        return Part(centre, mass, own[0] + own[1] + apart)
+
 
 class Connection(eqx.Module):
     """A joint between two bodies: of a kind, at a point or along the line of two [m], a universal one with its arms."""
@@ -58,14 +93,15 @@ class Connection(eqx.Module):
     at: Float[Array, "3"] | Float[Array, "2 3"]
     arms: tuple[Float[Array, "3"], Float[Array, "3"]] | None = None
 
-    def joint(self) -> AbstractJoint:
-        """The joint of the scene."""
+    def joint(self, named: Callable[[str], str] = itself) -> AbstractJoint:
+        """The joint of a scene in which its bodies are called so."""
+        between = [named(body) for body in self.between]
         if self.arms is not None:
-            return UniversalJoint(*self.between, at=self.at, axis_a=self.arms[0], axis_b=self.arms[1])
+            return UniversalJoint(*between, at=self.at, axis_a=self.arms[0], axis_b=self.arms[1])
         if self.kind in AT_A_POINT:
-            return AT_A_POINT[self.kind](*self.between, at=self.at)
+            return AT_A_POINT[self.kind](*between, at=self.at)
         middle = (self.at[0] + self.at[1]) / 2  # between the bushes of a wishbone, also in pictures
-        return ALONG_A_LINE[self.kind](*self.between, at=middle, axis=self.at[1] - self.at[0])
+        return ALONG_A_LINE[self.kind](*between, at=middle, axis=self.at[1] - self.at[0])
 
     def blocked(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """A point, and the directions in which it lets b neither turn nor move in a there: in NumPy, for checks."""
@@ -208,10 +244,10 @@ class Strut(eqx.Module):
         extension = np.linalg.norm(self.chassis_point - self.link_point) - self.free_length
         return -float(self.rate * Sampled(self.curve[0], self.curve[1], "monotone")(extension))
 
-    def element(self, kind: str, free_length: Any = None) -> AbstractForce:
-        """The force element, a "spring" or a "damper"; a preload is added at all lengths."""
+    def element(self, kind: str, free_length: Any = None, named: Callable[[str], str] = itself) -> AbstractForce:
+        """The force element, a "spring" or a "damper", of bodies called so; a preload is added at all lengths."""
         a, b = self.bodies
-        places: dict[str, Any] = {"a": a, "b": b, "at_a": self.ends[a], "at_b": self.ends[b]}
+        places: dict[str, Any] = {"a": named(a), "b": named(b), "at_a": self.ends[a], "at_b": self.ends[b]}
         if self.curve is None:
             rates: dict[str, Any] = (
                 {"stiffness": self.rate} if kind == "spring" else {"stiffness": 0.0, "damping": self.rate}

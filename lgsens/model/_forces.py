@@ -3,13 +3,15 @@
 import abc
 import dataclasses
 from collections.abc import Mapping
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import number_field, point_field
+from lgsens._validate import as_float, number_field, point_field, require
+from lgsens.liegroups import cross
 from lgsens.model._body import RigidBody
 from lgsens.model._frames import Frame, ground_frame
 from lgsens.model._loads import (
@@ -48,10 +50,12 @@ class AbstractForce(eqx.Module):
     velocity [ẋ, Ω], ẋ in the inertial frame, Ω in that of the body. `lgsens.testing.check_force` checks a force.
 
     `preload_shape` is that of its `preload`, in which its force is linear, for `static_preload`; None: it has none.
+    `preload_rates` are those with which its members grow as it yields; None: it takes what equilibrium asks of it.
     `on_merged` says whether its loads on bodies that fixed joints merge are one load on what they are merged to.
     """
 
-    preload_shape: ClassVar[tuple[int, ...] | None] = None
+    preload_shape: ClassVar[Any] = None
+    preload_rates: ClassVar[Any] = None
     on_merged: ClassVar[bool] = False
 
     @property
@@ -179,17 +183,20 @@ class Bushing(AbstractForce):
     Arguments:
         a, b: names of the two bodies; None is the ground.
         at: where it is in the reference configuration [m], inertial frame, shape (3,): both points are there.
-        stiffness: the spring stiffnesses [N/m] along x, y and z of the inertial frame in the reference
-            configuration, shape (3,). The axes turn with a.
+        stiffness: the spring stiffnesses [N/m] along its axes in the reference configuration, shape (3,). The axes turn
+            with a.
         damping: the damping along the same axes [N s/m], shape (3,).
-        preload: the force g₀ that pulls b to a in the reference configuration [N], inertial frame, shape (3,).
-        rotational_stiffness, rotational_damping: K_r [N m/rad] and C_r [N m s/rad] about x, y and z of the inertial
-            frame in the reference configuration, shape (3,); None: 0.
-        rotational_preload: the moment m₀ that turns b back there [N m], inertial frame, shape (3,); None: 0.
+        preload: the force g₀ that pulls b to a in the reference configuration [N], along the same axes, shape (3,).
+        rotational_stiffness, rotational_damping: K_r [N m/rad] and C_r [N m s/rad] about the same axes, shape (3,);
+            None: 0.
+        rotational_preload: the moment m₀ that turns b back there [N m], about the same axes, shape (3,); None: 0.
+        axes: the first of its axes, and a direction in the plane of the first and the second, inertial frame, shape
+            (2, 3), any lengths > 0; None: x, y and z of the inertial frame.
 
-    With none of the last three it resists no rotation, and costs nothing for it. The moments do the work −m·φ̇: on b
+    With no rotational numbers it resists no rotation, and costs nothing for it. The moments do the work −m·φ̇: on b
     acts −m but for terms of second order in φ. A force between bodies that is stiffer by orders than the others makes
-    explicit integrators take as many more steps; generalized-α does not mind. Raises `ValueError` for wrong shapes.
+    explicit integrators take as many more steps; generalized-α does not mind. Raises `ValueError` for wrong shapes, or
+    axes that are none.
     """
 
     a: str | None = eqx.field(static=True)
@@ -201,27 +208,61 @@ class Bushing(AbstractForce):
     rotational_stiffness: Float[Array, "3"] | None = point_field("rotational_stiffness", default=None)
     rotational_damping: Float[Array, "3"] | None = point_field("rotational_damping", default=None)
     rotational_preload: Float[Array, "3"] | None = point_field("rotational_preload", default=None)
+    axes: Float[Array, "2 3"] | None = eqx.field(
+        default=None, kw_only=True, converter=lambda axes: None if axes is None else as_float(axes, (2, 3), "`axes`")
+    )
+
+    def __check_init__(self):
+        require(
+            lambda axes: np.linalg.norm(np.cross(*axes)) > 1e-6 * np.prod(np.linalg.norm(axes, axis=1)),
+            f"Bushing: `axes` {self.axes} lie along each other or are zero; give two directions.",
+            np.eye(2, 3) if self.axes is None else self.axes,
+        )
 
     @property
     def bodies(self):
         return (self.a, self.b)
 
-    preload_shape = (3,)
+    @property
+    def preload_shape(self):
+        return (3,) if self.rotational_stiffness is None else (6,)
+
+    def with_preload(self, preload):
+        if self.rotational_stiffness is None:
+            return dataclasses.replace(self, preload=preload)
+        return dataclasses.replace(self, preload=preload[:3], rotational_preload=preload[3:])
+
+    @property
+    def preload_rates(self):
+        if self.rotational_stiffness is None:
+            return None
+        return jnp.concatenate([self.stiffness, self.rotational_stiffness])
+
+    @property
+    def triad(self) -> Float[Array, "3 3"]:
+        """Unit vectors along its axes as columns, inertial frame."""
+        first, second = jnp.eye(2, 3, dtype=self.at.dtype) if self.axes is None else self.axes
+        third = cross(first, second)
+        columns = jnp.stack([first, cross(third, first), third], axis=1)
+        return columns / jnp.linalg.norm(columns, axis=0, keepdims=True)
 
     def loads(self, bodies):
         a, b = (_frame(bodies, name, self.at.dtype) for name in (self.a, self.b))
-        back = a.orientation.T
+        triads = [frame.orientation.T for frame in (a, b)]
+        if self.axes is not None:
+            triads = [triad @ self.triad for triad in triads]
+        back = triads[0]
         load = BushingLoad(
             point_a=a.local_point(self.at),
             point_b=b.local_point(self.at),
-            stiffness=(back * self.stiffness[None]) @ a.orientation,
-            damping=(back * self.damping[None]) @ a.orientation,
-            preload=a.local_axis(self.preload),
+            stiffness=(back * self.stiffness[None]) @ back.T,
+            damping=(back * self.damping[None]) @ back.T,
+            preload=back @ self.preload,
         )
         about = self.rotational_stiffness, self.rotational_damping, self.rotational_preload
         if any(numbers is not None for numbers in about):
             about = (jnp.zeros_like(self.at) if numbers is None else numbers for numbers in about)
-            load = FullBushingLoad(load, RotationLoad(back, b.orientation.T, *about))
+            load = FullBushingLoad(load, RotationLoad(*triads, *about))
         return (Attached(load, self.a, self.b),)
 
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
@@ -17,12 +18,19 @@ def static_preload(model: Model, forces: Sequence[str], *, t0=0.0) -> tuple[Mode
     """The model with the preloads of the named springs chosen so that it rests in its reference configuration.
 
     The preloads F and the joint forces λ solve r(q_ref, 0, 0, λ, t0; F) = 0, which is linear in both:
-    A [λ; F] = −r_0, in the sense of least squares through [[I, A], [Aᵀ, 0]].
+    A [λ; F] = −r_0, in the sense of least squares through [[I, A], [Aᵀ, 0]]. Where bushings are named that resist
+    rotations, there are more of F than equations. Of all equilibria it is then the one of least energy ½ Σ F_i²/k_i in
+    the bushings, with rigid joints, springs of constant length and x the displacement that goes with it,
+
+        A [λ; F] = −r_0,     F_i = k_i a_iᵀ x,     B x = 0,     a_jᵀ x = 0 of the springs:
+
+    what the bushings bear if they were free of stress without load, to first order.
 
     Arguments:
         model: the scene.
         forces: names of elements with a preload (`SpringDamper`, `TyreSpring`, `Bushing`, one's own), as many as the
-            mechanism has degrees of freedom that weight or other forces move; a bushing counts for three.
+            mechanism has degrees of freedom that weight or other forces move; a bushing counts for three. Bushings that
+            resist rotations may be any number if they, joints and the springs named let nothing move.
         t0: the time at which time-dependent forces are taken [s].
 
     Returns the model and the largest force [N] or moment [N m] that remains unbalanced. Differentiable: a gradient
@@ -58,8 +66,23 @@ def _solve(model: Model, forces: tuple[str, ...], t):
 
     unbalanced, by_preload, jacobian = jax.linearize(residual, no_preload, has_aux=True)
     eye = jnp.eye(no_preload.size, dtype=no_preload.dtype)
-    a = jnp.concatenate([jacobian.T, jax.vmap(by_preload, out_axes=1)(eye)], axis=1)
+    by_preload = jax.vmap(by_preload, out_axes=1)(eye)
+    named = [model.forces[name] for name in forces]
+    rates = [force.preload_rates for force in named]
+    yields = [np.full(force.preload_shape, rate is not None) for force, rate in zip(named, rates)]
+    yields = np.concatenate(yields, axis=None)
+    a = jnp.concatenate([jacobian.T, by_preload[:, ~yields]], axis=1)
     k, n = a.shape
-    matrix = jnp.block([[jnp.eye(k, dtype=a.dtype), a], [a.T, jnp.zeros((n, n), a.dtype)]])
+    if yields.any():
+        soft, rate = by_preload[:, yields], jnp.concatenate([one for one in rates if one is not None])
+        rate = rate / jnp.max(rate)
+        upper = (soft * rate[None]) @ soft.T
+    else:
+        upper = jnp.eye(k, dtype=a.dtype)
+    matrix = jnp.block([[upper, a], [a.T, jnp.zeros((n, n), a.dtype)]])
     solution = jnp.linalg.solve(matrix, jnp.concatenate([-unbalanced, jnp.zeros(n, a.dtype)]))
-    return each(solution[k + jacobian.shape[0] :]), jnp.max(jnp.abs(solution[:k]))
+    values = no_preload.at[~yields].set(solution[k + jacobian.shape[0] :])
+    if yields.any():
+        values = values.at[yields].set(rate * (soft.T @ solution[:k]))
+    left = unbalanced + jacobian.T @ solution[k : k + jacobian.shape[0]] + by_preload @ values
+    return each(values), jnp.max(jnp.abs(left))

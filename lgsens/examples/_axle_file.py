@@ -1,0 +1,145 @@
+"""The tables of an axle in a suspension file; `lgsens/examples/_suspension_file.py` has the format."""
+
+import math
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from lgsens._validate import as_float
+from lgsens.examples._axle_parts import ALONG_Y, RATES, Bar, Mount, Rack, Stop
+from lgsens.examples._hardpoint_file import Reader
+from lgsens.examples._suspension_parts import Connection, Link, Part, Strut
+
+CARRIERS = ("subframe", "rack")
+OF_AXLE = (*CARRIERS, "anti_roll_bar", "bushings", "bump_stop", "rebound_stop")
+OF_PART = ("centre_of_mass", "mass", "inertia")
+SECTION = ("stiffness", "diameter", "length", "bore", "shear_modulus", "damping")
+OF_STOP = ("gap", "stiffness", "rounding", "progression")
+
+
+def carried(table: Reader, key: str, ends: dict[str, Any], carriers: dict[str, str]) -> dict[str, Any]:
+    """The ends of an element with the chassis in place of subframe or rack, which `carriers` keeps."""
+    taken = [body for body in ends if body in CARRIERS]
+    if not taken:
+        return ends
+    if len(taken) > 1 or "chassis" in ends:
+        raise table.fail(
+            taken[-1], f"is with {sorted({*ends} - {taken[-1]})} one body to a corner; hold on to one of them."
+        )
+    carriers[key] = taken[0]
+    return {"chassis" if body in CARRIERS else body: points for body, points in ends.items()}
+
+
+def stop(table: Reader, key: str, bodies: tuple[str, ...], damper: Strut, carriers: dict[str, str]) -> Stop:
+    """A bump or rebound stop."""
+    ends = table.ends(bodies, OF_STOP)
+    if not ends:
+        ends = damper.ends
+        if "damper" in carriers:
+            carriers[key] = carriers["damper"]
+    elif len(ends) != 2 or any(point.ndim != 1 for point in ends.values()):
+        raise table.fail(
+            next(iter(ends)),
+            f"a stop needs one point on each of two bodies of {sorted(bodies)}, got {sorted(ends)}; without any it "
+            "has those of the damper.",
+        )
+    ends = carried(table, key, ends, carriers)
+    rates = {name: table.number(name) for name in ("stiffness", "rounding")}
+    progression = table.number("progression") if "progression" in table else None
+    return Stop(ends, table.number("gap", positive=False), **rates, progression=progression, rebound=key != "bump_stop")
+
+
+def mounts(
+    root: Reader, links: Mapping[str, Link], joints: Mapping[str, Connection], carriers: Mapping[str, str]
+) -> dict[str, Mount]:
+    """The bushings, by the joints that they replace, and the mounts of the subframe."""
+    known = dict(joints)
+    for name, link in links.items():
+        for connection in link.connections(name):
+            body = connection.between[0]
+            known[f"{name}_{carriers.get(f'links.{name}', body) if body == 'chassis' else body}"] = connection
+    found = {}
+    for name, table in root.tables("bushings").items():
+        if name not in known:
+            raise root.table("bushings").fail(name, f"there is no such joint; those of the file are {sorted(known)}.")
+        if known[name].kind in ("cylindrical", "prismatic"):
+            raise table.fail("stiffness", f"joint {name!r} slides, and a bushing would hold it; leave it a joint.")
+        table.only((*RATES, "axes", "preload", "rotational_preload"))
+        found[name] = _mount(table, len(np.atleast_2d(known[name].at)))
+    if "subframe" in root:
+        for name, table in root.table("subframe").tables("mounts").items():
+            table.only(("at", *RATES, "axes", "preload", "rotational_preload"))
+            found[f"subframe_{name}"] = _mount(table, 1, table.point("at"))
+    return found
+
+
+def _mount(table: Reader, count: int, at: Array | None = None) -> Mount:
+    rates = {key: table.triples(key, count) for key in RATES[:2]}
+    rates |= {key: table.triples(key, count) for key in RATES[2:] if key in table}
+    for key, values in rates.items():
+        positive = key == "stiffness" or (key == "rotational_stiffness" and count == 1)  # two points hold a link
+        if not np.all(values > 0 if positive else values >= 0):
+            bound = "positive, else a body can move freely" if positive else "zero or positive"
+            raise table.fail(key, f"must be {bound}, got {np.asarray(values).tolist()}; give small numbers for soft.")
+    axes = table.directions("axes") if "axes" in table else None
+    if "preload" in table or "rotational_preload" in table:
+        rates |= {key: table.triples(key, count) for key in ("preload", "rotational_preload")}
+    return Mount(**rates, axes=axes, at=at)
+
+
+def axle_members(root: Reader, kilogram: float, links: Collection[str]) -> dict[str, Any]:
+    """The fields of an `Axle` beside its corners."""
+    part = lambda table: Part(table.point("centre_of_mass"), table.number("mass", kilogram), table.moments("inertia"))
+    found: dict[str, Any] = {}
+    if "subframe" in root:
+        table = root.table("subframe")
+        table.only((*OF_PART, "mounts"))
+        found["subframe"] = part(table)
+    if "rack" in root:
+        table = root.table("rack")
+        table.only((*OF_PART, "axis", "on", "travel", "ratio", "c_factor"))
+        if "ratio" in table and "c_factor" in table:
+            raise table.fail("c_factor", "is 2π times `ratio`; give one of them.")
+        ratio = table.number("ratio") if "ratio" in table else None
+        if "c_factor" in table:
+            ratio = table.number("c_factor") / (2.0 * math.pi)
+        axis = table.direction("axis")
+        travel = table.number("travel") if "travel" in table else None
+        axis = as_float(ALONG_Y, (3,), "axis") if axis is None else axis
+        found["rack"] = Rack(part(table), axis, ratio, travel, _carrier(root, table))
+    if "anti_roll_bar" in root:
+        found["bar"] = _bar(root, root.table("anti_roll_bar"), kilogram, links)
+    return found
+
+
+def _carrier(root: Reader, table: Reader) -> str:
+    known = ["chassis", "subframe"] if "subframe" in root else ["chassis"]
+    return table.choice("on", known) if "on" in table else "chassis"
+
+
+def _bar(root: Reader, table: Reader, kilogram: float, links: Collection[str]) -> Bar:
+    bodies = ("knuckle", *links)
+    ends = table.ends(bodies, ("bearing", "lever", "on", "mass", *SECTION))
+    if len(ends) != 1 or any(point.ndim != 1 for point in ends.values()):
+        raise table.fail(
+            "lever", f"its drop link needs the other end, a point of one body of {sorted(bodies)}, got {sorted(ends)}."
+        )
+    section = {key: table.number(key) for key in SECTION if key in table}
+    if "stiffness" in section and len({*section} - {"damping"}) > 1:
+        raise table.fail("stiffness", f"follows from the bar's dimensions; leave it or {sorted(section)} out.")
+    if "stiffness" not in section:
+        section |= {key: table.number(key) for key in ("diameter", "length")}
+    bearing, lever = table.point("bearing"), table.point("lever")
+    (end,) = ends.values()
+    arm, rod = np.asarray(lever - bearing) * (1.0, 0.0, 1.0), np.asarray(end - lever)
+    turning = abs(np.cross(arm, rod)[1])  # of the drop link about the bar
+    if not turning > 0.1 * np.linalg.norm(arm) * np.linalg.norm(rod) or not np.linalg.norm(rod) > 0:
+        raise table.fail(
+            "lever",
+            "the lever has no length across y, or the drop link goes along it or along y and cannot turn it; "
+            f"got bearing, end of lever and end of drop link {np.asarray(jnp.stack([bearing, lever, end])).tolist()}.",
+        )
+    return Bar(bearing, lever, ends, table.number("mass", kilogram), section, _carrier(root, table))

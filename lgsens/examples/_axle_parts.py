@@ -1,0 +1,142 @@
+"""What an axle has beside rigid links: bushings, stops, a rack, an anti-roll bar, and the elements that they become."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens.examples._suspension_parts import Part
+from lgsens.model import (
+    AbstractJoint,
+    AntiRollBar,
+    BumpStop,
+    Bushing,
+    DistanceJoint,
+    RevoluteJoint,
+    TorsionSpringDamper,
+)
+
+ALONG_Y: Any = (0.0, 1.0, 0.0)
+RATES = ("stiffness", "rotational_stiffness", "damping", "rotational_damping")
+
+
+class Mount(eqx.Module):
+    """A bushing in place of a joint, of a hinge one at each of its two points; or one between subframe and chassis.
+
+    Attributes:
+        stiffness, damping: along its axes [N/m], [N s/m], shape (3,), or (2, 3): of the two bushings of a hinge.
+        rotational_stiffness, rotational_damping: about them [N m/rad], [N m s/rad], of the same shape. None: 0.
+        axes: the first of them, and a direction in the plane of the first and the second, shape (2, 3); None: x, y, z.
+        preload, rotational_preload: the force [N] that pulls the joint's second body to its first at the design
+            position, and the moment [N m] that turns it back, in x, y and z, shape (3,) or (2, 3); None: those with
+            which the axle rests there.
+        at: its place [m], shape (3,); None: that of the joint.
+    """
+
+    stiffness: Float[Array, "*two 3"]
+    damping: Float[Array, "*two 3"] | None = None
+    rotational_stiffness: Float[Array, "*two 3"] | None = None
+    rotational_damping: Float[Array, "*two 3"] | None = None
+    axes: Float[Array, "2 3"] | None = None
+    preload: Float[Array, "*two 3"] | None = None
+    rotational_preload: Float[Array, "*two 3"] | None = None
+    at: Float[Array, "3"] | None = None
+
+    def elements(self, name: str, a: str, b: str, at: Array) -> Iterator[tuple[str, Bushing]]:
+        """The force elements by name, NAME, or NAME_1 and NAME_2 for two points."""
+        points = jnp.atleast_2d(at)
+        of = lambda key, i: jnp.broadcast_to(getattr(self, key), points.shape)[i]
+        given = [key for key in RATES if getattr(self, key) is not None]
+        for i, point in enumerate(points):
+            bushing = Bushing(a, b, at=point, axes=self.axes, **{key: of(key, i) for key in given})
+            if self.preload is not None:
+                along = [of(key, i) @ bushing.triad for key in ("preload", "rotational_preload")]
+                bushing = bushing.with_preload(jnp.concatenate(along))
+            yield name if len(points) == 1 else f"{name}_{i + 1}", bushing
+
+
+class Stop(eqx.Module):
+    """A bump or rebound stop: `BumpStop` between the points of two bodies, `ends`."""
+
+    ends: dict[str, Float[Array, "3"]]
+    gap: Float[Array, ""]
+    stiffness: Float[Array, ""]
+    rounding: Float[Array, ""]
+    progression: Float[Array, ""] | None
+    rebound: bool = eqx.field(static=True)
+
+    def element(self, named: Callable[[str], str]) -> BumpStop:
+        """The force element between bodies that are called so."""
+        (a, at_a), (b, at_b) = sorted(self.ends.items())
+        rates = {key: getattr(self, key) for key in ("gap", "stiffness", "rounding", "progression", "rebound")}
+        return BumpStop(named(a), named(b), at_a=at_a, at_b=at_b, **rates)
+
+
+class Rack(eqx.Module):
+    """A steering rack, which slides in the chassis or the subframe.
+
+    Attributes:
+        part: its mass.
+        axis: along which it slides, shape (3,).
+        ratio: its way per turn of the steering wheel [m/rad], shape (); None: not said.
+        travel: how far it goes either way [m], shape (); None: not said.
+        carrier: "chassis" or "subframe".
+    """
+
+    part: Part
+    axis: Float[Array, "3"]
+    ratio: Float[Array, ""] | None
+    travel: Float[Array, ""] | None
+    carrier: str = eqx.field(static=True)
+
+
+class Bar(eqx.Module):
+    """An anti-roll bar across the car: on each side a half that turns about y in a bearing, and a massless drop link.
+
+    Attributes:
+        bearing: a point on the bar's straight middle [m], shape (3,). lever: where its lever meets the drop link.
+        ends: by the link or knuckle at the other end of the drop link the point there.
+        mass: of the whole bar [kg], shape (), uniform along its middle and its levers.
+        section: `stiffness` [N m/rad] of the whole bar in torsion, or `diameter`, `length`, `bore`, `shear_modulus` as
+            of an `AntiRollBar`; and `damping` [N m s/rad].
+        carrier: "chassis" or "subframe", which holds the bearing.
+    """
+
+    bearing: Float[Array, "3"]
+    lever: Float[Array, "3"]
+    ends: dict[str, Float[Array, "3"]]
+    mass: Float[Array, ""]
+    section: dict[str, Float[Array, ""]]
+    carrier: str = eqx.field(static=True)
+
+    @property
+    def link(self) -> str:
+        """The body at the other end of the drop link."""
+        return next(iter(self.ends))
+
+    def half(self) -> Part:
+        """One half: slender rods from the middle, y = 0, to the bearing and on to the end of the lever."""
+        corners = jnp.stack([self.bearing * jnp.asarray([1.0, 0.0, 1.0]), self.bearing, self.lever])
+        rods = jnp.diff(corners, axis=0)
+        squares = jnp.sum(rods**2, axis=1)
+        masses = self.mass / 2 * jnp.sqrt(squares) / jnp.sum(jnp.sqrt(squares))
+        parts = [
+            Part(middle, mass, mass / 12 * (square * jnp.eye(3, dtype=rod.dtype) - jnp.outer(rod, rod)))
+            for middle, mass, square, rod in zip((corners[1:] + corners[:-1]) / 2, masses, squares, rods)
+        ]
+        return parts[0].joined(parts[1])
+
+    def joints(self, side: str) -> dict[str, AbstractJoint]:
+        """Of the half on this side."""
+        half, link = f"{side}_anti_roll_bar", f"{side}_{self.link}"
+        return {
+            f"{half}_{self.carrier}": RevoluteJoint(self.carrier, half, at=self.bearing, axis=ALONG_Y),
+            f"{side}_drop_link": DistanceJoint(half, link, at_a=self.lever, at_b=self.ends[self.link]),
+        }
+
+    def element(self, left: str, right: str) -> AntiRollBar | TorsionSpringDamper:
+        """What twists between its two halves."""
+        kind: Any = TorsionSpringDamper if "stiffness" in self.section else AntiRollBar
+        return kind(left, right, axis=ALONG_Y, **self.section)

@@ -1,0 +1,106 @@
+"""The bodies, joints and forces of a corner: of a car by itself, or of one side of an axle."""
+
+import dataclasses
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from jaxtyping import Array
+
+from lgsens.examples._axle_parts import ALONG_Y, Mount
+from lgsens.examples._suspension_parts import Connection
+from lgsens.model import AbstractForce, AbstractJoint, DistanceJoint, FixedJoint, RevoluteJoint, RigidBody
+
+if TYPE_CHECKING:
+    from lgsens.examples._quarter_car import QuarterCar
+
+SHARED = ("chassis", "subframe", "rack")
+
+
+class CornerScene(NamedTuple):
+    """What a corner brings into a scene.
+
+    Attributes:
+        ends: by body that it shares with others, masses [kg] and places [m] of ends of rods on it.
+        sought: its forces whose preloads are not given.
+    """
+
+    bodies: dict[str, RigidBody]
+    joints: dict[str, AbstractJoint]
+    forces: dict[str, AbstractForce]
+    ends: dict[str, list[tuple[Array, Array]]]
+    sought: list[str]
+
+
+def connections(car: "QuarterCar", carriers: Mapping[str, str]) -> dict[str, Connection]:
+    """The joints by name, those of links NAME_BODY; in place of the chassis the bodies that carry them."""
+
+    def carried(key: str, connection: Connection) -> Connection:
+        between: Any = tuple(carriers.get(key, end) if end == "chassis" else end for end in connection.between)
+        return dataclasses.replace(connection, between=between)
+
+    found = {name: carried(f"joints.{name}", connection) for name, connection in car.joints.items()}
+    for name, link in car.links.items():
+        for connection in link.connections(name):
+            connection = carried(f"links.{name}", connection)
+            found[f"{name}_{connection.between[0]}"] = connection
+    return found
+
+
+def corner_scene(
+    car: "QuarterCar",
+    *,
+    wheel: str,
+    links: str,
+    side: str = "",
+    mounts: Mapping[str, Mount] | None = None,
+    held: Collection[str] = (),
+) -> CornerScene:
+    """A corner but for the chassis and its guide, gravity, and the tyre.
+
+    Arguments:
+        car: the corner.
+        wheel, links: as in `QuarterCar.model`.
+        side: of an axle, before the names of what is this side's alone; "": of no axle, the chassis carries everything.
+        mounts: bushings by the joint that they replace, or of the subframe.
+        held: bodies on which others act that are not of the corner.
+    """
+    own, mounts = f"{side}_" if side else "", mounts or {}
+    carriers = dict(car.carriers) if side else {}
+
+    def named(key: str):
+        """What bodies are called by an element of the corner."""
+        return lambda body: carriers.get(key, body) if body == "chassis" else body if body in SHARED else own + body
+
+    joined = connections(car, carriers)
+    struts = {"spring": car.spring, "damper": car.damper}
+    busy = {*held, *(end for link in car.links.values() for end in link.ends)}
+    busy |= {end for acting in (*struts.values(), *car.stops.values()) for end in acting.ends}
+    busy |= {end for name, c in joined.items() if name in car.joints or name in mounts for end in c.between}
+    rods = {name: link for name, link in car.links.items() if links == "rods" and link.is_bar and name not in busy}
+    parts = {"knuckle": car.knuckle, "wheel": car.wheel}
+    parts |= {name: link.part(car.link_radius) for name, link in car.links.items() if name not in rods}
+    ends: dict[str, list[tuple[Array, Array]]] = {}
+    joints, forces, sought = {}, {}, [own + "spring"]
+    hub: dict[str, Any] = {"at": car.bearing} | ({"axis": ALONG_Y} if wheel == "hinged" else {})
+    joints[f"{own}hub"] = (RevoluteJoint if hub.keys() > {"at"} else FixedJoint)(own + "knuckle", own + "wheel", **hub)
+    for name, rod in rods.items():
+        (a, start), (b, end) = sorted(rod.ends.items())
+        a, b = map(named(f"links.{name}"), (a, b))
+        joints[own + name] = DistanceJoint(a, b, at_a=start, at_b=end)
+        for body, place in ((a, start), (b, end)):
+            ends.setdefault(body, []).append((rod.mass / 2, place))
+    joints |= {
+        own + name: connection.joint(named(""))
+        for name, connection in joined.items()
+        if name not in mounts and connection.between[1] not in rods
+    }
+    for name, mount in mounts.items():
+        place = Connection("fixed", ("chassis", "subframe"), mount.at) if mount.at is not None else joined[name]
+        a, b = map(named(""), place.between)
+        bushings = dict(mount.elements(own + name, a, b, place.at))
+        forces |= bushings
+        sought += bushings if mount.preload is None else ()
+    bodies = {own + name: part.body(ends.pop(own + name, ())) for name, part in parts.items()}
+    forces |= {own + key: strut.element(key, named=named(key)) for key, strut in struts.items()}
+    forces |= {own + key: stop.element(named(key)) for key, stop in car.stops.items()}
+    return CornerScene(bodies, joints, forces, ends, sought)
