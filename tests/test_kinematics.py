@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import GRAVITY, close, equations, random_body, random_rotation, says
+from helpers import GRAVITY, close, equations, factorizations, random_body, random_rotation, says
 
 import lgsens as lg
 from lgsens.dynamics import positions
@@ -161,11 +161,6 @@ def test_second_derivatives_and_batches():
     close(
         batched, np.stack([gradient(each) for each in designs]), 1000
     )  # of order 1, Newton's end differs by round-off
-
-
-def factorizations(jaxpr) -> int:
-    """How many LU factorizations are in a program, however deep."""
-    return sum(equation.primitive.name == "lu" for equation in equations(jaxpr))
 
 
 def test_one_factorization_for_all_parameters():

@@ -20,9 +20,13 @@ class Drive(AbstractDrive):
 
     def at(self, values):
         system = self.system
-        for (kind, stack, element), value in zip(self.where, values):
+        for kind, stack in dict.fromkeys((kind, stack) for kind, stack, _ in self.where):
             leaf = lambda s, kind=kind, stack=stack: getattr(s, kind)[stack].elements.driven
-            system = eqx.tree_at(leaf, system, leaf(system).at[element].set(value))
+            own = {element: i for i, (*of, element) in enumerate(self.where) if of == [kind, stack]}
+            # One selection for each stack: the derivative of a scatter takes as long as that of an element.
+            old = leaf(system)
+            new = [values[own[i]] if i in own else old[i] for i in range(old.shape[0])]
+            system = eqx.tree_at(leaf, system, jnp.stack(new))
         return system
 
 

@@ -37,7 +37,7 @@ from jaxtyping import Array, Bool, Float
 
 from lgsens._xla import linear_solve, scan, while_loop
 from lgsens.dynamics._kinematics import AbstractDrive
-from lgsens.linear import LU
+from lgsens.linear import LU, Inverse
 
 _MAX_ITERATIONS = 60
 _SLOW = 0.2  # what a chord iteration may leave of a step before factors are renewed
@@ -57,7 +57,7 @@ class StaticPath(NamedTuple):
 class _Factors(NamedTuple):
     """K in factors, in units in which its unknowns are of order one: lengths of the scene, rad, and `force`."""
 
-    lu: LU
+    lu: LU | Inverse
     coordinate: Float[Array, " k"]
     force: Float[Array, ""]  # J, the size of K_t in these units
 
@@ -169,32 +169,38 @@ def _path_jvp(starts, primals, tangents):
     drive, values, rates, t = primals
     drive_dot, values_dot, rates_dot, t_dot = tangents
     q, lam, w, lam_rate, *ended = _path(starts, *primals)
-    group = drive.system.group
+    group, rows = drive.system.group, (q, lam, values)
+    every = lambda of, xs: scan(lambda _, row: (None, of(*row)), None, xs)[1]
+    matrix, units = jax.vmap(lambda q, lam, s: _matrix(drive, s, q, lam, t))(*rows)
+    factors = jax.vmap(lambda matrix, *units: _Factors(Inverse.of(matrix), *units))(lax.stop_gradient(matrix), *units)
 
-    def tangent(_, row):
-        q, lam, w, lam_rate, s, rate, s_dot, rate_dot = row
-        matrix, units = _matrix(drive, s, q, lam, t)
-        factors = _Factors(LU.of(lax.stop_gradient(matrix)), *units)
-
-        def solve(force, violation):
-            once = lambda transposed: lambda _, b: factors.lu.solve(b[:, None], transposed=transposed)[:, 0]
-            rhs = factors.residual(force, violation)
-            return factors.parts(-linear_solve(lambda x: matrix @ x, rhs, once(False), once(True)))
-
-        at = lambda drive, s, t: _residual(drive, s, q, lam, t)
-        x, mu = solve(*jax.jvp(at, (drive, s, t), (drive_dot, s_dot, t_dot))[1])
-        moved = (drive_dot, s_dot, group.to_ambient(q, x), mu, t_dot)
-
-        def change(w, lam_rate, rate, rate_dot):
-            of = lambda drive, s, q, lam, t, rate: _response(drive, s, rate, q, lam, w, lam_rate, t)
-            return solve(*jax.jvp(of, (drive, s, q, lam, t, rate), (*moved, rate_dot))[1])
-
-        return None, (moved[2], mu, *jax.vmap(change)(w, lam_rate, rate, rate_dot))
+    def solve(force, violation):
+        """−K⁻¹ at every point: products, which are one operation for all directions."""
+        product = jax.vmap(jnp.matmul)
+        once = lambda at: lambda _, b: product(at, b)
+        inverse = jnp.swapaxes(factors.lu.transpose, 1, 2)
+        rhs = jax.vmap(_Factors.residual)(factors, force, violation)
+        solved = linear_solve(partial(product, matrix), rhs, once(inverse), once(factors.lu.transpose))
+        return jax.vmap(_Factors.parts)(factors, -solved)
 
     # One point after the other: what all directions need of one stays in the processor's cache.
-    rows = q, lam, w, lam_rate, values, rates, values_dot, rates_dot
-    tangents = scan(tangent, None, rows)[1]
-    return (q, lam, w, lam_rate, *ended), (*tangents, *jax.tree.map(jnp.zeros_like, ended))
+    def first(q, lam, s, s_dot):
+        of = lambda drive, s, t: _residual(drive, s, q, lam, t)
+        return jax.jvp(of, (drive, s, t), (drive_dot, s_dot, t_dot))[1]
+
+    x, mu = solve(*every(first, (*rows, values_dot)))
+    q_dot = jax.vmap(group.to_ambient)(q, x)
+
+    def second(q, lam, s, q_dot, mu, s_dot, *along):
+        def change(w, lam_rate, rate, rate_dot):
+            of = lambda drive, s, q, lam, t, rate: _response(drive, s, rate, q, lam, w, lam_rate, t)
+            return jax.jvp(of, (drive, s, q, lam, t, rate), (drive_dot, s_dot, q_dot, mu, t_dot, rate_dot))[1]
+
+        return jax.vmap(change)(*along)
+
+    changes = every(second, (*rows, q_dot, mu, values_dot, w, lam_rate, rates, rates_dot))
+    w_dot, lam_rate_dot = jax.vmap(solve, 1, 1)(*changes)
+    return (q, lam, w, lam_rate, *ended), (q_dot, mu, w_dot, lam_rate_dot, *jax.tree.map(jnp.zeros_like, ended))
 
 
 def static_path(

@@ -95,7 +95,7 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
             driven = np.array2string(details["values"], precision=6)
             more = f"It failed at point {int(details['position'])}, driven values and factors {driven}."
             if len(details.get("free", ())):
-                more = f"What moves freely: {', '.join(details['free'])}. {more}"
+                more = f"What moves freely: {', '.join(map(str, details['free']))}. {more}"
         case RESULTS.steps_exhausted:
             more = f"It came to {time} of {details['t1']:.6g} s in {num_steps} steps. `throw=False` returns these."
         case RESULTS.integration_failed:
