@@ -1,5 +1,6 @@
 """Suspensions by hand: positions from distances and right angles, forces from free bodies. Nothing of lgsens."""
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,29 @@ from scipy.optimize import brentq, root
 from scipy.spatial.transform import Rotation
 
 Z = np.array([0.0, 0.0, 1.0])
+
+
+def corner_of(document: dict[str, Any]) -> dict[str, Any]:
+    """The corner of an axle's file, as it is written: chassis for subframe and rack, and no table of the axle."""
+    to_chassis = lambda table: {"chassis" if key in ("subframe", "rack") else key: of for key, of in table.items()}
+    axle = ("subframe", "rack", "anti_roll_bar", "bushings", "bump_stop", "rebound_stop")
+    corner = {key: table for key, table in document.items() if key not in axle}
+    return corner | {"links": {name: to_chassis(link) for name, link in document.get("links", {}).items()}}
+
+
+def changed(scene, changes):
+    """A document with values put at places `TABLE.KEY`; None: the key goes."""
+    scene = copy.deepcopy(scene)
+    for place, value in changes.items():
+        *tables, key = place.split(".")
+        table = scene
+        for name in tables:
+            table = table[name]
+        if value is None:
+            del table[key]
+        else:
+            table[key] = value
+    return scene
 
 
 def points_of(value) -> np.ndarray:

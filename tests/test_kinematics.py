@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import GRAVITY, close, equations, factorizations, random_body, random_rotation, says
+from helpers import GRAVITY, close, factorizations, random_body, random_rotation, says
 
 import lgsens as lg
 from lgsens.dynamics import positions

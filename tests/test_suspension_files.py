@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers import says
 from scipy.interpolate import PchipInterpolator
-from suspension_closures import Closure, motion_ratio
+from suspension_closures import Closure, changed, corner_of, motion_ratio
 
 from lgsens.cli._main import main
 from lgsens.examples import QuarterCar, shipped
@@ -23,36 +23,10 @@ TRAVEL = np.linspace(-0.05, 0.05, 11)
 
 
 def document(name):
-    return tomllib.loads((DATA / f"{name}.toml").read_text(encoding="utf-8"))
+    return corner_of(tomllib.loads((DATA / f"{name}.toml").read_text(encoding="utf-8")))
 
 
-def push_rod():
-    """The double wishbone with a push-rod from its lower arm to a rocker, on which spring and damper act. Own data."""
-    car = document("double_wishbone")
-    links = car["links"]
-    links["lower"], links["upper"] = links.pop("lower_wishbone"), links.pop("upper_wishbone")
-    body = {"mass": 1.2, "centre_of_mass": [0.1, 0.42, 0.32], "inertia": [2e-3, 2e-3, 2e-3]}
-    links["rocker"] = {"chassis": [[0.05, 0.42, 0.3], [0.15, 0.42, 0.3]], **body}
-    links["push_rod"] = {"lower": [0.1, 0.62, -0.08], "rocker": [0.1, 0.5, 0.33], "mass": 0.8}
-    ends = {"chassis": [0.1, 0.12, 0.42], "rocker": [0.1, 0.4, 0.4]}
-    return car | {"spring": {**ends, "stiffness": 9e4}, "damper": {**ends, "damping": 6e3}}
-
-
-def semi_trailing():
-    """A knuckle that is the arm: a slanted hinge on the chassis and no link at all.
-
-    Source: projectchrono/chrono, data/vehicle/generic/suspension/SemiTrailingArm.json.
-    """
-    car = document("multi_link")
-    pivot = {"type": "revolute", "between": ["chassis", "knuckle"], "at": [[0.5, 0.9, 0.0], [0.42, 0.6, -0.05]]}
-    spring = {"knuckle": [0.3, 0.8, 0.0], "chassis": [0.3, 0.8, 0.4], "stiffness": 35e4}
-    damper = {"knuckle": [0.3, 0.8, 0.0], "chassis": [0.3, 0.8, 0.5], "damping": 2e4}
-    car["wheel"] |= {"centre": [0.0, 1.1, 0.0], "bearing": [0.0, 1.1, 0.0]}
-    return car | {"links": {}, "joints": {"pivot": pivot}, "spring": spring, "damper": damper}
-
-
-SCENES = {name: (lambda name=name: document(name)) for name in ("double_wishbone", "multi_link", "mcpherson")}
-SCENES |= {"push_rod": push_rod, "semi_trailing": semi_trailing}
+SCENES = ("double_wishbone", "multi_link", "mcpherson", "push_rod", "semi_trailing_arm")
 
 
 @pytest.fixture
@@ -71,10 +45,10 @@ def differences(function, step):
     return (a - 8 * b + 8 * c - d) / (12 * step)
 
 
-@pytest.mark.parametrize("name", ["double_wishbone", "multi_link", "mcpherson", "push_rod"])
+@pytest.mark.parametrize("name", SCENES[:4])
 def test_curves_agree_with_the_closure(name, load):
     """Positions by SciPy's root of hand-written distances, motion ratios by its differences and by virtual work."""
-    scene = SCENES[name]()
+    scene = document(name)
     curves, closure = load(scene).curves(TRAVEL), Closure(scene)
     camber, toe, x, y, _, spring, _ = np.stack([closure.curves(s) for s in TRAVEL], axis=1)
     middle = len(TRAVEL) // 2
@@ -111,7 +85,7 @@ def test_the_ratio_of_the_trailing_link_is_that_of_its_arms():
 @pytest.mark.parametrize("name", SCENES)
 def test_ratios_before_anything_is_compiled(name, load):
     """What a file is checked by, velocities, against virtual work, forces."""
-    scene = SCENES[name]()
+    scene = document(name)
     car = load(scene)
     found = motion_ratios("it", car.wheel.centre, car.links, car.joints, {"spring": car.spring, "damper": car.damper})
     for key, ratio in found.items():
@@ -183,9 +157,9 @@ def test_hardpoints_of_hinges_and_joints(load):
         (lambda c: c.links["tie_rod"].chassis, 9.0),
     ):
         np.testing.assert_array_equal(points(moved), points(car) + np.array([row, row + 1, row + 2]))
-    arm = load(semi_trailing())
+    arm = QuarterCar.load("semi_trailing_arm")
     assert arm.hardpoint_names == ["pivot 1", "pivot 2"]
-    np.testing.assert_array_equal(arm.hardpoints[1], [0.42, 0.6, -0.05 + 0.305])
+    np.testing.assert_array_equal(arm.hardpoints[1], [0.42, 0.6, -0.05 + 0.292])
     assert arm.with_values(hardpoints=np.zeros((2, 3))).joints["pivot"].at.shape == (2, 3)
 
 
@@ -217,7 +191,7 @@ def test_curves_of_spring_and_damper(load):
 
 def test_preloads_of_rods_and_curves(load):
     """Bars as bodies or as rods on other bodies, springs with and without curves, carry the same weights."""
-    scene = push_rod()
+    scene = document("push_rod")
     car = load(scene)
     wanted, *others = (car.model(wheel="locked", chassis="heave", links=links).forces for links in ("bodies", "rods"))
     assert "push_rod" not in car.model(links="rods", free_length=1.0).bodies
@@ -232,12 +206,12 @@ def test_preloads_of_rods_and_curves(load):
             assert float(forces[name].preload) == pytest.approx(float(wanted[name].preload), rel=1e-10)
     assert float(wanted["tyre"].preload) == pytest.approx(9.81 * float(car.mass), rel=1e-12)
     weight = 9.81 * float(car.chassis.mass)  # that of links and their way between comes on top of it
-    ratio = motion_ratio(push_rod(), "spring")
+    ratio = motion_ratio(document("push_rod"), "spring")
     assert -float(wanted["spring"].preload) * ratio == pytest.approx(weight, rel=0.05)
 
 
 def test_shipped_suspensions():
-    assert shipped() == ["double_wishbone", "five_link_suspension", "mcpherson", "multi_link"]
+    assert shipped() == [*sorted((*SCENES, "five_link_suspension"))]
     five = QuarterCar.load("quarter-car")
     assert jax.tree.all(jax.tree.map(np.array_equal, five, QuarterCar.load()))
 
@@ -438,25 +412,11 @@ MISTAKES = {
 }
 
 
-def changed(scene, changes):
-    scene = copy.deepcopy(scene)
-    for place, value in changes.items():
-        *tables, key = place.split(".")
-        table = scene
-        for name in tables:
-            table = table[name]
-        if value is None:
-            del table[key]
-        else:
-            table[key] = value
-    return scene
-
-
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_what_no_suspension_is(mistake, load):
     name, changes, parts = MISTAKES[mistake]
     with pytest.raises(ValueError, match=says("Hardpoint file", "mine.json", *parts)):
-        load(changed(SCENES[name](), changes))
+        load(changed(document(name), changes))
 
 
 def test_a_car_that_was_changed_is_checked_where_it_is_preloaded():
@@ -498,7 +458,7 @@ def test_the_commands_take_files(tmp_path, capsys):
 @pytest.mark.slow
 def test_curves_of_a_file(tmp_path, load):
     path, out = tmp_path / "rod.json", tmp_path / "out"
-    path.write_text(json.dumps(push_rod()), encoding="utf-8")
+    path.write_text(json.dumps(document("push_rod")), encoding="utf-8")
     assert main(["curves", str(path), "--out", str(out), "--travel", "0.04", "--points", "5", "--quiet"]) == 0
     assert sorted(file.name for file in out.iterdir()) == ["curves.csv", "curves.png", "travel.html"]
 

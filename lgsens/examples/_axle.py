@@ -106,8 +106,8 @@ class Axle(eqx.Module):
         check_choice("chassis", chassis, ("held", "guided"))
         check_choice("links", links, ("bodies", "rods"))
         cars = {"left": self.left, "right": self.right}
-        for side, car in cars.items():
-            car._check(f"Suspension {self.name!r}, {side}")
+        for car in (self.left, *(() if self.other is None else (self.other,))):
+            car._check(f"Suspension {self.name!r}")
         shared, joints = self._between(compliant)
         forces: dict[str, Any] = {"gravity": Gravity((0.0, 0.0, -GRAVITY))}
         bodies: dict[str, Any] = {}

@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from lgsens._validate import as_float
 from lgsens.examples._axle_parts import ALONG_Y, RATES, Bar, Mount, Rack, Stop
+from lgsens.examples._corner_scene import connections
 from lgsens.examples._hardpoint_file import Reader
 from lgsens.examples._suspension_parts import Connection, Link, Part, Strut
 
@@ -56,11 +57,7 @@ def mounts(
     root: Reader, links: Mapping[str, Link], joints: Mapping[str, Connection], carriers: Mapping[str, str]
 ) -> dict[str, Mount]:
     """The bushings, by the joints that they replace, and the mounts of the subframe."""
-    known = dict(joints)
-    for name, link in links.items():
-        for connection in link.connections(name):
-            body = connection.between[0]
-            known[f"{name}_{carriers.get(f'links.{name}', body) if body == 'chassis' else body}"] = connection
+    known = connections(links, joints, carriers)
     found = {}
     for name, table in root.tables("bushings").items():
         if name not in known:
@@ -142,4 +139,9 @@ def _bar(root: Reader, table: Reader, kilogram: float, links: Collection[str]) -
             "the lever has no length across y, or the drop link goes along it or along y and cannot turn it; "
             f"got bearing, end of lever and end of drop link {np.asarray(jnp.stack([bearing, lever, end])).tolist()}.",
         )
-    return Bar(bearing, lever, ends, table.number("mass", kilogram), section, _carrier(root, table))
+    bar = Bar(bearing, lever, ends, table.number("mass", kilogram), section, _carrier(root, table))
+    try:
+        bar.element("left", "right")
+    except ValueError as error:
+        raise table.fail("diameter", str(error)) from error
+    return bar

@@ -2,16 +2,13 @@
 
 import dataclasses
 from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from jaxtyping import Array
 
 from lgsens.examples._axle_parts import ALONG_Y, Mount
-from lgsens.examples._suspension_parts import Connection
+from lgsens.examples._suspension_parts import Connection, Link
 from lgsens.model import AbstractForce, AbstractJoint, DistanceJoint, FixedJoint, RevoluteJoint, RigidBody
-
-if TYPE_CHECKING:
-    from lgsens.examples._quarter_car import QuarterCar
 
 SHARED = ("chassis", "subframe", "rack")
 
@@ -31,15 +28,17 @@ class CornerScene(NamedTuple):
     sought: list[str]
 
 
-def connections(car: "QuarterCar", carriers: Mapping[str, str]) -> dict[str, Connection]:
-    """The joints by name, those of links NAME_BODY; in place of the chassis the bodies that carry them."""
+def connections(
+    links: Mapping[str, Link], joints: Mapping[str, Connection], carriers: Mapping[str, str]
+) -> dict[str, Connection]:
+    """All joints by name, those of links NAME_BODY; in place of the chassis the bodies that carry them."""
 
     def carried(key: str, connection: Connection) -> Connection:
         between: Any = tuple(carriers.get(key, end) if end == "chassis" else end for end in connection.between)
         return dataclasses.replace(connection, between=between)
 
-    found = {name: carried(f"joints.{name}", connection) for name, connection in car.joints.items()}
-    for name, link in car.links.items():
+    found = {name: carried(f"joints.{name}", connection) for name, connection in joints.items()}
+    for name, link in links.items():
         for connection in link.connections(name):
             connection = carried(f"links.{name}", connection)
             found[f"{name}_{connection.between[0]}"] = connection
@@ -47,7 +46,7 @@ def connections(car: "QuarterCar", carriers: Mapping[str, str]) -> dict[str, Con
 
 
 def corner_scene(
-    car: "QuarterCar",
+    car: Any,
     *,
     wheel: str,
     links: str,
@@ -58,7 +57,7 @@ def corner_scene(
     """A corner but for the chassis and its guide, gravity, and the tyre.
 
     Arguments:
-        car: the corner.
+        car: the corner, a `QuarterCar`.
         wheel, links: as in `QuarterCar.model`.
         side: of an axle, before the names of what is this side's alone; "": of no axle, the chassis carries everything.
         mounts: bushings by the joint that they replace, or of the subframe.
@@ -71,7 +70,7 @@ def corner_scene(
         """What bodies are called by an element of the corner."""
         return lambda body: carriers.get(key, body) if body == "chassis" else body if body in SHARED else own + body
 
-    joined = connections(car, carriers)
+    joined = connections(car.links, car.joints, carriers)
     struts = {"spring": car.spring, "damper": car.damper}
     busy = {*held, *(end for link in car.links.values() for end in link.ends)}
     busy |= {end for acting in (*struts.values(), *car.stops.values()) for end in acting.ends}

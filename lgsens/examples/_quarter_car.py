@@ -68,8 +68,8 @@ class QuarterCar(eqx.Module):
 
         Arguments:
             path: a TOML or JSON file in the format of `lgsens/examples/_suspension_file.py`, or the name of one that
-                ships with lgsens, in `lgsens/examples/data`: "five_link_suspension", "double_wishbone", "multi_link",
-                "mcpherson"; None: the first of them.
+                ships with lgsens, in `lgsens/examples/data`: "five_link_suspension", "double_wishbone", "push_rod",
+                "multi_link", "mcpherson", "semi_trailing_arm"; None: the first of them.
 
         Raises `ValueError` naming the file and the key (or the line) for a file that cannot be read, is incomplete, or
         describes a suspension that does not move as one: another freedom than travel, singular universal joints,
@@ -94,7 +94,8 @@ class QuarterCar(eqx.Module):
     def _check(self, name: str) -> None:
         """Raise `ValueError` for what moves or stands as no car does."""
         struts = {"spring": self.spring, "damper": self.damper}
-        ratios = motion_ratios(name, self.wheel.centre, self.links, self.joints, struts)
+        with jax.ensure_compile_time_eval():  # of numbers that are known, inside `jit` too
+            ratios = motion_ratios(name, self.wheel.centre, self.links, self.joints, struts)
         push = self.spring.push()
         if not ratios or push is None:
             return

@@ -47,11 +47,11 @@ def reflected(tree: Tree) -> Tree:
 
     def leaf(path, value):
         names = {entry.name for entry in path if isinstance(entry, jax.tree_util.GetAttrKey)}
+        flip = jnp.asarray([1.0, -1.0, 1.0], value.dtype)
         if "inertia" in names:
-            return value if value.ndim == 1 else value.at[1, ::2].multiply(-1.0).at[::2, 1].multiply(-1.0)
-        if AXIAL in names:
-            return value.at[..., ::2].multiply(-1.0)
-        return value.at[..., 1].multiply(-1.0) if names & VECTORS else value
+            return value if value.ndim == 1 else value * jnp.outer(flip, flip)
+        sign = -flip if AXIAL in names else flip if names & VECTORS else None
+        return value if sign is None else value * jnp.broadcast_to(sign, value.shape)
 
     return jax.tree_util.tree_map_with_path(leaf, tree)
 

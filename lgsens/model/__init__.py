@@ -1,6 +1,7 @@
 """Rigid bodies, joints and forces: one implementation of the abstract system (paper, §3 and §9)."""
 
 from lgsens.model._body import RigidBody as RigidBody, lumped as lumped
+from lgsens.model._bushing import Bushing as Bushing
 from lgsens.model._checks import invalid_numbers as invalid_numbers
 from lgsens.model._constraints import (
     AbstractClosedFormConstraint as AbstractClosedFormConstraint,
@@ -30,7 +31,6 @@ from lgsens.model._forces import (
     AbstractForce as AbstractForce,
     AppliedForce as AppliedForce,
     Attached as Attached,
-    Bushing as Bushing,
     Gravity as Gravity,
     SpringDamper as SpringDamper,
     TyreSpring as TyreSpring,
