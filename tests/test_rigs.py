@@ -158,9 +158,7 @@ class Energy:
         for name, own in zip(self.BODIES, np.split(x, len(self.BODIES), axis=-1)):
             move, turn = own[..., :3], own[..., 3:]
             square = np.sum(turn * turn, axis=-1)[..., None, None]
-            series = lambda first: sum(
-                (-square) ** i / np.prod(np.arange(1, 2 * i + first + 1.0)) for i in range(10)
-            )
+            series = lambda first: sum((-square) ** i / np.prod(np.arange(1, 2 * i + first + 1.0)) for i in range(10))
             skew = np.zeros((*turn.shape, 3), turn.dtype)
             for i, j, k, sign in ((0, 1, 2, -1), (1, 2, 0, -1), (2, 0, 1, -1)):
                 skew[..., i, j] += sign * turn[..., k]
@@ -307,7 +305,9 @@ def check_gradients(of, p, direction):
 def relative_direction(p, seed=0):
     """Changes of about a per cent of each number."""
     rng = np.random.default_rng(seed)
-    return {name: 0.1 * jnp.asarray(rng.uniform(-1, 1, np.shape(x))) * jnp.maximum(jnp.abs(x), 0.1) for name, x in p.items()}
+    return {
+        name: 0.1 * jnp.asarray(rng.uniform(-1, 1, np.shape(x))) * jnp.maximum(jnp.abs(x), 0.1) for name, x in p.items()
+    }
 
 
 @pytest.mark.slow
