@@ -143,7 +143,7 @@ class Energy:
     Derivatives by complex steps. Unknowns: six for each of the six bodies, six for each constraint.
     """
 
-    BODIES = [f"{side}_{part}" for side in SIDES for part in ("wheel", *ARMS)]
+    BODIES = tuple(f"{side}_{part}" for side in SIDES for part in ("wheel", *ARMS))
 
     def __init__(self):
         self.points = {s: {n: np.array(p) * sign for n, p in POINTS.items()} for s, sign in SIDES.items()}
@@ -158,12 +158,17 @@ class Energy:
         for name, own in zip(self.BODIES, np.split(x, len(self.BODIES), axis=-1)):
             move, turn = own[..., :3], own[..., 3:]
             square = np.sum(turn * turn, axis=-1)[..., None, None]
-            series = lambda first: sum((-square) ** i / np.prod(np.arange(1, 2 * i + first + 1.0)) for i in range(10))
+            powers = [(-square) ** i for i in range(10)]
+            # Σ (−θ²)ⁱ/(2i + 1)! and /(2i + 2)!: sin θ/θ and (1 − cos θ)/θ²
+            sine, cosine = (
+                sum(power / np.prod(np.arange(1.0, 2 * i + first + 1)) for i, power in enumerate(powers))
+                for first in (1, 2)
+            )
             skew = np.zeros((*turn.shape, 3), turn.dtype)
             for i, j, k, sign in ((0, 1, 2, -1), (1, 2, 0, -1), (2, 0, 1, -1)):
                 skew[..., i, j] += sign * turn[..., k]
                 skew[..., j, i] -= sign * turn[..., k]
-            found[name] = self.start[name] + move, np.eye(3) + series(1) * skew + series(2) * (skew @ skew), turn
+            found[name] = self.start[name] + move, np.eye(3) + sine * skew + cosine * (skew @ skew), turn
         return found
 
     def at(self, frames, body, point):
@@ -305,9 +310,8 @@ def check_gradients(of, p, direction):
 def relative_direction(p, seed=0):
     """Changes of about a per cent of each number."""
     rng = np.random.default_rng(seed)
-    return {
-        name: 0.1 * jnp.asarray(rng.uniform(-1, 1, np.shape(x))) * jnp.maximum(jnp.abs(x), 0.1) for name, x in p.items()
-    }
+    size = lambda x: 0.1 * jnp.maximum(jnp.abs(x), 0.1)
+    return {name: size(x) * jnp.asarray(rng.uniform(-1, 1, np.shape(x))) for name, x in p.items()}
 
 
 @pytest.mark.slow

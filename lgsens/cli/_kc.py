@@ -21,15 +21,15 @@ from lgsens.examples import Axle
 
 # By unit of a sweep's number the factor and the unit shown.
 SHOWN = {"m": (1e3, "mm"), "N": (1e-3, "kN"), "N m": (1.0, "N m")}
-STYLE = """body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 82rem; padding: 0 1rem; color: #222; }
+STYLE = """body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 82rem; padding: 0 1rem; }
 h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; border-bottom: 1px solid #ddd; }
 table { border-collapse: collapse; } td, th { padding: .15rem .8rem; text-align: left; }
 td.n { text-align: right; font-variant-numeric: tabular-nums; } tr:nth-child(even) { background: #f6f7f9; }
 .columns { columns: 2; column-gap: 2rem; } .columns table { break-inside: avoid; width: 100%; }
 svg { width: 100%; height: auto; } nav a { margin-right: .9rem; } p.note { color: #555; max-width: 60rem; }"""
 NOTE = (
-    "Chassis held, pads without friction under both wheels, springs and bushings in equilibrium at every point. Axes and "
-    "signs of ISO 8855: x forward, y left, z up; toe-in, camber with the top outward, caster with the top rearward, "
+    "Chassis held, pads without friction under both wheels, springs and bushings in equilibrium at every point. Axes "
+    "and signs of ISO 8855: x forward, y left, z up; toe-in, camber with the top outward, caster with the top rearward, "
     "forces of the tyre on the wheel in tyre axes are positive. Lateral, braking and aligning loads act at the contact "
     "centre, traction at the wheel centre; rates and compliances are exact derivatives at the design position."
 )
@@ -232,7 +232,8 @@ def _page(axle: Axle, sweeps, numbers: dict[str, float], gradients, figures) -> 
 
 
 def _row(one: rigs.Characteristic, value: float) -> str:
-    return f'<tr><td>{html.escape(one.label)}</td><td class="n">{_cell(value, one.shown[0])}</td><td>{one.shown[1]}</td></tr>'
+    factor, unit = one.shown
+    return f'<tr><td>{html.escape(one.label)}</td><td class="n">{_cell(value, factor)}</td><td>{unit}</td></tr>'
 
 
 def _gradient_table(axle: Axle, gradients: dict[str, np.ndarray]) -> str:

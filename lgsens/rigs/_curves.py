@@ -124,7 +124,7 @@ class AxleCurves(NamedTuple):
         caster, kingpin_inclination: of the steering axis [rad], shape (n, 2).
         scrub_radius, trail: where it meets the road, from the contact centre [m], shape (n, 2).
         steer_per_rack: derivative of the steer angles by the way of the rack [rad/m], shape (n, 2).
-        steering_ratio: turn of the steering wheel per mean steer angle [–], shape (n,).
+        steering_ratio: turn of the steering wheel per mean steer angle [–], positive, shape (n,).
         ackermann: share of Ackermann's condition, of sweeps that steer [–], shape (n,).
         force_roll_centre_height: from the forces under lateral ones [m], shape (n,).
         anti_dive, anti_lift, anti_squat: [–], 1 for a car that does not pitch, shape (n,).
@@ -221,7 +221,7 @@ def axle_curves(found: Statics, centres: Float[Array, "2 3"], vehicle: Vehicle) 
         held = -jnp.linalg.solve(by_pads, lengths["spring"][3][..., None])[..., 0]
     combined = lambda of: of[:, 3] + jnp.einsum("np,npsi->nsi", held, of[:, 1:3])
     steer = rack[0].steer
-    ratio = None if vehicle.rack_ratio is None else 1.0 / (vehicle.rack_ratio * jnp.mean(steer, axis=1))
+    ratio = None if vehicle.rack_ratio is None else 1.0 / (vehicle.rack_ratio * jnp.abs(jnp.mean(steer, axis=1)))
     return curves._replace(
         **_steering_axis(combined(spin), combined(velocity), axis, centre, centres, side),
         steer_per_rack=steer,
