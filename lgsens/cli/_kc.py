@@ -30,8 +30,8 @@ svg { width: 100%; height: auto; } nav a { margin-right: .9rem; } p.note { color
 NOTE = (
     "Chassis held, pads without friction under both wheels, springs and bushings in equilibrium at every point. Axes "
     "and signs of ISO 8855: x forward, y left, z up; toe-in, camber with the top outward, caster with the top rearward "
-    "and forces of the tyre on the wheel in tyre axes are positive. Lateral, braking and aligning loads act at the contact "
-    "centre, traction at the wheel centre; rates and compliances are exact derivatives at the design position."
+    "and forces of the tyre on the wheel in tyre axes are positive. Lateral, braking and aligning loads act at the "
+    "contact centre, traction at the wheel centre; rates and compliances are exact derivatives at the design position."
 )
 
 
