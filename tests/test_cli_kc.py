@@ -72,7 +72,7 @@ def test_an_interrupt_keeps_what_is_written(tmp_path, capsys, monkeypatch):
     """In the second file of a report without a test; before the first nothing is left behind."""
 
     class Nothing:
-        sweeps = {}
+        sweeps = ()
 
     def stop(*_):
         raise KeyboardInterrupt

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import says
-from jax.flatten_util import ravel_pytree
 from scipy.optimize import root
 from small_axle import ARMS, POINTS, RATES, SIDES, arm_centre, numbers, small_axle
 
@@ -281,31 +280,36 @@ def test_an_independent_static_solver_agrees():
 
 
 def outputs(scene, names, points):
-    """All outputs of some sweeps as one vector, zero where they are not determined."""
+    """All outputs of some sweeps, zero where they are not determined."""
 
     def of(p):
         sweeps = rigs.kc(*scene(p), {name: STANDARD[name] for name in names}, points=points, throw=False).sweeps
-        return jnp.nan_to_num(ravel_pytree(sweeps)[0])
+        return jax.tree.map(jnp.nan_to_num, sweeps)
 
     return of
 
 
 def check_gradients(of, p, direction):
     """Along a direction in both modes, against differences of fourth order."""
-    run = jax.jit(of)
-    forward = jax.jit(lambda p, d: jax.jvp(of, (p,), (d,))[1])(p, direction)
-    moved = lambda h: run(jax.tree.map(lambda x, d: x + h * d, p, direction))
-    h = 2e-3
-    a, b, c, d = (np.asarray(moved(i * h)) for i in (-2, -1, 1, 2))
-    differences = (a - 8 * b + 8 * c - d) / (12 * h)
-    size = np.maximum(np.abs(run(p)), np.abs(differences))
-    # h⁴/30 of relative changes, and round-off of the outputs, 1e-12 of their size and of 1, over h
-    np.testing.assert_allclose(forward, differences, rtol=1e-6, atol=1e-8 * (1.0 + size).max() * 1e-2)
-    assert np.count_nonzero(np.abs(forward) > 1e-9) > 0.5 * forward.size
-    weights = jnp.asarray(np.random.default_rng(1).normal(size=forward.shape)) / (1.0 + size)
+    run, h = jax.jit(of), 2e-3
+    value, forward = jax.jit(lambda p, d: jax.jvp(of, (p,), (d,)))(p, direction)
+    a, b, c, d = (run(jax.tree.map(lambda x, d, h=i * h: x + h * d, p, direction)) for i in (-2, -1, 1, 2))
+    differences = jax.tree.map(lambda a, b, c, d: (a - 8 * b + 8 * c - d) / (12 * h), a, b, c, d)
+    paths = jax.tree_util.tree_flatten_with_path(forward)[0]
+    changing = 0
+    for (path, found), expected, own in zip(paths, jax.tree.leaves(differences), jax.tree.leaves(value)):
+        # Round-off of an output, 1e-11 of its size for the condition of 1e5, over h; numbers change by 2e-4 of theirs.
+        size = max(np.abs(own).max(), np.abs(expected).max())
+        name = jax.tree_util.keystr(path)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * size + 1e-13, err_msg=name)
+        changing += np.abs(expected).max() > 1e-6 * size > 1e-13
+    assert changing > 0.5 * len(paths)
+    rng = np.random.default_rng(1)
+    weights = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)) / (1e-9 + jnp.abs(x).max()), value)
     back = jax.jit(lambda p: jax.vjp(of, p)[1](weights)[0])(p)
-    along = sum(jnp.vdot(back[name], direction[name]) for name in p)
-    np.testing.assert_allclose(along, jnp.vdot(weights, forward), rtol=1e-9)
+    inner = lambda one, other: float(sum(map(jnp.vdot, jax.tree.leaves(one), jax.tree.leaves(other))))
+    # one linear operator and its transpose
+    np.testing.assert_allclose(inner(back, direction), inner(weights, forward), rtol=1e-9)
 
 
 def relative_direction(p, seed=0):
