@@ -303,7 +303,7 @@ def check_gradients(of, p, direction):
         name = jax.tree_util.keystr(path)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * size + 1e-13, err_msg=name)
         changing += np.abs(expected).max() > 1e-6 * size > 1e-13
-    assert changing > 0.5 * len(paths)
+    assert changing > 0.4 * len(paths)
     rng = np.random.default_rng(1)
     weights = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)) / (1e-9 + jnp.abs(x).max()), value)
     back = jax.jit(lambda p: jax.vjp(of, p)[1](weights)[0])(p)
