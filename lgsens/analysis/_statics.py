@@ -124,7 +124,8 @@ def statics(
             details = details | {"free": _free_bodies(drive, details)}
         states, responses = throw_if_failed((states, responses), result, details, system.constraint_names)
     time = jnp.broadcast_to(start, shape)
-    return Statics(given, time, states, responses, result, system, model.joints)
+    own = {"states": states, "responses": responses, "result": result}
+    return Statics(values=given, t=time, **own, system=system, joints=model.joints)
 
 
 @eqx.filter_jit

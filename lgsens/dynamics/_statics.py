@@ -57,14 +57,14 @@ class StaticPath(NamedTuple):
 class _Factors(NamedTuple):
     """K in factors, in units in which its unknowns are of order one: lengths of the scene, rad, and `force`."""
 
-    lu: LU | Inverse
+    lu: Any  # LU or Inverse
     coordinate: Float[Array, " k"]
     force: Float[Array, ""]  # J, the size of K_t in these units
 
     def residual(self, force, violation):
         return jnp.concatenate([force * self.coordinate / self.force, violation])
 
-    def parts(self, y):
+    def parts(self, y) -> tuple[Array, Array]:
         k = self.coordinate.shape[0]
         return y[:k] * self.coordinate, y[k:] * self.force
 
@@ -137,7 +137,8 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
 
     def respond(s, rates, q, lam, factors):
         def refine(z, _):
-            left = jax.vmap(lambda z, rate: _response(drive, s, rate, q, lam, *factors.parts(z), t))(z, rates)
+            response = partial(_response, drive, s)
+            left = jax.vmap(lambda z, rate: response(rate, q, lam, *factors.parts(z), t=t))(z, rates)
             return z - factors.lu.solve(jax.vmap(factors.residual)(*left).T).T, None
 
         z = scan(refine, jnp.zeros((rates.shape[0], k + m), dtype), None, length=2)[0]
@@ -211,4 +212,5 @@ def static_path(
     *found, done, pivot = _path(starts, drive, values, rates, t)
     held = (done > 0) & (pivot > 1e2 * jnp.finfo(pivot.dtype).eps)
     poison = lambda leaf: jnp.where(held.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.nan)
-    return StaticPath(*jax.tree.map(poison, tuple(found)), held, pivot)
+    q, lam, w, lam_rate = jax.tree.map(poison, tuple(found))
+    return StaticPath(q, lam, w, lam_rate, held, pivot)

@@ -179,8 +179,9 @@ def axle_curves(found: Statics, centres: Float[Array, "2 3"], vehicle: Vehicle) 
     by = jnp.moveaxis(by, 2, 0)  # (r, n, 2, quantities)
     pads = lambda run: -jnp.concatenate([run.multiplier(f"{side}_pad") for side in SIDES], axis=1)
     force_by = jnp.stack([pads(run) for run in moving])
-    wheels = WheelCurves(*jnp.moveaxis(at[..., : len(_PLACED)], 2, 0), pads(found))
-    rates = [WheelCurves(*jnp.moveaxis(one[..., : len(_PLACED)], 2, 0), force) for one, force in zip(by, force_by)]
+    curves_of = lambda of, force: WheelCurves(**dict(zip(_PLACED, jnp.moveaxis(of, 2, 0))), force=force)
+    wheels = curves_of(at, pads(found))
+    rates = [curves_of(*one) for one in zip(by, force_by)]
     _, left, right, *rack = rates
     own = lambda name: jnp.stack([getattr(left, name)[:, 0], getattr(right, name)[:, 1]], axis=1)
     both, against = (jax.tree.map(lambda l, r, sign=sign: sign * l + r, left, right) for sign in (1.0, -1.0))

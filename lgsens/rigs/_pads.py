@@ -8,6 +8,7 @@ of ISO 8855: X_T = e × e_z/|…|, the trace of the wheel plane on the road, for
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -86,7 +87,7 @@ class Pad(AbstractJoint):
     at: Float[Array, "3"] = point_field("at")
     displacement: Float[Array, ""] = number_field("displacement", default=0.0)
 
-    a = None
+    a: str | None = eqx.field(static=True, default=None, init=False)
 
     def constraints(self, a: Frame, b: Frame):
         left = b.local_axis(jnp.asarray([0.0, 1.0, 0.0], self.at.dtype))
@@ -170,11 +171,11 @@ def on_rig(model: Model, centres: Mapping[str, Float[Array, "3"]]) -> Model:
         wheel, centre = f"{side}_wheel", centres[side]
         if wheel not in model.bodies:
             raise ValueError(f"`model`: the rig needs the body {wheel!r}; the bodies are {sorted(model.bodies)}.")
-        joints[f"{side}_pad"] = Pad(wheel, at=centre)
+        joints[f"{side}_pad"] = Pad(b=wheel, at=centre)
         for kind, (force, moment, contact) in KINDS.items():
             radius = centre[2] if contact else jnp.zeros_like(centre[2])
-            load = TyreLoad(wheel, at=centre, force=force, moment=moment, radius=radius)
-            forces[f"{side}_{kind}"] = load
+            wrench: dict[str, Any] = {"force": force, "moment": moment, "radius": radius}
+            forces[f"{side}_{kind}"] = TyreLoad(wheel, at=centre, **wrench)
     if taken := sorted(({*joints} & {*model.joints}) | ({*forces} & {*model.forces})):
         raise ValueError(f"`model`: {taken} are names of the rig's; give these elements other ones.")
     return Model(model.bodies, model.joints | joints, model.forces | forces)

@@ -3,12 +3,11 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_count, as_float
+from lgsens._validate import as_count, as_float, is_concrete
 from lgsens.rigs._pads import KINDS, SIDES
 
 PADS = tuple(f"{side}_pad" for side in SIDES)
@@ -86,7 +85,7 @@ def path(sweeps: Mapping[str, Sweep], points: int, names: tuple[str, ...]) -> Pa
     way = np.concatenate([up, -up[1:]])
     for title, sweep in sweeps.items():
         most = as_float(sweep.amplitude, (), f"`sweeps[{title!r}].amplitude`")
-        if not isinstance(most, jax.core.Tracer) and not (float(most) > 0 and np.isfinite(float(most))):
+        if is_concrete(most) and not (float(most) > 0 and np.isfinite(float(most))):
             raise ValueError(f"`sweeps[{title!r}].amplitude` must be positive, got {float(most)}.")
         if unknown := sorted({*sweep.shares} - {*names}):
             more = "; the axle has no rack" if RACK in unknown else ""
