@@ -14,11 +14,13 @@ from lgsens.analysis import (
     Growth as Growth,
     Kinematics as Kinematics,
     Linearization as Linearization,
+    Statics as Statics,
     constraint_rank as constraint_rank,
     kinematics as kinematics,
     linearize as linearize,
     random_road as random_road,
     sensitivity_growth as sensitivity_growth,
+    statics as statics,
 )
 from lgsens.criteria import (
     Advice as Advice,
@@ -128,6 +130,7 @@ _NAMESPACES = (
     "importers",
     "optimize",
     "plotting",
+    "rigs",
     "testing",
 )  # imported when first used: optax and matplotlib take their time
 

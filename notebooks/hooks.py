@@ -30,6 +30,7 @@ SHOWN = (
 NAMESPACES = (
     *("lgsens", "lgsens.model", "lgsens.integrate", "lgsens.liegroups", "lgsens.analysis", "lgsens.accuracy"),
     *("lgsens.optimize", "lgsens.sweeps", "lgsens.testing", "lgsens.plotting", "lgsens.examples", "lgsens.importers"),
+    "lgsens.rigs",
 )
 FORMULA = r"\$\$(.+?)\$\$|\\\[(.+?)\\\]|\$(.+?)\$|\\\((.+?)\\\)"  # newer mkdocs-jupyter writes \[…\] and \(…\)
 

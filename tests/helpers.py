@@ -26,6 +26,11 @@ def close(actual, expected, ulps, scale=None):
     np.testing.assert_allclose(actual, expected, rtol=0, atol=ulps * EPS * size)
 
 
+def factorizations(jaxpr) -> int:
+    """How many LU factorizations are in a program, however deep."""
+    return sum(equation.primitive.name == "lu" for equation in equations(jaxpr))
+
+
 def random_rotation(rng) -> np.ndarray:
     return Rotation.from_quat(rng.normal(size=4)).as_matrix()
 

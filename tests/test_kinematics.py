@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import GRAVITY, close, equations, random_body, random_rotation, says
+from helpers import GRAVITY, close, factorizations, random_body, random_rotation, says
 
 import lgsens as lg
 from lgsens.dynamics import positions
@@ -163,19 +163,14 @@ def test_second_derivatives_and_batches():
     )  # of order 1, Newton's end differs by round-off
 
 
-def factorizations(jaxpr) -> int:
-    """How many LU factorizations are in a program, however deep."""
-    return sum(equation.primitive.name == "lu" for equation in equations(jaxpr))
-
-
 def test_one_factorization_for_all_parameters():
     """The derivative by every number of the model adds one factorization, a batch over the positions."""
-    from lgsens.analysis._kinematics import _Drive, _drivers
+    from lgsens.analysis._driven import Drive, drivers
 
     system = driven_four_bar().system()
     values = jnp.asarray(ANGLES[:5, None])
-    where = (_drivers(system)["motor"],)
-    place = lambda system: positions(_Drive(system, where), values, jnp.zeros(5)).q.position[:, 1]
+    where = (drivers(system)["motor"],)
+    place = lambda system: positions(Drive(system, where), values, jnp.zeros(5)).q.position[:, 1]
     forward = jax.make_jaxpr(place)(system).jaxpr
     backward = jax.make_jaxpr(lambda s: jax.vjp(place, s)[1](jnp.ones((5, 3))))(system).jaxpr
     assert factorizations(backward) == factorizations(forward) + 1

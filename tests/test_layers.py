@@ -21,6 +21,7 @@ RANKS = (
     ("criteria",),
     ("analysis",),
     ("sweeps", "examples", "importers"),
+    ("rigs",),
     ("plotting",),
     ("accuracy", "optimize", "testing"),
     ("cli",),

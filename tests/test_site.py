@@ -23,7 +23,7 @@ import lgsens
 ROOT = Path(__file__).parents[1]
 NAMESPACES = (
     *("", ".model", ".integrate", ".liegroups", ".analysis", ".accuracy", ".optimize", ".sweeps", ".testing"),
-    *(".plotting", ".examples", ".importers"),
+    *(".plotting", ".examples", ".importers", ".rigs"),
 )
 
 

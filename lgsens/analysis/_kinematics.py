@@ -1,7 +1,6 @@
 """`kinematics`: the motion that joints and prescribed coordinates alone determine."""
 
-import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -9,10 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from lgsens._validate import as_float, suggestion
+from lgsens._validate import as_float
 from lgsens._xla import alike
-from lgsens.dynamics import RESULTS, AbstractDrive, State, forces_of_motion, positions
-from lgsens.model import AbstractJoint, AbstractSignal, Model, MultibodySystem
+from lgsens.analysis._driven import Drive, columns, drivers, of_one_length, refuse_history, speeds, table, with_numbers
+from lgsens.dynamics import RESULTS, State, forces_of_motion, positions
+from lgsens.model import AbstractJoint, Model, MultibodySystem
 from lgsens.simulation import AbstractRun, throw_if_failed
 
 
@@ -37,20 +37,6 @@ class Kinematics(AbstractRun):
 
     def _kinematics(self):
         return self.states, self.t
-
-
-class _Drive(AbstractDrive):
-    """A model's system, and where its driven numbers are: the stack of constraints and the element in it."""
-
-    system: MultibodySystem
-    where: tuple[tuple[int, int], ...] = eqx.field(static=True)
-
-    def at(self, values):
-        system = self.system
-        for (stack, element), value in zip(self.where, values):
-            leaf = lambda s, stack=stack: s.constraints[stack].elements.driven
-            system = eqx.tree_at(leaf, system, leaf(system).at[element].set(value))
-        return system
 
 
 def kinematics(
@@ -92,40 +78,19 @@ def kinematics(
     if not isinstance(model, Model):
         raise ValueError(f"`model` must be a Model, got {type(model).__name__}.")
     driven, start = dict(driven or {}), as_float(t0, (), "`t0`")
-    where = _drivers(_with_numbers(model, start).system())
+    where = drivers(with_numbers(model, start).system())
     if not driven and t is None:
         raise ValueError(
             f"`driven` is empty; give values for drivers of the model, some of {sorted(where)}, or the times `t` at "
             "which their signals are taken."
         )
-    for name in (*driven, *(rates or ())):
-        if name not in where:
-            raise ValueError(f"`driven`: {suggestion(name, where)}, the drivers and distance joints of the model.")
-    names = sorted(driven)
-    columns = [as_float(driven[name], None, f"`driven[{name!r}]`") for name in names]
-    times = [] if t is None else [as_float(t, None, "`t`")]
-    (shape, *_), given = [of.shape for of in (*times, *columns)], zip((*names, "t"), (*columns, *times))
-    if len(shape) != 1 or not shape[0] or any(of.shape != shape for of in (*times, *columns)):
-        shapes = {name: of.shape for name, of in given}
-        raise ValueError(f"`driven` must hold vectors of one length ≥ 1, and `t` be one, got shapes {shapes}.")
-    given = dict.fromkeys(names, 1.0) if rates is None else {name: rates.get(name, 0.0) for name in names}
-    speeds = [as_float(given[name], None, f"`rates[{name!r}]`") for name in names]
-    if any(speed.shape not in ((), shape) for speed in speeds):
-        raise ValueError(f"`rates` must have shape () or {shape}, got {[speed.shape for speed in speeds]}.")
-    if set(rates or ()) - set(names):
-        raise ValueError(f"`rates`: {sorted(set(rates or ()) - set(names))} are not among the driven joints {names}.")
-    system = _with_numbers(model, start, names).system()
-    if system.num_velocity_rows:
-        rolling = sorted(set(system.constraint_names[-system.num_velocity_rows :]))
-        raise ValueError(
-            f"`model`: {rolling} constrain velocities, so the positions depend on the way to them and not on driven "
-            "values alone; use `simulate`."
-        )
-    if system.num_states:
-        raise ValueError(
-            f"`model`: the force elements {sorted(system.places_of_states())} have states, whose values depend on the "
-            "motion before; use `simulate`, or leave them out."
-        )
+    values = columns("driven", driven, where, "the drivers and distance joints of the model")
+    columns("driven", rates or {}, where, "the drivers and distance joints of the model")
+    names, times = list(values), {} if t is None else {"t": as_float(t, None, "`t`")}
+    shape = of_one_length(times | values, ", and `t` be one")
+    given, speed = (table(rows, shape, start.dtype) for rows in (values.values(), speeds(names, rates, shape)))
+    system = with_numbers(model, start, names).system()
+    refuse_history(system)
     unknowns, equations = system.group.dim, len(system.constraint_names)
     if unknowns != equations:
         raise ValueError(
@@ -137,21 +102,18 @@ def kinematics(
                 else "Drive fewer coordinates, or remove joints that repeat each other."
             )
         )
-    where = _drivers(system)
-    drive = _Drive(system, tuple(where[name] for name in names))
-    table = lambda rows: jnp.stack([jnp.zeros(shape, start.dtype), *rows], axis=1)[:, 1:]
-    values, speed = table(columns), table([jnp.broadcast_to(speed, shape) for speed in speeds])
-    time = jnp.broadcast_to(start, shape) if t is None else times[0]
+    where = drivers(system)
+    drive = Drive(system, tuple(where[name] for name in names))
+    time = jnp.broadcast_to(start, shape) if t is None else times["t"]
     clock = jnp.zeros_like(time) if t is None else jnp.ones_like(time)
-    (states, result), details = _kinematics_jit(*alike((drive, (values, time), (speed, clock))))
+    (states, result), details = _kinematics_jit(*alike((drive, (given, time), (speed, clock))))
     if throw:
         states = throw_if_failed(states, result, details, system.constraint_names)
-    values = dict(zip(names, columns))
     return Kinematics(values=values, t=time, states=states, result=result, system=system, joints=model.joints)
 
 
 @eqx.filter_jit
-def _kinematics_jit(drive: _Drive, driven, rates):
+def _kinematics_jit(drive: Drive, driven, rates):
     found = positions(drive, *driven)
     states = jax.vmap(lambda *args: forces_of_motion(drive, *args))(found.q, driven, rates)
     first = jnp.argmin(found.found)  # the first that was not found, 0 if all were
@@ -159,25 +121,3 @@ def _kinematics_jit(drive: _Drive, driven, rates):
     details = {"violation": found.violation[first], "values": driven[0][first], "time": driven[1][first]}
     details["position"] = first
     return (states, result), jax.lax.stop_gradient(details)
-
-
-def _with_numbers(model: Model, t, names: Sequence[str] | None = None) -> Model:
-    """The model with numbers in place of the signals of time of these joints; None: of all."""
-    is_signal = lambda leaf: isinstance(leaf, AbstractSignal)
-    number = lambda leaf: leaf(t) if is_signal(leaf) else leaf
-
-    def numbers(joint: AbstractJoint) -> AbstractJoint:
-        leaves = lambda name: jax.tree.leaves(getattr(joint, name), is_leaf=is_signal)
-        over_time = [field.name for field in dataclasses.fields(joint) if field.metadata.get("over", "time") == "time"]
-        fields = [name for name in over_time if any(map(is_signal, leaves(name)))]
-        some = lambda joint: [getattr(joint, name) for name in fields]
-        return eqx.tree_at(some, joint, jax.tree.map(number, some(joint), is_leaf=is_signal)) if fields else joint
-
-    joints = {name: numbers(joint) if names is None or name in names else joint for name, joint in model.joints.items()}
-    return eqx.tree_at(lambda model: model.joints, model, joints)
-
-
-def _drivers(system: MultibodySystem) -> dict[str, tuple[int, int]]:
-    """By the name of each driver the stack of constraints and the element in it with its number."""
-    stacks = [(k, stack) for k, stack in enumerate(system.constraints) if stack.elements.driven is not None]
-    return {owner: (k, i) for k, stack in stacks for i, owner in enumerate(stack.owners)}

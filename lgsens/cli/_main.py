@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 import jax
 
 from lgsens._xla import compilation_cache
-from lgsens.cli import _curves, _import, _optimize, _paper, _top, _tradeoff
+from lgsens.cli import _curves, _import, _kc, _optimize, _paper, _top, _tradeoff
 from lgsens.cli._report import INTERRUPTED, UNFINISHED, interrupted, version
 from lgsens.examples import DEFAULT, PARAMETERS, shipped
 from lgsens.simulation import SimulationError
@@ -116,6 +116,40 @@ def _parser() -> argparse.ArgumentParser:
     curves.option("--travel", 0.08, "up and down [m]", type=_positive, metavar="M")
     curves.option("--points", 41, "positions", type=_count)
     curves.quiet("no table")
+
+    kc = commands.add_parser(
+        "kc",
+        help="kinematics and compliance of an axle",
+        description="An axle on the rig: its wheels are moved, steered and loaded in equilibrium with springs and "
+        "bushings. A page with all curves, pictures, JSON and CSV.",
+    )
+    kc.set_defaults(run=_kc.run)
+    kc.hardpoints()
+    kc.out("out/kc", "kc.html, kc.json, kc.csv and a picture of each sweep")
+    kc.add_argument(
+        "--sweeps", metavar="NAME,…", help="parallel, opposite, single, steering, lateral, … (default: all)"
+    )
+    kc.add_argument(
+        "--gradient", metavar="NAME,…|all", help="characteristics to differentiate by the hardpoints (default: none)"
+    )
+    kc.option("--points", 41, "of each sweep, odd", type=_count)
+    kc.option("--axle", "rear", choices=["rear", "front"])
+    kc.add_argument("--rigid", action="store_true", help="ideal joints in place of bushings")
+    for name, default, meaning in (
+        ("travel", 0.08, "of both wheels [m]"),
+        ("roll", 0.05, "of the wheels against each other [m]"),
+        ("lateral", 3000.0, "force on each wheel [N]"),
+        ("braking", 3000.0, "force on each wheel [N]"),
+        ("traction", 2000.0, "force on each wheel [N]"),
+        ("aligning", 150.0, "moment on each wheel [N m]"),
+        ("wheelbase", 2.7, "of the car [m], for anti-features and Ackermann"),
+        ("centre-height", 0.55, "of the car's centre of mass [m]"),
+        ("braking-share", 0.5, "of this axle in the braking force"),
+        ("traction-share", 1.0, "of this axle in the traction"),
+    ):
+        kc.option(f"--{name}", default, meaning, type=_positive)
+    kc.add_argument("--rack", type=_positive, metavar="M", help="way of the rack [m] (default: its travel, or 0.06)")
+    kc.quiet("no table")
 
     top = commands.add_parser(
         "top",

@@ -50,6 +50,7 @@ from lgsens.dynamics._redundant import (
     softness as softness,
 )
 from lgsens.dynamics._results import RESULTS as RESULTS
+from lgsens.dynamics._statics import StaticPath as StaticPath, static_path as static_path
 from lgsens.dynamics._system import (
     AbstractSparseSystem as AbstractSparseSystem,
     AbstractSystem as AbstractSystem,

@@ -18,6 +18,8 @@ class RESULTS(IntEnum):
     turn_not_resolved = 9
     invalid_numbers = 10
     not_steady = 11
+    statics_failed = 12
+    not_held = 13
 
     @property
     def message(self) -> str:
@@ -73,6 +75,14 @@ _MESSAGES = {
         "The motion is not steady: the equations of small motions about it change with time. Linearize at an "
         "equilibrium, or name the `rotation` of axes in which it does not change (a body that turns about another axis "
         "than that of its symmetry has none)."
+    ),
+    RESULTS.statics_failed: (
+        "No static equilibrium was found for these driven values and loads: they are out of reach, or the equilibrium "
+        "becomes unstable on the way (a linkage that snaps through). Ask for less, or come there in smaller steps."
+    ),
+    RESULTS.not_held: (
+        "The equilibrium is not determined: something can move without any force against it. Lock it (a wheel on its "
+        "hinge: `FixedJoint`), hold it (`RigidBody.free`), or give it a spring, however weak; or drive it."
     ),
     RESULTS.steps_exhausted: (
         "Error control needs more steps than `num_steps` allows. Try more `num_steps` or a looser `tolerance`."

@@ -25,7 +25,11 @@ from lgsens.examples._quarter_car_design import (
     Response as Response,
     SuspensionDesign as SuspensionDesign,
 )
-from lgsens.examples._suspension_curves import SuspensionCurves as SuspensionCurves
+from lgsens.examples._suspension_curves import (
+    SuspensionCurves as SuspensionCurves,
+    WheelPlane as WheelPlane,
+    wheel_plane as wheel_plane,
+)
 from lgsens.examples._tops import (
     free_rigid_body as free_rigid_body,
     heavy_top as heavy_top,

@@ -22,6 +22,37 @@ from jaxtyping import Array, Float
 from lgsens.analysis import Kinematics
 
 
+class WheelPlane(NamedTuple):
+    """How a wheel stands, ISO 8855 axes.
+
+    Attributes:
+        steer: angle from x to the trace of the wheel plane on the road [rad], positive to the left, shape ().
+        inclination: of the wheel plane to the vertical [rad], positive with its top to the right, shape ().
+        contact: the contact centre, its lowest point [m], inertial frame, shape (3,).
+    """
+
+    steer: Float[Array, ""]
+    inclination: Float[Array, ""]
+    contact: Float[Array, "3"]
+
+
+def wheel_plane(axis: Float[Array, "3"], centre: Float[Array, "3"], radius: Float[Array, ""]) -> WheelPlane:
+    """Steer angle, inclination and contact centre of a wheel.
+
+        δ = atan2(−e·e_x, e·e_y),     ε = asin(e·e_z),     P = c − r u,  u = (e_z − (e_z·e) e)/|…|
+
+    Arguments:
+        axis: e, unit vector of the spin axis that points left, inertial frame, shape (3,).
+        centre: c, the wheel centre [m], inertial frame, shape (3,).
+        radius: r, from the wheel centre to the road [m], shape (); 0: the contact centre is the wheel centre.
+
+    Source: ISO 8855:2011 (wheel plane, contact centre, steer and inclination angle).
+    """
+    up = jnp.asarray([0.0, 0.0, 1.0], axis.dtype) - axis[2] * axis
+    contact = centre - radius * up / jnp.linalg.norm(up)
+    return WheelPlane(jnp.arctan2(-axis[0], axis[1]), jnp.arcsin(axis[2]), contact)
+
+
 class SuspensionCurves(NamedTuple):
     """The curves of a suspension over wheel travel, ISO 8855 axes and signs; arrays of shape (n,).
 
@@ -63,19 +94,16 @@ def suspension_curves(motion: Kinematics, centre: Float[Array, "3"], *, rear: bo
     axis_rate = jnp.einsum("nij,nj->ni", wheel.orientation, turning)
     side = jnp.where(centre[1] > 0, 1.0, -1.0)
 
-    def contact(axis, place):
-        up = jnp.asarray([0.0, 0.0, 1.0], axis.dtype) - axis[2] * axis
-        return place - centre[2] * up / jnp.linalg.norm(up)
-
-    along = lambda *args: jax.jvp(contact, args[:2], args[2:])
-    at, rate = jax.vmap(along)(axis, wheel.position, axis_rate, wheel.velocity)
+    along = lambda *args: jax.jvp(lambda axis, place: wheel_plane(axis, place, centre[2]), args[:2], args[2:])
+    plane, rates = jax.vmap(along)(axis, wheel.position, axis_rate, wheel.velocity)
+    at, rate = plane.contact, rates.contact
     # At the design position the axis is along y, so the contact centre is below the wheel centre.
     moved = at - jnp.stack([centre[0], centre[1], jnp.zeros_like(side)])[None]
     spring, damper = motion.force("spring"), motion.force("damper")
     return SuspensionCurves(
         travel=motion.values["travel"],
-        camber=-side * jnp.arcsin(axis[:, 2]),
-        toe=-side * jnp.arctan2(-axis[:, 0], axis[:, 1]),
+        camber=-side * plane.inclination,
+        toe=-side * plane.steer,
         track_change=2.0 * side * moved[:, 1],
         wheelbase_change=-moved[:, 0] if rear else moved[:, 0],
         spring_motion_ratio=-spring.rate,

@@ -59,11 +59,6 @@ class AbstractRows(AbstractElement):
         """Whether it is about orientations only."""
         return {*self.acts_on} <= {*TURNING_A, *TURNING_B}
 
-    @property
-    def driven(self) -> Float[Array, ""] | None:
-        """The number that `kinematics` prescribes, a leaf with ∂Φ/∂s = −1; None: there is none."""
-        return None
-
     def violable(self, free: Set[str]) -> tuple[bool, ...]:
         """Which of its equations change where its bodies have these degrees of freedom, one rotation at most, and the
         reference configuration satisfies them all. The others are left out: their rows of B would be zero."""

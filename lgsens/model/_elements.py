@@ -7,7 +7,7 @@ import dataclasses
 from typing import Any, ClassVar
 
 import equinox as eqx
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from lgsens.model._frames import ALL
 
@@ -36,6 +36,12 @@ class AbstractElement(eqx.Module):
         """The coordinates 0 … 11, [x_a, θ_a, x_b, θ_b], that it acts on: B has no other columns, and the generalized
         force no other entries. Of a constraint, which then depends on no others, all of them or the six rotations."""
         return ALL
+
+    @property
+    def driven(self) -> Float[Array, ""] | None:
+        """The number, a leaf, that `kinematics` and `statics` prescribe: a constraint has ∂Φ/∂s = −1, a load is
+        multiplied by it; None: there is none."""
+        return None
 
     def fixed(self, kind: str, bodies: str = "ab") -> list[Array]:
         """Its points, axes or tensors, in the frames of these bodies."""

@@ -22,7 +22,7 @@ from lgsens.model._loads import (
     Weight,
 )
 from lgsens.model._roads import FlatRoad
-from lgsens.model._signals import AbstractSignal, prepared, signal_field
+from lgsens.model._signals import AbstractSignal, Constant, prepared, signal_field
 from lgsens.model._turning_loads import FixedMoment, FollowingForce, LoadSum
 
 
@@ -70,6 +70,10 @@ class AbstractForce(eqx.Module):
     def on(self, joints: Mapping[str, AbstractJoint]) -> "AbstractForce":
         """The same element, given the joints of the model, one of which it may act in."""
         return self
+
+    def with_factor(self, factor) -> "AbstractForce | None":
+        """The same element multiplied by a number in place of a signal; None: no signal multiplies it."""
+        return None
 
     @abc.abstractmethod
     def loads(self, bodies: Mapping[str, RigidBody]) -> tuple[Attached, ...]:
@@ -257,6 +261,9 @@ class AppliedForce(AbstractForce):
     fixed_moment: Float[Array, "3"] | None = point_field("fixed_moment", default=None)
     signal: AbstractSignal = signal_field("signal", default_factory=_one)
     follows: bool = eqx.field(static=True, default=False, kw_only=True)
+
+    def with_factor(self, factor):
+        return dataclasses.replace(self, signal=Constant(value=factor))
 
     @property
     def bodies(self):

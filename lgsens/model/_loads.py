@@ -29,7 +29,7 @@ from lgsens.model._frames import (
     separation_force,
     separation_stiffness,
 )
-from lgsens.model._signals import AbstractSignal
+from lgsens.model._signals import AbstractSignal, constant_of
 
 
 class LoadTangents(NamedTuple):
@@ -302,6 +302,10 @@ class PointForce(AbstractClosedFormLoad):
     vector: Float[Array, "3"]
     moment: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
     signal: AbstractSignal
+
+    @property
+    def driven(self):
+        return constant_of(self.signal)
 
     def force(self, a, b, va, vb, t):
         moment = self.moment + cross(self.point_b, b.local_axis(self.vector))

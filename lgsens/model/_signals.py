@@ -279,6 +279,11 @@ def number_of(value: Prescribed | None) -> Float[Array, ""] | None:
     return None if isinstance(value, AbstractSignal) else value
 
 
+def constant_of(signal: AbstractSignal) -> Float[Array, ""] | None:
+    """The number of a signal that is one; None: of another."""
+    return signal.value if isinstance(signal, Constant) else None
+
+
 def _no_signal(name: str, what: str, value: Any) -> ValueError:
     return ValueError(
         f"`{name}` must be {what} (Harmonic, Polynomial, Ramp, Sampled, or a subclass of AbstractSignal, whose numbers "

@@ -13,12 +13,11 @@ from jaxtyping import Array, Float
 
 from lgsens.liegroups import SO3, cross, skew, turn, turn_back
 from lgsens.model._constraints import total
-from lgsens.model._drivers import Angle
 from lgsens.model._elements import body_fixed
 from lgsens.model._frames import BODY_B, ROTATION, ROTATION_B, TRANSLATION_B, TURNING_A, TURNING_B, embedded
 from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, BushingLoad, LoadTangents
-from lgsens.model._signals import AbstractSignal, Prescribed, at_time
-from lgsens.model._stack import constraint_jacobian, load_tangents
+from lgsens.model._signals import AbstractSignal, Prescribed, at_time, constant_of
+from lgsens.model._stack import load_tangents
 
 
 class HingeMoment(NamedTuple):
@@ -93,21 +92,29 @@ class TorsionLoad(AbstractLoad):
     def acts_on(self):
         return TURNING_A + TURNING_B
 
-    def _row(self, a, b, t):
-        """θ − θ₀ and ∂θ/∂q."""
-        twist = Angle(self.first_a, self.second_a, self.first_b, self.free_angle)
-        return twist.value(a, b, t)[0], constraint_jacobian(twist, a, b, t)[0]
+    def _row(self, a, b):
+        """θ − θ₀ and ∂θ/∂q: with β = Cβ₀, C = R_aᵀR_b, and g = ∂θ/∂β, δβ = β × δθ_a + C (δθ_b × β₀)."""
+        relative = a.orientation.T @ b.orientation
+        beta = turn(relative, self.first_b)
+        x, y = jnp.sum(beta * self.first_a), jnp.sum(beta * self.second_a)
+        g = (x * self.second_a - y * self.first_a) / (x * x + y * y)
+        sine, cosine = jnp.sin(self.free_angle), jnp.cos(self.free_angle)
+        twist = jnp.arctan2(y * cosine - x * sine, x * cosine + y * sine)
+        zero = jnp.zeros_like(g)
+        return twist, jnp.concatenate([zero, cross(g, beta), zero, cross(self.first_b, turn_back(relative, g))])
+
+    def _moment(self, twist, rate, t):
+        moment = -self.preload - self.stiffness * twist - self.damping * rate
+        return moment if self.motor is None else moment + at_time(self.motor, t)
 
     def measure(self, a, b, va, vb, t) -> HingeMoment:
-        twist, row = self._row(a, b, t)
+        twist, row = self._row(a, b)
         rate = jnp.sum(row * jnp.concatenate([va, vb]))
-        moment = -self.preload - self.stiffness * twist - self.damping * rate
-        if self.motor is not None:
-            moment += at_time(self.motor, t)
-        return HingeMoment(self.free_angle + twist, rate, moment)
+        return HingeMoment(self.free_angle + twist, rate, self._moment(twist, rate, t))
 
     def force(self, a, b, va, vb, t):
-        return self.measure(a, b, va, vb, t).moment * self._row(a, b, t)[1]
+        twist, row = self._row(a, b)
+        return self._moment(twist, jnp.sum(row * jnp.concatenate([va, vb])), t) * row
 
 
 class RotationLoad(AbstractLoad):
@@ -180,6 +187,10 @@ class FollowingForce(AbstractClosedFormLoad):
     vector: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
     moment: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
     signal: AbstractSignal
+
+    @property
+    def driven(self):
+        return constant_of(self.signal)
 
     def force(self, a, b, va, vb, t):
         zero = jnp.zeros(BODY_B.start, self.vector.dtype)

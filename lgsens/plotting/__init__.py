@@ -12,6 +12,7 @@ from lgsens.plotting._errors import (
     work_precision as work_precision,
     work_precision_panels as work_precision_panels,
 )
+from lgsens.plotting._kc import kc_curves as kc_curves
 from lgsens.plotting._mechanism import mechanism as mechanism
 from lgsens.plotting._panels import (
     Panel as Panel,

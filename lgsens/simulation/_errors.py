@@ -91,6 +91,11 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
         case RESULTS.position_failed:
             driven = np.array2string(details["values"], precision=6)
             more = f"It failed at position {int(details['position'])}, driven values {driven}, {time}. {worst}"
+        case RESULTS.statics_failed | RESULTS.not_held:
+            driven = np.array2string(details["values"], precision=6)
+            more = f"It failed at point {int(details['position'])}, driven values and factors {driven}."
+            if len(details.get("free", ())):
+                more = f"What moves freely: {', '.join(map(str, details['free']))}. {more}"
         case RESULTS.steps_exhausted:
             more = f"It came to {time} of {details['t1']:.6g} s in {num_steps} steps. `throw=False` returns these."
         case RESULTS.integration_failed:
@@ -110,6 +115,7 @@ def _exception(result: int, details: dict[str, Any], names: tuple[str, ...], not
         RESULTS.position_failed,
         RESULTS.invalid_numbers,
         RESULTS.not_steady,
+        RESULTS.not_held,
     )
     kind = ValueError if result in bad_input else SimulationError
     note = note if result == RESULTS.redundant_constraints else ""

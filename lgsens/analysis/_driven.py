@@ -1,0 +1,100 @@
+"""Driven mechanisms: where their driven numbers are, and what values and rates of them are given."""
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from lgsens._validate import as_float, suggestion
+from lgsens.dynamics import AbstractDrive
+from lgsens.model import AbstractJoint, AbstractSignal, Model, MultibodySystem
+
+
+class Drive(AbstractDrive):
+    """A model's system, and where its driven numbers are: whether in a constraint, the stack and the element in it."""
+
+    system: MultibodySystem
+    where: tuple[tuple[str, int, int], ...] = eqx.field(static=True)
+
+    def at(self, values):
+        system = self.system
+        for kind, stack in dict.fromkeys((kind, stack) for kind, stack, _ in self.where):
+            leaf = lambda s, kind=kind, stack=stack: getattr(s, kind)[stack].elements.driven
+            own = {element: i for i, (*of, element) in enumerate(self.where) if of == [kind, stack]}
+            # One selection for each stack: the derivative of a scatter takes as long as that of an element.
+            old = leaf(system)
+            new = [values[own[i]] if i in own else old[i] for i in range(old.shape[0])]
+            system = eqx.tree_at(leaf, system, jnp.stack(new))
+        return system
+
+
+def with_numbers(model: Model, t, names: Iterable[str] | None = None) -> Model:
+    """The model with numbers in place of the signals of time of these joints; None: of all."""
+    is_signal = lambda leaf: isinstance(leaf, AbstractSignal)
+    number = lambda leaf: leaf(t) if is_signal(leaf) else leaf
+
+    def numbers(joint: AbstractJoint) -> AbstractJoint:
+        leaves = lambda name: jax.tree.leaves(getattr(joint, name), is_leaf=is_signal)
+        over_time = [field.name for field in dataclasses.fields(joint) if field.metadata.get("over", "time") == "time"]
+        fields = [name for name in over_time if any(map(is_signal, leaves(name)))]
+        some = lambda joint: [getattr(joint, name) for name in fields]
+        return eqx.tree_at(some, joint, jax.tree.map(number, some(joint), is_leaf=is_signal)) if fields else joint
+
+    joints = {name: numbers(joint) if names is None or name in names else joint for name, joint in model.joints.items()}
+    return eqx.tree_at(lambda model: model.joints, model, joints)
+
+
+def drivers(system: MultibodySystem, kind: str = "constraints") -> dict[str, tuple[str, int, int]]:
+    """By the name of each driver, or of each load ("loads") with a factor, where its number is."""
+    stacks = [(k, stack) for k, stack in enumerate(getattr(system, kind)) if stack.elements.driven is not None]
+    return {owner: (kind, k, i) for k, stack in stacks for i, owner in enumerate(stack.owners)}
+
+
+def columns(argument: str, given: Mapping[str, Any], known: Iterable[str], what: str) -> dict[str, jax.Array]:
+    """Values by name, in sorted order; `what` the known names are."""
+    for name in given:
+        if name not in known:
+            raise ValueError(f"`{argument}`: {suggestion(name, known)}, {what}.")
+    return {name: as_float(given[name], None, f"`{argument}[{name!r}]`") for name in sorted(given)}
+
+
+def of_one_length(given: Mapping[str, jax.Array], more: str = "") -> tuple[int, ...]:
+    """The shape (n,) of all vectors. Raises `ValueError` for another one."""
+    shape = next(iter(given.values())).shape
+    if len(shape) != 1 or not shape[0] or any(of.shape != shape for of in given.values()):
+        shapes = {name: of.shape for name, of in given.items()}
+        raise ValueError(f"`driven` must hold vectors of one length ≥ 1{more}, got shapes {shapes}.")
+    return shape
+
+
+def speeds(names: Sequence[str], given: Mapping[str, Any] | None, shape: tuple[int, ...]) -> list[jax.Array]:
+    """The rates of the driven values by name, each of shape (n,); those left out are 0, None: 1 for all."""
+    if unknown := sorted(set(given or ()) - set(names)):
+        raise ValueError(f"`rates`: {unknown} are not among the driven ones {list(names)}.")
+    rates = [as_float(1.0 if given is None else given.get(name, 0.0), None, f"`rates[{name!r}]`") for name in names]
+    if any(rate.shape not in ((), shape) for rate in rates):
+        raise ValueError(f"`rates` must have shape () or {shape}, got {[rate.shape for rate in rates]}.")
+    return [jnp.broadcast_to(rate, shape) for rate in rates]
+
+
+def table(rows: Iterable[jax.Array], shape: tuple[int, ...], dtype) -> jax.Array:
+    """The vectors as columns, of none of them an array without columns."""
+    return jnp.stack([jnp.zeros(shape, dtype), *rows], axis=1)[:, 1:]
+
+
+def refuse_history(system: MultibodySystem) -> None:
+    """Raise `ValueError` where positions or forces depend on the motion before."""
+    if system.num_velocity_rows:
+        rolling = sorted(set(system.constraint_names[-system.num_velocity_rows :]))
+        raise ValueError(
+            f"`model`: {rolling} constrain velocities, so the positions depend on the way to them and not on driven "
+            "values alone; use `simulate`."
+        )
+    if system.num_states:
+        raise ValueError(
+            f"`model`: the force elements {sorted(system.places_of_states())} have states, whose values depend on the "
+            "motion before; use `simulate`, or leave them out."
+        )

@@ -1,0 +1,221 @@
+"""Quasi-static equilibria along a path of driven values: r(q, 0, 0, λ; s, t) = 0, Φ(q; s, t) = 0.
+
+The driven values s are d numbers of a system: what constraints prescribe, and by what given forces are multiplied. With
+the numbers p of the system, y = (q, λ) and R = [r; Φ] at rest, a point of the path is R(y; s, p) = 0. Perturbed,
+q w̃ and μ in place of δq and δλ,
+
+    δR = K (w, μ) + R_s δs + R_p δp,     K = [[K_t, Bᵀ], [B, 0]],
+
+square, and regular where the equilibrium holds every body: a wheel that turns freely on its hinge makes it singular.
+
+Path. In one scan each point begins at the one before, moved along its tangent K⁻¹ R_s Δs, with the factors of K there:
+modified Newton, factors renewed when an iteration leaves more than a fifth of the step. Once steps are below √ε, one
+more with new factors ends at round-off, and its factors are those of the tangents: one or two factorizations per point.
+
+Responses. To rates s′ along the path (a direction, of which there may be several) the equilibrium answers with
+
+    z = (w, λ′) :     D(y, z; s, s′, p) = d/dε R(q exp(ε w̃), λ + ε λ′; s + ε s′, p) = K z + R_s s′ = 0.
+
+Factors from a distance √ε away leave ε of the error after two iterations z ← z − K⁻¹ D.
+
+Derivatives. By the implicit function theorem, first of the point, then of its response at the derivative of the point,
+
+    K (x, μ) = −(R_s δs + R_p δp),     K δz = −δD  at fixed w and λ′ (Lie-algebra coordinates).
+
+One factorization of K serves all right-hand sides: in forward mode one or two per parameter, in reverse mode, by the
+transposed factors, as many per output. δD is a directional derivative of D, no third derivative is ever a matrix.
+Nothing is differentiated along the iteration, nor by the point where it began (Haug, Choi & Komkov 1986, §1.2.2).
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from lgsens._xla import scan, while_loop
+from lgsens.dynamics._kinematics import AbstractDrive
+from lgsens.linear import LU, Inverse, LinearEquations, linear_solve
+
+_MAX_ITERATIONS = 60
+_SLOW = 0.2  # what a chord iteration may leave of a step before factors are renewed
+
+
+_times = jax.vmap(jnp.matmul)
+_AT_EVERY_POINT = LinearEquations(  # of the constants K and K⁻ᵀ
+    lambda of, x: _times(of[0], x),
+    lambda of, b: _times(jnp.swapaxes(of[1], 1, 2), b),
+    lambda of, c: _times(of[1], c),
+)
+
+
+class StaticPath(NamedTuple):
+    """Equilibria at n points, and their responses to r directions; NaN where none was found."""
+
+    q: Any  # stacked along a leading axis n
+    lam: Float[Array, "n m"]
+    w: Float[Array, "n r k"]
+    lam_rate: Float[Array, "n r m"]
+    found: Bool[Array, " n"]
+    pivot: Float[Array, " n"]  # the smallest pivot of the scaled K over the largest: 0 where it is singular
+
+
+class _Factors(NamedTuple):
+    """K in factors, in units in which its unknowns are of order one: lengths of the scene, rad, and `force`."""
+
+    lu: Any  # LU or Inverse
+    coordinate: Float[Array, " k"]
+    force: Float[Array, ""]  # J, the size of K_t in these units
+
+    def residual(self, force, violation):
+        return jnp.concatenate([force * self.coordinate / self.force, violation])
+
+    def parts(self, y) -> tuple[Array, Array]:
+        k = self.coordinate.shape[0]
+        return y[:k] * self.coordinate, y[k:] * self.force
+
+
+def _matrix(drive: AbstractDrive, values, q, lam, t):
+    """K and its units."""
+    system = drive.at(values)
+    zero = jnp.zeros_like(system.reference()[1])
+    tangents = system.tangents(q, zero, zero, lam, t)
+    scale = lax.stop_gradient(drive.system.coordinate_scale())
+    stiffness = tangents.stiffness * scale[None, :] * scale[:, None]
+    size = lax.stop_gradient(jnp.max(jnp.abs(stiffness)))
+    size = jnp.where(size > 0, size, 1.0)
+    jacobian = tangents.constraint_jacobian * scale[None, :]
+    corner = jnp.zeros((jacobian.shape[0],) * 2, jacobian.dtype)
+    return jnp.block([[stiffness / size, jacobian.T], [jacobian, corner]]), (scale, size)
+
+
+def _residual(drive: AbstractDrive, values, q, lam, t):
+    """r and Φ at rest."""
+    system = drive.at(values)
+    zero = jnp.zeros_like(system.reference()[1])
+    return system.residual(q, zero, zero, lam, t), system.constraint(q, t)
+
+
+def _response(drive: AbstractDrive, values, rates, q, lam, w, lam_rate, t):
+    """D."""
+    along = (rates, drive.system.group.to_ambient(q, w), lam_rate)
+    return jax.jvp(lambda s, q, lam: _residual(drive, s, q, lam, t), (values, q, lam), along)[1]
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
+    """y and z at each point; the points `starts` are found from the first one, that one from the reference."""
+    group, system, (home, v) = drive.system.group, drive.system, drive.system.reference()
+    k, m, dtype = v.shape[0], len(system.constraint_names), v.dtype
+    n, precise = values.shape[0], float(jnp.finfo(dtype).eps) ** 0.5
+    begins = jnp.zeros(n, bool).at[jnp.asarray((0, *starts))].set(True)
+    ahead = jnp.concatenate([values[1:] - values[:-1], jnp.zeros_like(values[:1])])
+    ahead = jnp.where(jnp.roll(begins, -1)[:, None], 0.0, ahead)
+    # The last direction is that to the next point.
+    rates = jnp.concatenate([rates, ahead[:, None]], axis=1)
+
+    def factorize(s, q, lam):
+        matrix, units = _matrix(drive, s, q, lam, t)
+        return _Factors(LU.of(matrix), *units)
+
+    def move(q, lam, w, change):
+        return group.retract(q, w), lam + change
+
+    def newton(s, q, lam, factors, stale):
+        def body(carry):
+            q, lam, factors, stale, size, iteration, _ = carry
+            factors = lax.cond(stale, lambda: factorize(s, q, lam), lambda: factors)
+            step = -factors.lu.solve(factors.residual(*_residual(drive, s, q, lam, t)))
+            left = jnp.max(jnp.abs(step))
+            # Far from the solution a full step may leave the branch: at most 0.2 rad or a fifth of the scene at a time.
+            step = step * jnp.minimum(1.0, 0.2 / jnp.maximum(jnp.max(jnp.abs(step[:k])), 0.2))
+            q, lam = move(q, lam, *factors.parts(step))
+            small = left <= precise
+            return q, lam, factors, small | (left > _SLOW * size), left, iteration + 1, small & stale
+
+        def unfinished(carry):
+            *_, iteration, done = carry
+            return ~done & (iteration < _MAX_ITERATIONS)
+
+        start = (q, lam, factors, stale, jnp.full((), jnp.inf, dtype), jnp.zeros((), jnp.int32), jnp.zeros((), bool))
+        q, lam, factors, *_, done = while_loop(unfinished, body, start)
+        return q, lam, factors, done
+
+    def respond(s, rates, q, lam, factors):
+        def refine(z, _):
+            response = partial(_response, drive, s)
+            left = jax.vmap(lambda z, rate: response(rate, q, lam, *factors.parts(z), t=t))(z, rates)
+            return z - factors.lu.solve(jax.vmap(factors.residual)(*left).T).T, None
+
+        z = scan(refine, jnp.zeros((rates.shape[0], k + m), dtype), None, length=2)[0]
+        return jax.vmap(factors.parts)(z)
+
+    def follow(carry, row):
+        home, before, factors, held = carry
+        s, rates, begins, first = row
+        q, lam = jax.tree.map(lambda far, near: jnp.where(begins, far, near), home, before)
+        q, lam, factors, done = newton(s, q, lam, factors, begins | ~held)
+        w, lam_rate = respond(s, rates, q, lam, factors)
+        keep = lambda new, old: jnp.where(done, new, old)
+        after = jax.tree.map(keep, move(q, lam, w[-1], lam_rate[-1]), before)
+        home = jax.tree.map(lambda new, old: jnp.where(first & done, new, old), (q, lam), home)
+        pivots = jnp.abs(jnp.diagonal(factors.lu.lu))
+        ended = done.astype(dtype), jnp.min(pivots) / jnp.max(pivots)
+        return (home, after, factors, done), (q, lam, w[:-1], lam_rate[:-1], *ended)
+
+    whole = jnp.arange(k + m, dtype=jnp.int32)
+    start = home, jnp.zeros(m, dtype)
+    none = LU(jnp.zeros((k + m, k + m), dtype), whole, whole)
+    factors = _Factors(none, jnp.ones(k, dtype), jnp.ones((), dtype))
+    rows = values, rates, begins, jnp.arange(n) == 0
+    return scan(follow, (start, start, factors, jnp.zeros((), bool)), rows)[1]
+
+
+@_path.defjvp
+def _path_jvp(starts, primals, tangents):
+    drive, values, rates, t = primals
+    drive_dot, values_dot, rates_dot, t_dot = tangents
+    q, lam, w, lam_rate, *ended = _path(starts, *primals)
+    group, rows = drive.system.group, (q, lam, values)
+    every = lambda of, xs: scan(lambda _, row: (None, of(*row)), None, xs)[1]
+    matrix, units = jax.vmap(lambda q, lam, s: _matrix(drive, s, q, lam, t))(*rows)
+    factors = jax.vmap(lambda matrix, *units: _Factors(Inverse.of(matrix), *units))(lax.stop_gradient(matrix), *units)
+
+    def solve(force, violation):
+        """−K⁻¹ at every point: products, which are one operation for all directions."""
+        rhs = jax.vmap(_Factors.residual)(factors, force, violation)
+        solved = linear_solve(_AT_EVERY_POINT, (matrix, factors.lu.transpose), rhs)
+        return jax.vmap(_Factors.parts)(factors, -solved)
+
+    # One point after the other: what all directions need of one stays in the processor's cache.
+    def first(q, lam, s, s_dot):
+        of = lambda drive, s, t: _residual(drive, s, q, lam, t)
+        return jax.jvp(of, (drive, s, t), (drive_dot, s_dot, t_dot))[1]
+
+    x, mu = solve(*every(first, (*rows, values_dot)))
+    q_dot = jax.vmap(group.to_ambient)(q, x)
+
+    def second(q, lam, s, q_dot, mu, s_dot, *along):
+        def change(w, lam_rate, rate, rate_dot):
+            of = lambda drive, s, q, lam, t, rate: _response(drive, s, rate, q, lam, w, lam_rate, t)
+            return jax.jvp(of, (drive, s, q, lam, t, rate), (drive_dot, s_dot, q_dot, mu, t_dot, rate_dot))[1]
+
+        return jax.vmap(change)(*along)
+
+    changes = every(second, (*rows, q_dot, mu, values_dot, w, lam_rate, rates, rates_dot))
+    w_dot, lam_rate_dot = jax.vmap(solve, 1, 1)(*changes)
+    return (q, lam, w, lam_rate, *ended), (q_dot, mu, w_dot, lam_rate_dot, *jax.tree.map(jnp.zeros_like, ended))
+
+
+def static_path(
+    drive: AbstractDrive, values: Float[Array, "n d"], rates: Float[Array, "n r d"], t, starts: tuple[int, ...] = ()
+) -> StaticPath:
+    """The equilibria at each row of driven values, and their responses to each direction of rates, differentiable by
+    the rule above; NaN where none was found."""
+    *found, done, pivot = _path(starts, drive, values, rates, t)
+    held = (done > 0) & (pivot > 1e2 * jnp.finfo(pivot.dtype).eps)
+    poison = lambda leaf: jnp.where(held.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.nan)
+    q, lam, w, lam_rate = jax.tree.map(poison, tuple(found))
+    return StaticPath(q, lam, w, lam_rate, held, pivot)

@@ -1,0 +1,174 @@
+"""Equilibria along a path against closed forms and SciPy on hand-written equations, their derivatives, bad input."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import GRAVITY, close, factorizations, says
+from scipy.optimize import brentq
+
+import lgsens as lg
+from lgsens.analysis._driven import Drive, drivers
+from lgsens.dynamics import static_path
+
+PUSH = np.linspace(0.0, 600.0, 7)
+ANCHOR, WEIGHT = np.array([0.4, 1.0]), 2.0 * 9.81
+
+
+def lever(stiffness=5000.0, arm=0.4):
+    """A bar of 1 m hinged at one end, a spring from above at `arm`, a load of 1 N downward at the other end."""
+    bar = lg.RigidBody(mass=2.0, inertia=(0.1, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    forces = {
+        "spring": lg.SpringDamper(
+            None,
+            "bar",
+            at_a=(ANCHOR[0], 0.0, ANCHOR[1]),
+            at_b=jnp.stack([jnp.asarray(arm), *jnp.zeros(2)]),
+            stiffness=stiffness,
+            damping=7.0,
+        ),
+        "push": lg.AppliedForce("bar", at=(1.0, 0.0, 0.0), force=(0.0, 0.0, -1.0)),
+        "gravity": lg.Gravity(GRAVITY),
+    }
+    hinge = lg.RevoluteJoint(None, "bar", at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+    return lg.Model({"bar": bar}, {"hinge": hinge}, forces)
+
+
+def angle(push, stiffness=5000.0, arm=0.4):
+    """How far the bar turns downward, where the moments of spring, weight and load vanish."""
+    free = np.hypot(arm - ANCHOR[0], ANCHOR[1])
+
+    def moment(angle):
+        point = arm * np.array([np.cos(angle), -np.sin(angle)])
+        d = point - ANCHOR
+        length = np.hypot(*d)
+        turned = arm * np.array([-np.sin(angle), -np.cos(angle)])
+        return (WEIGHT / 2 + push) * np.cos(angle) - stiffness * (length - free) * (d @ turned) / length
+
+    return brentq(moment, -0.3, 0.9, xtol=1e-15, rtol=1e-15)
+
+
+def of_lever(numbers):
+    """Height of the centre of mass, its derivative by the load, and the spring's."""
+    found = lg.statics(lever(*numbers), loads={"push": PUSH})
+    along = found.along()
+    return found.body("bar").position[:, 2], along.body("bar").velocity[:, 2], along.force("spring").rate
+
+
+NUMBERS = jnp.array([5000.0, 0.4])
+
+
+@pytest.fixture(scope="module")
+def found():
+    return of_lever(NUMBERS)
+
+
+def differences(function, step):
+    """Central differences of fourth order."""
+    a, b, c, d = (np.asarray(function(i * step)) for i in (-2, -1, 1, 2))
+    return (a - 8 * b + 8 * c - d) / (12 * step)
+
+
+def test_positions_and_responses(found):
+    """Large turns, 0.2 rad, of a spring that goes round its anchor."""
+    angles = np.array([angle(push) for push in PUSH])
+    assert angles[-1] > 0.2
+    close(found[0], -0.5 * np.sin(angles), 16, scale=1.0)
+    # h⁴/30 f⁽⁵⁾, measured as 1.4e-12 at h = 5 N, so 2e-15 at 1 N; round-off 1e-16/h
+    rates = np.array([differences(lambda h, p=p: -0.5 * np.sin(angle(p + h)), 1.0) for p in PUSH])
+    np.testing.assert_allclose(found[1], rates, rtol=0, atol=1e-14)
+
+
+def test_derivatives_of_equilibria_and_responses(found):
+    forward, backward = jax.jit(jax.jacfwd(of_lever))(NUMBERS), jax.jit(jax.jacrev(of_lever))(NUMBERS)
+    for i, step in enumerate((10.0, 1e-3)):
+        numbers = lambda h, i=i: np.asarray(NUMBERS.at[i].add(h))
+        height = lambda h, numbers=numbers: [-0.5 * np.sin(angle(p, *numbers(h))) for p in PUSH]
+        slope = lambda h, numbers=numbers: [
+            differences(lambda d, p=p: -0.5 * np.sin(angle(p + d, *numbers(h))), 2.0) for p in PUSH
+        ]
+        for value, expected in zip((forward[0], forward[1]), (height, slope)):
+            # Differences leave (h/p)⁴ = (1e-3/0.4)⁴, 4e-11, by the load 3e-10, and 1e-16/h of round-off twice.
+            scale = np.abs(value[:, i]).max()
+            np.testing.assert_allclose(value[:, i], differences(expected, step), rtol=0, atol=1e-8 * scale)
+    for one, other in zip(forward, backward):
+        close(one, other, 100)  # one linear operator and its transpose, of condition 10
+
+
+def test_series_parallel_and_starts():
+    """Springs in series and parallel, driven: λ = −k₁(k₂ + k₃)/(k₁ + k₂ + k₃) s, whichever point each begins from."""
+    stiffness = {"one": 3e4, "two": 5e4, "three": 2e4}
+    bodies = {
+        name: lg.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), position=(0.0, 0.0, z), free="z")
+        for name, z in (("low", 1.0), ("high", 2.0))
+    }
+    ends = {"one": (None, "low", 0.0, 1.0), "two": ("low", "high", 1.0, 2.0), "three": ("low", "high", 1.0, 2.0)}
+    forces = {
+        name: lg.SpringDamper(a, b, at_a=(0.0, 0.0, za), at_b=(0.0, 0.0, zb), stiffness=stiffness[name])
+        for name, (a, b, za, zb) in ends.items()
+    }
+    driver = lg.TranslationDriver(None, "high", at=(0.0, 0.0, 2.0), axis=(0.0, 0.0, 1.0))
+    model = lg.Model(bodies, {"driver": driver}, forces)
+    way = np.array([0.0, 0.1, 0.2, -0.1, -0.2])
+    rate = 1.0 / (1.0 / 3e4 + 1.0 / 7e4)
+    for starts in ((), (3,)):
+        found = lg.statics(model, {"driver": way}, starts=starts, rates=[{"driver": 1.0}, {"driver": 2.0}])
+        np.testing.assert_allclose(found.multiplier("driver")[:, 0], -rate * way, rtol=0, atol=1e-8 * rate * 0.2)
+        for i in (0, 1):
+            slopes = found.along(i).multiplier("driver")[:, 0]
+            np.testing.assert_allclose(slopes, np.full(5, -(i + 1) * rate), rtol=1e-8)
+    assert found.body("low").velocity.max() == 0.0  # at rest
+
+
+def test_one_factorization_for_all_parameters():
+    """The derivative by every number of the model adds one factorization, of a loop over the points."""
+    model = lever()
+    push = model.forces["push"].with_factor(jnp.zeros(()))
+    system = lg.Model(model.bodies, model.joints, model.forces | {"push": push}).system()
+    where = (drivers(system, "loads")["push"],)
+    values, rates = jnp.asarray(PUSH[:, None]), jnp.ones((len(PUSH), 1, 1))
+    zero = jnp.zeros(())
+    place = lambda system: static_path(Drive(system, where), values, rates, zero).q.position[:, 0, 2]
+    forward = jax.make_jaxpr(place)(system).jaxpr
+    backward = jax.make_jaxpr(lambda s: jax.vjp(place, s)[1](jnp.ones(len(PUSH))))(system).jaxpr
+    assert factorizations(backward) == factorizations(forward) + 1
+
+
+def test_what_is_free_is_named():
+    model = lever()
+    wheel = lg.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), position=(1.0, 0.0, 0.0))
+    hub = lg.RevoluteJoint("bar", "wheel", at=(1.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+    scene = lg.Model(model.bodies | {"wheel": wheel}, model.joints | {"hub": hub}, model.forces)
+    with pytest.raises(ValueError, match=says("can move without any force", "What moves freely: wheel.", "point 0")):
+        lg.statics(scene, loads={"push": PUSH})
+
+
+def test_out_of_reach():
+    driver = lg.TranslationDriver(None, "bar", at=(1.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    model = lever()
+    driven = lg.Model(model.bodies, model.joints | {"driver": driver}, model.forces)
+    way = {"driver": [0.0, 0.5, 1.5]}
+    with pytest.raises(lg.SimulationError, match=says("No static equilibrium", "at point 2", "[1.5]")):
+        lg.statics(driven, way)
+    found = lg.statics(driven, way, throw=False)
+    assert found.result == lg.RESULTS.statics_failed
+    assert np.isfinite(found.states.lam[:2]).all() and np.isnan(found.states.lam[2]).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"loads": {}}, says("`driven` and `loads` are empty", "['push']")),
+        ({"loads": {"spring": [1.0]}}, says("`loads`: 'spring' is not one of ['push']", "AppliedForce")),
+        ({"driven": {"hinge": [1.0]}}, says("`driven`: 'hinge' is not one of []")),
+        ({"loads": {"push": 1.0}}, says("must hold vectors of one length", "()")),
+        ({"rates": {"pull": 1.0}}, says("`rates`: ['pull'] are not among the driven ones ['push']")),
+        ({"starts": (9,)}, says("`starts` must be indices of the 7 points, got [9]")),
+        ({"model": 3.0}, says("`model` must be a Model, got float")),
+    ],
+)
+def test_bad_input(arguments, message):
+    settings = {"loads": {"push": PUSH}} | arguments
+    model = settings.pop("model", None) or lever()
+    with pytest.raises(ValueError, match=message):
+        lg.statics(model, **settings)
