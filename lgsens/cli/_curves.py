@@ -8,7 +8,7 @@ import numpy as np
 
 from lgsens import plotting
 from lgsens._progress import compiling
-from lgsens.cli._report import ANEW, interrupted, output_folder, suspension_file, written
+from lgsens.cli._report import output_folder, suspension_file, write_all, written
 from lgsens.examples import QuarterCar, SuspensionCurves
 
 # Heading, member of SuspensionCurves, factor to the unit shown, decimals.
@@ -42,14 +42,8 @@ def run(arguments: argparse.Namespace) -> int:
             ),
             "travel.html": lambda path: plotting.animate(car.travel(travel, links="bodies"), path, title=car.name),
         }
-        for i, (name, write) in enumerate(files.items()):
-            try:
-                write(out / name)
-            except KeyboardInterrupt:
-                (out / name).unlink(missing_ok=True)
-                if not i:
-                    raise
-                return interrupted("curves", f"{' and '.join(list(files)[:i])} written", ANEW)
+        if status := write_all("curves", files, out):
+            return status
         if not arguments.quiet:
             print(table(curves), written(out), sep="\n")
     return 0

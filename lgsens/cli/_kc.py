@@ -16,7 +16,7 @@ import numpy as np
 from lgsens import plotting, rigs
 from lgsens._progress import compiling
 from lgsens._validate import suggestion
-from lgsens.cli._report import ANEW, interrupted, output_folder, suspension_file, versions, write_json, written
+from lgsens.cli._report import output_folder, suspension_file, versions, write_all, write_json, written
 from lgsens.examples import Axle
 
 # By unit of a sweep's number the factor and the unit shown.
@@ -59,14 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
         }
         for name, figure in figures.items():
             files[f"{name}.png"] = lambda path, figure=figure: plotting.save(figure, path, dpi=110)
-        for i, (name, write) in enumerate(files.items()):
-            try:
-                write(out / name)
-            except KeyboardInterrupt:
-                (out / name).unlink(missing_ok=True)
-                if not i:
-                    raise
-                return interrupted("kc", f"{' and '.join(list(files)[:i])} written", ANEW)
+        if status := write_all("kc", files, out):
+            return status
         if not arguments.quiet:
             print(table(numbers), written(out), sep="\n")
     return 0

@@ -5,7 +5,7 @@ import json
 import platform
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -69,6 +69,19 @@ def interrupted(command: str, found: str | None, remedy: str = "the same command
     more = f": {found}; {remedy}" if found else " before anything was found"
     print(f"\nlgsens {command}: interrupted{more}", file=sys.stderr)
     return INTERRUPTED
+
+
+def write_all(command: str, files: Mapping[str, Callable[[Path], Any]], out: Path) -> int:
+    """Each file by the function that writes it; an interrupt leaves whole ones only. The exit status, 0: all."""
+    for i, (name, write) in enumerate(files.items()):
+        try:
+            write(out / name)
+        except KeyboardInterrupt:
+            (out / name).unlink(missing_ok=True)
+            if not i:
+                raise
+            return interrupted(command, f"{' and '.join(list(files)[:i])} written", ANEW)
+    return 0
 
 
 def version(distribution: str = "lgsens") -> str:
