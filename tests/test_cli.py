@@ -124,7 +124,7 @@ def edited(old, new):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (edited("[design]", "[designs]"), "key 'design': is missing"),
+        (edited("[design]", "[designs]"), "key 'designs'"),
         (
             edited("minimum_tyre_force = 650.0", "minimum_tire_force = 650.0"),
             "key 'design.minimum_tyre_force'",

@@ -122,6 +122,7 @@ def on_a_road(ms, mu, ks, cs, kt):
     return acceleration, np.sqrt(INTENSITY * (ms + mu) / (2 * cs))
 
 
+@pytest.mark.slow  # `test_driven_base_with_damping_and_a_state` has derivatives in the quick run
 def test_derivatives_of_the_quarter_car():
     """In reverse mode by differences: eigenvalues and responses of the two-mass matrices, closed forms of a random road
     (the adjoint Lyapunov equation), A and modes of `linearize` itself.

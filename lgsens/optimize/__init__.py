@@ -29,3 +29,9 @@ from lgsens.optimize._scipy import (
     scipy_least_squares as scipy_least_squares,
     scipy_problem as scipy_problem,
 )
+from lgsens.optimize._tolerances import (
+    ToleranceStack as ToleranceStack,
+    allocate_tolerances as allocate_tolerances,
+    monte_carlo as monte_carlo,
+    tolerance_stack as tolerance_stack,
+)

@@ -170,6 +170,7 @@ def check_gradients(source, joint, leaves):
         np.testing.assert_allclose(jnp.sum(leaf(gradient) * leaf(imported)), difference, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow  # two programs; a loop's, with its notebook, is there too
 def test_gradients_of_what_was_read():
     """By a mass, the inertia of a rotor, the place of a hinge, a torque."""
     leaves = (

@@ -44,7 +44,8 @@ def inner(one, other):
     return sum(a @ b for a, b in pairs), sum(np.abs(a) @ np.abs(b) for a, b in pairs)
 
 
-@pytest.mark.parametrize("uneven", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow  # `test_given_steps` has both modes in the quick run
+@pytest.mark.parametrize("uneven", [False, True])
 def test_the_sweeps_solve_the_linearized_equations(uneven):
     """L times the solution of the direct sweep is its right-hand side, with rows everywhere; Lᵀ is the adjoint's.
 
