@@ -36,11 +36,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import PyTree
 
 from lgsens._validate import as_count, as_float
 from lgsens.accuracy._certificate import Certificate
 from lgsens.accuracy._error_estimate import corrected, error_estimate
+from lgsens.analysis import grows_exponentially
 from lgsens.dynamics import State
 from lgsens.integrate import (
     AbstractIntegrator,
@@ -58,7 +59,6 @@ from lgsens.sensitivity import Parameters, linearized_trajectory, to_ambient
 from lgsens.simulation import Trajectory, check_integrator, interval, raise_if_failed, simulate
 
 _LEAST_STEPS = 8
-_EXPONENTIAL = 16.0  # as in `sensitivity_growth`
 _SPIKE = 8.0  # second differences beside a smooth change of accelerations differ by less
 _INSIDE = 0.1
 _VISIBLE = 1e-4  # of the largest acceleration: smaller kinks move a value by less than the scheme does
@@ -169,17 +169,12 @@ def _certified(criterion, build, start, p, t0, t1, num_steps: int, integrator):
         "duality": duality,
         "newton": newton,
         "growth": growth,
-        "exponential": _is_exponential(grown),
+        "exponential": grows_exponentially(grown),
         "margin": margin,
         "unresolved": unresolved,
         "result": trajectory.result,
     }
     return found, trajectory, spikes
-
-
-def _is_exponential(grown: Float[Array, " n"]):
-    """Whether it is by more than 16 times larger at the end than in the middle."""
-    return grown[-1] > _EXPONENTIAL * grown[(len(grown) - 1) // 2]
 
 
 def _left_by_newton(scheme: GeneralizedAlpha, states: State, parameters: Parameters) -> State:

@@ -1,6 +1,10 @@
 """What a mechanism is like: kinematics, small motions, rank of its constraints, growth of small changes."""
 
-from lgsens.analysis._growth import Growth as Growth, sensitivity_growth as sensitivity_growth
+from lgsens.analysis._growth import (
+    Growth as Growth,
+    grows_exponentially as grows_exponentially,
+    sensitivity_growth as sensitivity_growth,
+)
 from lgsens.analysis._kinematics import Kinematics as Kinematics, kinematics as kinematics
 from lgsens.analysis._linearize import (
     Linearization as Linearization,

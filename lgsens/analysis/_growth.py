@@ -118,4 +118,9 @@ def _growth_jit(system: AbstractSystem, t0, t1, num_steps: int, integrator: Abst
     factor = lax.cummax(jnp.max(sizes, axis=0))
     lost = factor * jnp.finfo(factor.dtype).eps >= 1.0
     horizon = jnp.where(jnp.any(lost), t[jnp.argmax(lost)], jnp.inf)
-    return Growth(t, factor, factor[-1] > _REGULAR * factor[num_steps // 2], horizon), result, details
+    return Growth(t, factor, grows_exponentially(factor), horizon), result, details
+
+
+def grows_exponentially(factor: Float[Array, " n+1"]) -> Bool[Array, ""]:
+    """Whether g, `Growth.factor` on equal steps, grows by more than a regular motion's in the second half."""
+    return factor[-1] > _REGULAR * factor[(factor.shape[0] - 1) // 2]

@@ -41,6 +41,7 @@ from lgsens.dynamics import (
     constraint_velocity,
     equations_of_motion,
     factorized_accelerations,
+    finite,
     require_independent,
     require_linear,
 )
@@ -169,8 +170,7 @@ class RadauIIA(AbstractScheme):
         q = system.group.retract(begun.q, x[-1])
         vdot, lam = factorized_accelerations(shared, system, q, v[-1], node.t)
         state = State(q, v[-1], vdot, lam, vdot, found)
-        finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state)]))
-        converged = running & finite & (size <= tolerance)
+        converged = running & finite(state) & (size <= tolerance)
         state = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), state)
         return state, memory, Stats(jnp.where(running, count, 0), size, rest, converged, jnp.nan * node.h)
 

@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._xla import while_loop
-from lgsens.dynamics import RESULTS, AbstractSystem, Initial, State
+from lgsens.dynamics import RESULTS, AbstractSystem, Initial, State, finite
 from lgsens.integrate._grid import AbstractGrid, EqualGrid
 from lgsens.integrate._linearized import AbstractLinearizedStep, DenseLinearizedStep, Node, Variation
 
@@ -262,8 +262,7 @@ class AbstractScheme(AbstractIntegrator):
         none = jnp.zeros((), jnp.int32)
         first = (guess, jnp.inf * node.h, jnp.inf * node.h, none, running)
         state, size, left, count, _ = while_loop(lambda carry: carry[-1], corrected, first)
-        finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state)]))
-        converged = running & finite & (size <= tolerance)
+        converged = running & finite(state) & (size <= tolerance)
         state = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), state)
         return state, memory, Stats(jnp.where(running, count, 0), size, left, converged, jnp.nan * node.h)
 
