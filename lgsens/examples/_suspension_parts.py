@@ -77,6 +77,10 @@ class Part(eqx.Module):
             inertia = (jnp.diag(inertia) if inertia.ndim == 1 else inertia) + shifted
         return RigidBody(mass=mass, inertia=inertia, position=centre, free=free)
 
+    def halved(self) -> "Part":
+        """Its half on either side of the plane y = 0, of which it is symmetric."""
+        return Part(self.centre, self.mass / 2, self.inertia / 2)
+
     def joined(self, other: "Part") -> "Part":
         """Both as one body."""
         both = jnp.stack([self.mass, other.mass]), jnp.stack([self.centre, other.centre])
