@@ -158,8 +158,11 @@ class Without(AbstractReduction):
 
     def toward(self, scene, before, s, rate):
         _known(self, "force", self.force, scene.forces)
-        force = self._scaled(scene, 1.0 - s) if self.numbers else ScaledForce(scene.forces[self.force], factor=1.0 - s)
-        return scene.replaced(forces={self.force: force})
+        if not self.numbers:
+            return scene.replaced(forces={self.force: ScaledForce(scene.forces[self.force], factor=1.0 - s)})
+        lean, rich = self._scaled(before, 0.0), before.forces[self.force]  # others may be on their way with it
+        both = {f"{self!r}, lean": ScaledForce(lean, factor=s), f"{self!r}, rich": ScaledForce(rich, factor=-s)}
+        return scene.replaced(forces=both)
 
 
 class Joint(AbstractReduction):
@@ -232,6 +235,8 @@ class Frozen(AbstractReduction):
     Arguments:
         body: its name.
         coordinates: names among "x", "y", "z", "rx", "ry", "rz", in a tuple or one string; none: all that it has.
+        guide: the joint that holds them already (a `PrismaticJoint` along z, say, where only z is left), to be left out
+            with them; None: no joint is left out but for equations that nothing can violate.
 
     Their initial velocities are left out. Raises `ValueError`, when it is applied, for names that the scene or the body
     does not have, and where `RigidBody` does not have what is left (one rotation is about an inertial axis).
@@ -239,15 +244,16 @@ class Frozen(AbstractReduction):
 
     body: str = eqx.field(static=True)
     coordinates: tuple[str, ...] = eqx.field(static=True)
+    guide: str | None = eqx.field(static=True)
 
     holds = True
 
-    def __init__(self, body: str, coordinates: str | Iterable[str] = ()):
+    def __init__(self, body: str, coordinates: str | Iterable[str] = (), *, guide: str | None = None):
         names = tuple(coordinates.split()) if isinstance(coordinates, str) else tuple(coordinates)
         unknown = set(names) - set(ALL_FREE)
         if unknown:
             raise ValueError(f"Frozen: {suggestion(sorted(unknown)[0], ALL_FREE)}.")
-        self.body, self.coordinates = body, names
+        self.body, self.coordinates, self.guide = body, names, guide
 
     def applied(self, scene):
         _known(self, "body", self.body, scene.bodies)
@@ -267,7 +273,10 @@ class Frozen(AbstractReduction):
             )
         except ValueError as error:
             raise ValueError(f"{self!r}: {error}") from error
-        return scene.replaced(bodies={self.body: held})
+        if self.guide is None:
+            return scene.replaced(bodies={self.body: held})
+        _known(self, "guide", self.guide, scene.joints)
+        return scene.replaced(bodies={self.body: held}, joints={self.guide: None})
 
     def toward(self, scene, before, s, rate):
         _known(self, "body", self.body, scene.bodies)
