@@ -2,16 +2,16 @@
 
 Let Ψ(p, s) be the criterion of the rich scene on its way to the lean ones, a number s_i for each reduction
 (`lgsens.model._reductions`): s = 0 is the rich scene, s_i = 1 the lean one. One reverse run gives ∂Ψ/∂p and all of
-∂Ψ/∂s_i. With y(t; s) the motion, r(y, s) = 0 its equations and λ its adjoint, ∂Ψ/∂s_i = −λᵀ ∂r/∂s_i: the residual that the
-inertia of a link, the yield of a bushing or a force is in the equations, weighted by the adjoint, and so
+∂Ψ/∂s_i. With y(t; s) the motion, r(y, s) = 0 its equations and λ its adjoint, ∂Ψ/∂s_i = −λᵀ ∂r/∂s_i: what the inertia
+of a link, the yield of a bushing or a force is in the equations, weighted by the adjoint (a dual-weighted residual). So
 
-    Ψ(e_i) − Ψ(0) = ∂Ψ/∂s_i + ½ ∂²Ψ/∂s_i² + …                            (first)
+    Ψ(e_i) − Ψ(0) = ∂Ψ/∂s_i + ½ ∂²Ψ/∂s_i² + …
 
 is predicted for all reductions at once. A second run for each, half way and in the same compiled program, leaves the
 third derivative, by the midpoint rule, and tells the change of the gradient, with half of its second-order term left,
 
     Ψ(e_i) − Ψ(0) = ∂Ψ/∂s_i(½ e_i) + Ψ'''/24,
-    ∂Ψ/∂p(e_i) − ∂Ψ/∂p(0) = 2 (∂Ψ/∂p(½ e_i) − ∂Ψ/∂p(0)) + ½ ∂³Ψ/∂p∂s_i²·½ + …
+    ∂Ψ/∂p(e_i) − ∂Ψ/∂p(0) = 2 (∂Ψ/∂p(½ e_i) − ∂Ψ/∂p(0)) + ¼ ∂³Ψ/∂p∂s_i² + …
 
 A coordinate that is held has no small parameter. Its run is at s_i = 1, where a spring a hundred times faster than a
 step holds it, and leaves no more than the virtual compliance, some (ωh/100)² of what the coordinate did. Changes of
@@ -104,17 +104,9 @@ class _Runs(NamedTuple):
     study: Study
     setting: Setting
 
-    def measure(self, options: Sequence[Option]) -> tuple[Evaluated, float]:
-        """Value, gradient and time of a scene with these options, compiled for it: the median of five calls [s]."""
-        program = Program(self.study._replace(build=_Lean(self.study.build, tuple(options))), self.setting)
-        seconds = []
-        for _ in range(5):
-            started = time.perf_counter()
-            found = program.evaluate()[0]
-            seconds.append(time.perf_counter() - started)
-        if found.failure:
-            raise ValueError(f"The scene with {options!r} fails: {found.failure}")
-        return found, float(np.median(seconds))
+    def program(self, options: Sequence[Option]) -> Program:
+        """Ψ and dΨ/dp of the scene with these options, compiled."""
+        return Program(self.study._replace(build=_Lean(self.study.build, tuple(options))), self.setting)
 
 
 class _Lean(NamedTuple):
@@ -177,7 +169,11 @@ class Fidelity:
         Raises `ValueError` where the lean scene fails (equations that are redundant now, a body that nothing holds).
         """
         options = () if reduced is None else reduced.options
-        (found, seconds), (_, of_rich) = self.runs.measure(options), self.runs.measure(())
+        lean, rich = (self.runs.program(of) for of in (options, ()))
+        found, _ = lean.evaluate()
+        if found.failure:
+            raise ValueError(f"The scene with {options!r} fails: {found.failure}")
+        seconds, of_rich = (float(np.median(taken)) for taken in zip(*((_taken(lean), _taken(rich)) for _ in range(5))))
         value, gradient = _changes(found, self.rich)
         unknowns = _unknowns(_Lean(self.runs.study.build, options), self.runs.study.p)
         return Reduced(options, value, gradient, np.nan, unknowns, seconds / of_rich)
@@ -203,6 +199,12 @@ class Fidelity:
         return "\n".join([*lines, f"the rich scene: Ψ = {self.value:.6g}, {self.unknowns} unknowns"])
 
     __repr__ = __str__
+
+
+def _taken(program: Program) -> float:
+    started = time.perf_counter()
+    program()
+    return time.perf_counter() - started
 
 
 def _time(unknowns: int, of: int) -> float:

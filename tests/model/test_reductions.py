@@ -49,7 +49,9 @@ def test_numbers_of_the_rich_model_go_through():
     mass = lambda m: four_bar(m).reduced(Rod("coupler")).bodies["rocker"].mass
     np.testing.assert_allclose(jax.jit(jax.grad(mass))(0.3), 0.5)
     with pytest.raises(ValueError, match="not known here; give `kind`"):
-        jax.jit(lambda k: eqx.tree_at(_turning, four_bar(), k).reduced(Joint("bush")).bodies["rocker"].mass)(jnp.ones(3))
+        jax.jit(lambda k: eqx.tree_at(_turning, four_bar(), k).reduced(Joint("bush")).bodies["rocker"].mass)(
+            jnp.ones(3)
+        )
 
 
 def _turning(model):
