@@ -5,8 +5,8 @@ Of the tangents at the start, with columns of Z the motions that the joints allo
 
     M̂ ẍ + Ĉ ẋ + K̂ x = 0,     ẋ = λ x,
 
-and a step h resolves what has |λ| h well below 1. The rest is looked up in one run: rotations per step, margins to
-singular configurations, kinks, growth; and in the numbers of the scene.
+Z's own rate left out, (Ω/λ)², and a step h resolves what has |λ| h well below 1. The rest is looked up in one run:
+rotations per step, margins to singular configurations, kinks, growth; and in the numbers of the scene.
 """
 
 import dataclasses
@@ -46,10 +46,9 @@ class Finding:
         return not (self.number >= self.limit if self.least else self.number <= self.limit)
 
     def __str__(self) -> str:
-        line = (
-            f"{'!' if self.near else ' '} {self.extreme:44}{self.number:>9.2g}  limit {self.limit:<8.2g} {self.where}"
-        )
-        return line.rstrip() + (f"\n      {self.remedy}" if self.near else "")
+        mark, number = "!" if self.near else " ", f"{self.number:>9.2g}  limit {self.limit:<8.2g}"
+        line = f"{mark} {self.extreme:52}{number} {self.where}".rstrip()
+        return line + (f"\n      {self.remedy}" if self.near else "")
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -65,7 +64,7 @@ class Diagnosis:
 
     def __str__(self) -> str:
         many = len(self.near)
-        verdict = f"{many} of {len(self.findings)} extremes are near." if many else "Nothing extreme."
+        verdict = f"Extremes that are near: {many}." if many else "Nothing extreme."
         return "\n".join([*map(str, self.findings), verdict])
 
     __repr__ = __str__
