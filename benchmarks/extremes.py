@@ -4,8 +4,8 @@
 
 Prints a table (extreme, bound and why, measured, verdict) and writes it to extremes.json. The bounds and the references
 (closed forms, SciPy, a Runge-Kutta scheme, differences) are in extremes_rotation.py, extremes_scales.py,
-extremes_forces.py, extremes_elements.py and extremes_long.py; tests/extremes asks for the same rows. Some minutes. Ends with 1 if a row is
-wrong.
+extremes_forces.py, extremes_elements.py and extremes_long.py; tests/extremes asks for the same rows. Some minutes. Ends
+with 1 if a row is wrong.
 """
 
 import argparse

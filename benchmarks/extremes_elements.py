@@ -21,11 +21,11 @@ def _line(p, forces, *, velocity, start=1.0, t1=1.0, steps=STEPS, integrator=lg.
 
 
 ENDS = {"at_a": (0.0, 0.0, 0.0), "at_b": (0.0, 0.0, 1.0)}
-AWAY = {"at_a": (0.0, 0.0, 0.0), "at_b": (0.0, 0.0, 2.0), "free_length": 1.0}  # of a mass that starts at z = 2
+AWAY = {"at_a": (0.0, 0.0, -9.0), "at_b": (0.0, 0.0, 2.0), "free_length": 10.0}  # z − 1, from z = 2 on
 
 
 def oscillation(p, integrator):
-    """On a spring of ω = p₀ from rest at z = 2, its free length 1: z − 1 = cos ωt."""
+    """On a spring of ω = p₀ from rest at z = 2, free at z = 1: z − 1 = cos ωt."""
     spring = lg.SpringDamper(None, "mass", stiffness=MASS * p[0] ** 2, **AWAY)
     return _line(p, {"spring": spring}, velocity=jnp.zeros_like(p[0]), start=2.0, integrator=integrator)[:1]
 
@@ -210,9 +210,10 @@ def stops():
     slopes = np.abs(forward[:, 0, 1] - 1.0)
     both = [largest(each[0] / [v, 1.0]) for each, v in zip(forward - reverse, speed)]
     bound = np.full(len(points), 10 * step**2)
-    extreme = "stop, 1e2 … 1e8 N/m"
+    extreme, energy = "stop, 1e2 … 1e8 N/m", "10 (ωh)²: the energy of a scheme of order 2"
+    rounded = np.full(len(points), 64 * EPS * 240 / 0.01)
     return [
-        worst_row(extreme, "speed of rebound/speed − 1", errors, bound, labels, "10 (ωh)²: the energy of a scheme of order 2"),
+        worst_row(extreme, "speed of rebound/speed − 1", errors, bound, labels, energy),
         worst_row(extreme, "its derivative by the speed − 1", slopes, bound, labels, "same: all scales with the speed"),
-        worst_row(extreme, "reverse − forward, of the speed", both, np.full(len(points), 64 * EPS * 240 / 0.01), labels, "64 n ε travel/rounding"),
+        worst_row(extreme, "reverse − forward, of the speed", both, rounded, labels, "64 n ε travel/rounding"),
     ]  # fmt: skip
