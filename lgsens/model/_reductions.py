@@ -87,7 +87,7 @@ class Rod(AbstractReduction):
     def _ends(self, scene: Scene) -> list[tuple[str, str | None, Any]]:
         """The joint, the other body and the point of each end."""
         _known(self, "link", self.link, scene.bodies)
-        near = {name: j for name, j in scene.joints.items() if self.link in (j.a, j.b, *j.others)}
+        near: dict[str, Any] = {name: j for name, j in scene.joints.items() if self.link in (j.a, j.b, *j.others)}
         loaded = [name for name, force in scene.forces.items() if self.link in force.on(scene.joints).bodies]
         if len(near) != 2 or not all(joint.coordinates in _BALLS for joint in near.values()) or loaded:
             kinds = {name: type(joint).__name__ for name, joint in near.items()}

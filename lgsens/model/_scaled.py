@@ -1,5 +1,7 @@
 """A force element times a number: on the way from a scene with it to one without, or to one in which it is rigid."""
 
+from typing import Any
+
 import jax
 from jaxtyping import Array, Float
 
@@ -32,7 +34,7 @@ class ScaledForce(AbstractForce):
 
     def loads(self, bodies):
         def scaled(load):
-            kind = ScaledDynamicLoad if isinstance(load, AbstractDynamicLoad) else ScaledLoad
+            kind: Any = ScaledDynamicLoad if isinstance(load, AbstractDynamicLoad) else ScaledLoad
             return kind(load, self.factor)
 
         return tuple(Attached(scaled(load), a, b) for load, a, b in self.of.loads(bodies))

@@ -8,6 +8,7 @@ from oscillator import CRITERION, T1, V
 
 import lgsens as lg
 from lgsens.accuracy import fidelity
+from lgsens.examples import QuarterCar
 from lgsens.model import Frozen, Joint, Rod, Without
 
 MASS, RATE, DAMPING, BUSH = 2.0, 20.0, 0.05, 4e4
@@ -86,6 +87,32 @@ def test_an_option_is_the_sum_of_its_reductions(found):
     both = row(found, Joint("bush"), Without("damper", "damping"))
     parts = row(found, Joint("bush")).value + row(found, Without("damper")).value
     np.testing.assert_allclose(both.value, parts, rtol=1e-10)  # without `damping` the damper is none: stiffness is zero
+
+
+@pytest.mark.slow  # three programs of the quarter-car
+def test_rods_of_the_quarter_car_are_predicted():
+    """The shipped car with `links="rods"`, a scene that is written otherwise: 2.6e-3 of Ψ; asked for is a factor of 2.
+
+    Changes of several rods add up to terms of second order, 2.6e-3 of them, and a few such terms.
+    """
+    car = QuarterCar.load()
+    p = {"stiffness": car.spring.rate, "damping": car.damper.rate, "hardpoints": car.hardpoints}
+    comfort = lg.Criterion(integrand=lambda s, p: s.body("chassis").acceleration[2] ** 2)
+    settings = {"t1": 1.0, "num_steps": 200}
+    links = [(Rod(name),) for name in ("guide_link", "wishbone", "track_strut", "trailing_arm")]
+    found = fidelity(comfort, lambda p: car.with_values(**p).model(), p, links, **settings)
+    rich, lean = (
+        lg.differentiate(comfort, lambda p, links=links: car.with_values(**p).model(links=links), p, **settings)
+        for links in ("bodies", "rods")
+    )
+    change = float((lean.value - rich.value) / rich.value)
+    np.testing.assert_allclose(sum(row.value for row in found.rows), change, rtol=0.02)
+    np.testing.assert_allclose(sum(row.first for row in found.rows), change, rtol=0.05)
+    best = found.recommended(1e-2)
+    assert len(best.options) == 4
+    verified = found.verified(best)
+    np.testing.assert_allclose(verified.value, change, rtol=1e-6)  # the same scene
+    np.testing.assert_allclose(best.gradient, verified.gradient, rtol=0.1)
 
 
 def test_bad_arguments():
