@@ -160,7 +160,7 @@ def _certified(criterion, build, start, p, t0, t1, num_steps: int, integrator):
         moved = _left_by_newton(integrator, states, Parameters(system, grid))
         by_states = lambda states: jnp.asarray(criterion(eqx.tree_at(lambda t: t.states, trajectory, states), p))
         newton = jax.jvp(by_states, (states,), (moved,))[1]
-    spikes, unresolved = _rough(trajectory)
+    spikes, unresolved = rough(trajectory)
     found = {
         "value": values[0],
         "gradient": unravel(gradient),
@@ -190,7 +190,7 @@ def _left_by_newton(scheme: GeneralizedAlpha, states: State, parameters: Paramet
     return jax.vmap(lambda state, delta: to_ambient(system.group, state, delta))(states, delta)
 
 
-def _rough(trajectory: Trajectory):
+def rough(trajectory: Trajectory):
     """Whether an acceleration has a kink or a jump in the step that ends at each time, of each body, (n+1, bodies); and
     the share of steps whose accelerations are not resolved."""
     system = trajectory.system
