@@ -19,7 +19,7 @@ from lgsens.accuracy._certify import rough
 from lgsens.analysis import constraint_rank, sensitivity_growth
 from lgsens.dynamics import RESULTS, full_jacobian
 from lgsens.integrate import AbstractIntegrator, GeneralizedAlpha, singular_steps
-from lgsens.model import Gravity, Model, MultibodySystem
+from lgsens.model import Model, MultibodySystem
 from lgsens.simulation import Trajectory, check_integrator, interval, simulate
 
 
@@ -163,13 +163,13 @@ def of_numbers(model: Model):
             repr(wide),
             "No body is so much larger than its scene: inertia in kg mm² with lengths in m? lgsens wants SI.",
         )
-    pulls = [
-        float(jnp.linalg.norm(force.acceleration)) for force in model.forces.values() if isinstance(force, Gravity)
-    ]
-    for pull in pulls:
+    fields = [getattr(force, "acceleration", None) for force in model.forces.values()]
+    for field in fields:
+        if field is None:
+            continue
         yield Finding(
             "gravity [m/s²]",
-            pull,
+            float(jnp.linalg.norm(field)),
             100.0,
             "",
             "That is mm/s²: lengths in mm give forces in mN and rates 1000 times too large. lgsens wants SI.",
