@@ -34,8 +34,10 @@ def pendulum(*, mass=1.0, inertia=(0.1, 0.1, 0.1), gravity=9.81, stiffness=None)
 
 
 def test_a_stiff_spring_and_a_spin_are_told_by_their_numbers():
-    """ω = √(k/(J + m l²)) at the hinge, of a pendulum that starts level and at rest, where gravity has no stiffness; and
-    a ball that nothing holds keeps its spin."""
+    """ω = √(k/(J + m l²)) at the hinge, of a pendulum that starts level and at rest, where gravity has no stiffness.
+
+    A ball that nothing holds keeps its spin.
+    """
     found = {each.extreme: each for each in doctor(pendulum(stiffness=1.1e6), t1=0.2, num_steps=20).near}
     fastest = found["fastest mode at the start times the step, |λ| h"]
     np.testing.assert_allclose(fastest.number, 1e3 * 0.01, rtol=1e-6)  # round-off of λ² beside λ = 0: √ε at most
