@@ -45,7 +45,7 @@ SCHEMES = {
 
 
 def schemes():
-    """Every scheme on a linear oscillation of 1e-3 to 0.3 rad per step; the parasitic root starts with a share of φ²."""
+    """Every scheme on a linear oscillation of 1e-3 to 0.3 rad per step."""
     phases, rows = np.array([1e-3, 1e-2, 1e-1, 0.3]), []
     for name, (scheme, error) in SCHEMES.items():
         value, forward, reverse = derivatives(partial(oscillation, integrator=scheme), phases[:, None] * STEPS)
