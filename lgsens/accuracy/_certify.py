@@ -45,6 +45,7 @@ from lgsens.analysis import grows_exponentially
 from lgsens.dynamics import State
 from lgsens.integrate import (
     AbstractIntegrator,
+    AbstractScheme,
     EqualGrid,
     GeneralizedAlpha,
     Variation,
@@ -155,9 +156,9 @@ def _certified(criterion, build, start, p, t0, t1, num_steps: int, integrator):
     margin = jnp.where(jnp.all(jnp.isnan(margins)), jnp.inf, jnp.nanmin(margins) / jnp.nanmax(margins))
     margin = jnp.where(jnp.any(singular_steps(margins)), 0.0, margin)
     newton = jnp.full((), jnp.nan, flat.dtype)
-    if type(integrator) is GeneralizedAlpha and not integrator.stabilized:
+    if integrator.scheme.physical(system, states) is states:  # nothing of them was left out
         grid = EqualGrid(t0, (t1 - t0) / num_steps, num_steps)
-        moved = _left_by_newton(integrator, states, Parameters(system, grid))
+        moved = _left_by_newton(integrator.scheme, states, Parameters(system, grid))
         by_states = lambda states: jnp.asarray(criterion(eqx.tree_at(lambda t: t.states, trajectory, states), p))
         newton = jax.jvp(by_states, (states,), (moved,))[1]
     spikes, unresolved = rough(trajectory)
@@ -177,7 +178,7 @@ def _certified(criterion, build, start, p, t0, t1, num_steps: int, integrator):
     return found, trajectory, spikes
 
 
-def _left_by_newton(scheme: GeneralizedAlpha, states: State, parameters: Parameters) -> State:
+def _left_by_newton(scheme: AbstractScheme, states: State, parameters: Parameters) -> State:
     """The tangent of the states that would take what the steps leave of their equations away."""
     system, grid = parameters
 
