@@ -29,7 +29,8 @@ e.v̇ = 0: the transients in which it goes from there to here are not estimated.
 
 v̈ and v⃛ are differences of v̇, at the middle of each step. That of v⃛, on equal steps
 (v̇_{n+2} − v̇_{n+1} − v̇_n + v̇_{n−1})/(2h²), does not see the part (−1)ⁿ in which transients of v̇ remain
-for ρ∞ close to 1. On steps whose sizes change slowly, h_{n+1}/h_n = 1 + O(h), all of this holds with the size of each step.
+for ρ∞ close to 1. On steps whose sizes change slowly, h_{n+1}/h_n = 1 + O(h), all of this holds with the size of each
+step.
 
 Sources: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I (2008), §II.8 (the principal error term
 solves the variational equation with the local error as its load); Arnold, Brüls & Cardona, Numerische Mathematik 129
