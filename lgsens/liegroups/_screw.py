@@ -11,7 +11,7 @@ _ROTATION = SO3()
 
 
 def _dual(mv, x, y):
-    """`T(x) y` or `T(x)^{-1} y` from `mv` of SO(3): coordinates of SE(3) are dual vectors of SO(3), `ω + ε u`, `ε² = 0`.
+    """`T(x) y` or `T(x)^{-1} y` from `mv` of SO(3): coordinates of SE(3) are dual vectors of SO(3), ω + ε u, ε² = 0.
 
     The bracket `[x, y] = (u_x × ω_y + ω_x × u_y, ω_x × ω_y)` is the cross product of dual vectors, so each power series
     in `ad x` is that of SO(3) in dual numbers, F(ω + ε u) (y_ω + ε y_u) = F(ω) y_ω + ε (F(ω) y_u + DF(ω)[u] y_ω).
