@@ -4,8 +4,8 @@
 
 Prints a table (extreme, bound and why, measured, verdict) and writes it to extremes.json. The bounds and the references
 (closed forms, SciPy, a Runge-Kutta scheme, differences) are in extremes_rotation.py, extremes_scales.py,
-extremes_forces.py and extremes_long.py; tests/extremes asks for the same rows. Some minutes. Ends with 1 if a row is
-wrong.
+extremes_forces.py, extremes_elements.py and extremes_long.py; tests/extremes asks for the same rows. Some minutes. Ends
+with 1 if a row is wrong.
 """
 
 import argparse
@@ -18,6 +18,7 @@ import time
 from functools import partial
 from pathlib import Path
 
+import extremes_elements
 import extremes_failures
 import extremes_forces
 import extremes_long
@@ -37,6 +38,12 @@ EXTREMES = {
     "no_length": extremes_forces.no_length,
     "nothing": extremes_forces.nothing,
     "friction": extremes_forces.friction,
+    "schemes": extremes_elements.schemes,
+    "drivers": extremes_elements.drivers,
+    "rolling": extremes_elements.rolling,
+    "states": extremes_elements.states,
+    "curves": extremes_elements.curves,
+    "stops": extremes_elements.stops,
     "failures": extremes_failures.failures,
     "free_body": extremes_long.free_body,
     "reverse": extremes_long.reverse,

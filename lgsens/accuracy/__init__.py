@@ -4,12 +4,15 @@
     print(table, lg.accuracy.recommend(table, 1e-4))
     lg.accuracy.plot(table, targets=(1e-4,))
 
-`error_estimate` says of a single run how far off it is, `certify` how far its value and gradient are.
+`error_estimate` says of a single run how far off it is, `certify` how far its value and gradient are, `fidelity` what
+of a scene need not be modelled, `doctor` which extremes it comes near to.
 """
 
 from lgsens.accuracy._certificate import Certificate as Certificate
 from lgsens.accuracy._certify import certify as certify
+from lgsens.accuracy._doctor import Diagnosis as Diagnosis, Finding as Finding, doctor as doctor
 from lgsens.accuracy._error_estimate import corrected as corrected, error_estimate as error_estimate
+from lgsens.accuracy._fidelity import Fidelity as Fidelity, Reduced as Reduced, fidelity as fidelity
 from lgsens.accuracy._measure import work_precision as work_precision
 from lgsens.accuracy._recommend import Recommendation as Recommendation, plot as plot, recommend as recommend
 from lgsens.accuracy._reference import Reference as Reference

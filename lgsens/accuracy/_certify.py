@@ -45,6 +45,7 @@ from lgsens.analysis import grows_exponentially
 from lgsens.dynamics import State
 from lgsens.integrate import (
     AbstractIntegrator,
+    AbstractScheme,
     EqualGrid,
     GeneralizedAlpha,
     Variation,
@@ -155,12 +156,12 @@ def _certified(criterion, build, start, p, t0, t1, num_steps: int, integrator):
     margin = jnp.where(jnp.all(jnp.isnan(margins)), jnp.inf, jnp.nanmin(margins) / jnp.nanmax(margins))
     margin = jnp.where(jnp.any(singular_steps(margins)), 0.0, margin)
     newton = jnp.full((), jnp.nan, flat.dtype)
-    if type(integrator) is GeneralizedAlpha and not integrator.stabilized:
+    if integrator.scheme.physical(system, states) is states:  # nothing of them was left out
         grid = EqualGrid(t0, (t1 - t0) / num_steps, num_steps)
-        moved = _left_by_newton(integrator, states, Parameters(system, grid))
+        moved = _left_by_newton(integrator.scheme, states, Parameters(system, grid))
         by_states = lambda states: jnp.asarray(criterion(eqx.tree_at(lambda t: t.states, trajectory, states), p))
         newton = jax.jvp(by_states, (states,), (moved,))[1]
-    spikes, unresolved = _rough(trajectory)
+    spikes, unresolved = rough(trajectory)
     found = {
         "value": values[0],
         "gradient": unravel(gradient),
@@ -177,7 +178,7 @@ def _certified(criterion, build, start, p, t0, t1, num_steps: int, integrator):
     return found, trajectory, spikes
 
 
-def _left_by_newton(scheme: GeneralizedAlpha, states: State, parameters: Parameters) -> State:
+def _left_by_newton(scheme: AbstractScheme, states: State, parameters: Parameters) -> State:
     """The tangent of the states that would take what the steps leave of their equations away."""
     system, grid = parameters
 
@@ -190,7 +191,7 @@ def _left_by_newton(scheme: GeneralizedAlpha, states: State, parameters: Paramet
     return jax.vmap(lambda state, delta: to_ambient(system.group, state, delta))(states, delta)
 
 
-def _rough(trajectory: Trajectory):
+def rough(trajectory: Trajectory):
     """Whether an acceleration has a kink or a jump in the step that ends at each time, of each body, (n+1, bodies); and
     the share of steps whose accelerations are not resolved."""
     system = trajectory.system

@@ -47,6 +47,7 @@ def refined_error(scheme: AbstractScheme, trajectory: Trajectory) -> StateError:
     grid = UnevenGrid(t[0], sizes, h[0])
     finer, _ = DirectDifferentiation().trajectory(scheme, start, Parameters(system, grid))
     finer = jax.tree.map(lambda leaf: leaf[::2], scheme.physical(system, finer))
+    assert scheme.convergence_order is not None
     group, power = system.group, 2.0**scheme.convergence_order
     between = lambda q, other: group.log(group.compose(group.inverse(q), other))
     missing = lambda name: getattr(finer, name) - getattr(states, name)

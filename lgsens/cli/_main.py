@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 import jax
 
 from lgsens._xla import compilation_cache
-from lgsens.cli import _curves, _import, _kc, _optimize, _paper, _top, _tradeoff
+from lgsens.cli import _curves, _doctor, _import, _kc, _optimize, _paper, _top, _tradeoff
 from lgsens.cli._report import INTERRUPTED, UNFINISHED, interrupted, version
 from lgsens.examples import DEFAULT, PARAMETERS, shipped
 from lgsens.simulation import SimulationError
@@ -207,6 +207,18 @@ def _parser() -> argparse.ArgumentParser:
     costs = ["seconds", "cpu_seconds"]
     tradeoff.option("--by", "seconds", "the cost: time of the clock or of the processor", choices=costs)
     tradeoff.quiet("no progress bar and no table")
+
+    doctor = commands.add_parser(
+        "doctor",
+        help="which extremes a scene comes near to",
+        description="Stiffness and spin against the step, mass ratios, inertias, units, redundant constraints, "
+        "singular configurations, kinks, chaos: a number, a limit and a remedy each. Ends with 1 if one is near.",
+    )
+    doctor.set_defaults(run=_doctor.run)
+    doctor.add_argument("scene", metavar="FILE|NAME", help="as in `lgsens tradeoff`, or a suspension as in `optimize`")
+    doctor.add_argument("--t1", type=_positive, help="duration [s] (default: that of the scene, 1 of a suspension)")
+    doctor.option("--dt", 1e-3, "step size [s]", type=_positive)
+    doctor.quiet("no progress bar")
     return parser
 
 

@@ -70,12 +70,8 @@ class Part(eqx.Module):
 
     def body(self, points: Sequence[tuple[Array, Array]] = (), free: str | Sequence[str] = ALL_FREE) -> RigidBody:
         """It with point masses, pairs of a mass and a place, fixed to it."""
-        mass, inertia, centre = self.mass, self.inertia, self.centre
-        if points:
-            masses, places = zip((mass, centre), *points)
-            mass, centre, shifted = lumped(jnp.stack(masses), jnp.stack(places))
-            inertia = (jnp.diag(inertia) if inertia.ndim == 1 else inertia) + shifted
-        return RigidBody(mass=mass, inertia=inertia, position=centre, free=free)
+        body = RigidBody(mass=self.mass, inertia=self.inertia, position=self.centre, free=free)
+        return body.with_points(*zip(*points)) if points else body
 
     def halved(self) -> "Part":
         """Its half on either side of the plane y = 0, of which it is symmetric."""

@@ -155,6 +155,9 @@ class IndexReducedODE(AbstractScheme):
     def convergence_order(self):
         return self._solver.order(None)
 
+    def mismatch(self, before, after):
+        return after[1] - after[0]
+
     @property
     def coefficients(self) -> Coefficients:
         """Those of the solver."""

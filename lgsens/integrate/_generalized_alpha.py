@@ -27,6 +27,7 @@ from jaxtyping import Array, Bool
 from lgsens._validate import require_setting
 from lgsens.dynamics import given_way, split_velocity
 from lgsens.integrate._alpha import AbstractAlpha, AbstractEquations, Matrix, Wear
+from lgsens.integrate._alpha_defects import alpha_defects
 from lgsens.integrate._guess import Guess
 from lgsens.integrate._index3 import Index3
 from lgsens.integrate._levels import Levels
@@ -102,6 +103,22 @@ class AbstractGeneralizedAlpha(AbstractAlpha):
         c = (1/6 − β − Δ/2) v̈ + ad(v) v̇/12.
         """
         return (1.0 / 6.0 - self.beta - self.delta / 2.0) * jerk + system.group.ad_mv(v, vdot) / 12.0
+
+    @property
+    def convergence_order(self):
+        return 2
+
+    def defects(self, system, grid, states):
+        """Of index 3 where no force depends on the multipliers, as the start takes it."""
+        if self.stabilized or system.reads_multipliers:
+            return None
+        return alpha_defects(self, system, grid, states)
+
+    def mismatch(self, before, after):
+        """Of eq. (29)."""
+        (vdot, a), (next_vdot, next_a) = before, after
+        left = (1.0 - self.alpha_m) * next_a + self.alpha_m * a
+        return left - (1.0 - self.alpha_f) * next_vdot - self.alpha_f * vdot
 
     def memory(self, shared, state, node, *, uneven, exact=False):
         matrix = shared.no_matrix(state, node, self.factor_every, LU if exact else Inverse)

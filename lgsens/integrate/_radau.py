@@ -104,6 +104,9 @@ class RadauIIA(AbstractScheme):
     def convergence_order(self):
         return 5
 
+    def mismatch(self, before, after):
+        return after[1] - after[0]
+
     # How a motion begins, and what is seen of it.
 
     def resumed(self, system, state0, t0):

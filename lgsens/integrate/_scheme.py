@@ -172,9 +172,9 @@ class AbstractScheme(AbstractIntegrator):
         return
 
     @property
-    def convergence_order(self) -> int:
-        """p: errors of states are of the order of h^p."""
-        return 2
+    def convergence_order(self) -> int | None:
+        """p: errors of states are of the order of h^p; None: not said, and then errors cannot be estimated."""
+        return None
 
     @abc.abstractmethod
     def equations(self, system: AbstractSystem, node: Node, previous: State, state: State) -> State:
@@ -220,6 +220,21 @@ class AbstractScheme(AbstractIntegrator):
         Here that of the trapezoidal rule, (v̈ + ad(v) v̇)/12, which a scheme of second order has or has less of.
         """
         return (jerk + system.group.ad_mv(v, vdot)) / 12.0
+
+    def defects(self, system: AbstractSystem, grid: AbstractGrid, states: State) -> Variation | None:
+        """b: the error of a run solves L e = b to leading order, e = numerical − true, L the linearized trajectory.
+
+        What each step misses if the true motion takes the place of the numerical one, after the row of the start. None:
+        not known, and errors are those against a second run. At least three steps.
+        """
+        return None
+
+    def mismatch(self, before: tuple[Any, Any], after: tuple[Any, Any]) -> Any:
+        """What is zero of (v̇, a) as a step begins and ends with them, in NumPy or JAX: whether a run is of this scheme.
+
+        None: v̇ and a do not tell.
+        """
+        return None
 
     # The march.
 

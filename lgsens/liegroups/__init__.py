@@ -16,3 +16,4 @@ from ._rotation import (
     turn_back as turn_back,
     unskew as unskew,
 )
+from ._screw import SE3 as SE3

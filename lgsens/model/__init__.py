@@ -73,6 +73,15 @@ from lgsens.model._loads import (
 from lgsens.model._measured import measured as measured
 from lgsens.model._model import Model as Model
 from lgsens.model._on_merged_bodies import carried as carried
+from lgsens.model._reductions import (
+    AbstractReduction as AbstractReduction,
+    Fixed as Fixed,
+    Frozen as Frozen,
+    Joint as Joint,
+    Merged as Merged,
+    Rod as Rod,
+    Without as Without,
+)
 from lgsens.model._relative import (
     Coordinate as Coordinate,
     continued as continued,

@@ -1,6 +1,6 @@
 """The rigid body."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import jax
@@ -178,6 +178,18 @@ class RigidBody(eqx.Module):
         if self.pivot is None:
             return self.inertia_matrix
         return self.inertia_matrix + self.mass * parallel_axis(self.centre)
+
+    def with_points(self, masses: Sequence[Array], places: Sequence[Array]) -> "RigidBody":
+        """It with point masses [kg] fixed to it at places [m], inertial frame; each of its points moves as before."""
+        mass, position, shifted = lumped(jnp.stack([self.mass, *masses]), jnp.stack([self.position, *places]))
+        axes, inertia, velocity = self.orientation, self.inertia, self.velocity
+        if inertia is not None:
+            inertia = self.inertia_matrix + axes.T @ shifted @ axes
+        if self.pivot is None and {*self.free} & {*ROTATIONS}:
+            velocity = velocity + jnp.cross(axes @ self.angular_velocity, position - self.position)
+        return RigidBody(
+            mass, inertia, position, axes, velocity, self.angular_velocity, free=self.free, pivot=self.pivot
+        )
 
 
 def lumped(

@@ -1,6 +1,7 @@
 """Rubber bushings in place of joints: rates or curves along and about three axes."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -8,12 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float, point_field, require
+from lgsens._validate import as_float, is_concrete, point_field, require
 from lgsens.liegroups import cross
 from lgsens.model._forces import AbstractForce, Attached, _frame
+from lgsens.model._joints import FixedJoint, RevoluteJoint, SphericalJoint
 from lgsens.model._loads import BushingLoad
 from lgsens.model._signals import AbstractSignal, prepared
 from lgsens.model._turning_loads import CurveBushingLoad, Curves, LoadSum, RotationLoad
+
+_CURVES = ("springs", "dampers")
+_SOFT = 1e-2  # of the largest rotational rate: below, a joint turns
 
 
 class Bushing(AbstractForce):
@@ -116,6 +121,47 @@ class Bushing(AbstractForce):
         third = cross(first, second)
         columns = jnp.stack([first, cross(third, first), third], axis=1)
         return columns / jnp.linalg.norm(columns, axis=0, keepdims=True)
+
+    def as_joint(self, kind, what):
+        known = ("spherical", "revolute", "fixed")
+        if kind is not None and kind not in known:
+            raise ValueError(f"{what}: `kind` must be one of {known} or None, got {kind!r}.")
+        free = self._free_turns(kind, what)
+        if not len(free):
+            joint = FixedJoint(self.a, self.b, at=self.at)
+        elif len(free) == 1:
+            joint = RevoluteJoint(self.a, self.b, at=self.at, axis=self.triad[:, free[0]])
+        else:
+            joint = SphericalJoint(self.a, self.b, at=self.at)
+        yielding = self.with_preload(jnp.zeros(self.preload_shape, self.at.dtype))
+        blocked = yielding._about([i for i in range(3) if i not in free])
+        if not self._turns or not len(free):
+            return joint, blocked, None
+        none, still = jnp.zeros_like(self.at), {"springs": None, "dampers": None}
+        left = dataclasses.replace(self._about(free), stiffness=none, damping=none, preload=none, **still)
+        return joint, blocked, left
+
+    def _free_turns(self, kind: str | None, what: str) -> list[int]:
+        """About which of its axes the joint that it becomes lets its bodies turn."""
+        if kind in ("spherical", "fixed") or not self._turns:
+            return [] if kind == "fixed" else [0, 1, 2]
+        rates = self.preload_rates
+        if not is_concrete(rates):
+            raise ValueError(f"{what}: the rates of this bushing are not known here; give `kind`.")
+        turning = np.asarray(rates)[3:]
+        free = [int(i) for i in np.flatnonzero(turning <= _SOFT * turning.max())]
+        if kind == "revolute":
+            return [int(np.argmin(turning))]
+        return free if len(free) == 1 else [0, 1, 2] if len(free) > 1 else []
+
+    def _about(self, axes: Sequence[int]) -> "Bushing":
+        """The same, resisting rotations about some of its axes only."""
+        on = jnp.asarray([i in axes for i in range(3)], self.at.dtype)
+        of = lambda rate: None if rate is None or not len(axes) else on * rate
+        curves = lambda given: given and tuple(curve if i in axes else None for i, curve in enumerate(given))
+        turns = {name: of(getattr(self, f"rotational_{name}")) for name in ("stiffness", "damping", "preload")}
+        turns |= {name: curves(getattr(self, f"rotational_{name}")) if len(axes) else None for name in _CURVES}
+        return dataclasses.replace(self, **{f"rotational_{name}": value for name, value in turns.items()})
 
     def loads(self, bodies):
         a, b = (_frame(bodies, name, self.at.dtype) for name in (self.a, self.b))

@@ -75,6 +75,10 @@ class AbstractForce(eqx.Module):
         """The same element multiplied by a number in place of a signal; None: no signal multiplies it."""
         return None
 
+    def as_joint(self, kind: str | None, what: str) -> tuple[AbstractJoint, "AbstractForce", "AbstractForce | None"]:
+        """The joint that it becomes if it does not yield; what it does as it yields, and what the joint leaves out."""
+        raise ValueError(f"{what}: no joint takes the place of a {type(self).__name__}; one does of a Bushing.")
+
     @abc.abstractmethod
     def loads(self, bodies: Mapping[str, RigidBody]) -> tuple[Attached, ...]:
         """The loads of the element, given the bodies in their reference configuration.

@@ -1,7 +1,7 @@
 """The scene: bodies, joints and forces by name."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -21,6 +21,7 @@ from lgsens.model._forces import AbstractForce
 from lgsens.model._frames import Frame
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._merge import Group, groups
+from lgsens.model._reductions import AbstractReduction, Scene, reduced
 from lgsens.model._summary import Summary, summarize
 from lgsens.model._system import MultibodySystem
 
@@ -204,6 +205,36 @@ class Model(eqx.Module):
             return None
         found = groups(self.bodies, self.joints)
         return None if all(group.name in self.bodies for group in found) else found
+
+    def reduced(self, *reductions: AbstractReduction) -> "Model":
+        """A leaner model: without what does not matter.
+
+        ```python
+        lean = model.reduced(lg.model.Rod("trailing_arm"), lg.model.Without("bump_stop"))
+        ```
+
+        Arguments:
+            reductions: `Rod`, `Joint`, `Merged`, `Fixed`, `Frozen` and `Without` of `lgsens.model`, applied in turn.
+
+        Numbers of the lean model are functions of those of this one and derivatives go through.
+        `lgsens.accuracy.fidelity` says what each of them changes. Raises `ValueError` as these do and as `Model`.
+        """
+        return self._of(reduced(self._scene, reductions))
+
+    @property
+    def _scene(self) -> Scene:
+        return Scene(self.bodies, self.joints, self.forces, self.merge_fixed)
+
+    def _of(self, scene: Scene) -> "Model":
+        members, merge = scene[:3], scene.merge_fixed
+        return Model(*members, linear_solver=self.linear_solver, merge_fixed=merge, redundant=self.redundant)
+
+    def toward(self, paths: Sequence[Sequence[AbstractReduction]], s, rate) -> "Model":
+        """The scene of this structure at s on the way to some reductions (`_reductions.py`); `rate`: [1/s]."""
+        scene = self._scene
+        for path, place in zip(paths, s):
+            scene = path[-1].toward(scene, reduced(self._scene, path[:-1]), place, rate)
+        return self._of(scene)
 
     def summary(self) -> Summary:
         """Bodies with their free coordinates, joints with their equations, force elements, and the totals.

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import pytest
 from differences import central
 
 import lgsens as lg
+from lgsens.accuracy import error_estimate
 from lgsens.dynamics import constraint_velocity
 from lgsens.examples import spinning_top
 from lgsens.integrate import AbstractScheme, Start
@@ -25,6 +27,10 @@ class ImplicitMidpoint(AbstractScheme):
 
     tolerance: float = eqx.field(static=True, default=1e-10)
     max_iterations: int = eqx.field(static=True, default=10)
+
+    @property
+    def convergence_order(self):
+        return 2
 
     def equations(self, system, node, previous, state):
         h, m = node.h, len(system.constraint_names)
@@ -139,3 +145,30 @@ def test_second_derivatives():
     hessian = jax.jit(jax.hessian(f))(P)
     expected = differences(jax.grad(f))
     np.testing.assert_allclose(hessian, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.slow  # three programs
+def test_its_error_is_estimated():
+    """What is left is O(h) of the error, the reference by explicit steps of order 8: those of ε²."""
+    model = spinning_top(P[0], length=P[1])
+    run = lg.simulate(model, t1=P[2], num_steps=30, integrator=MIDPOINT)
+    exact = lg.simulate(model, t1=P[2], num_steps=30, integrator=lg.IndexReducedODE(diffrax.Dopri8()))
+    error = exact.states.v - run.states.v
+    left = error_estimate(run, MIDPOINT).v - error
+    assert np.abs(left).max() < 0.1 * np.abs(error).max()
+
+
+class OrderUnsaid(AbstractScheme):
+    """A scheme of which nobody has said how its errors fall."""
+
+    tolerance: float = eqx.field(static=True, default=1e-10)
+    max_iterations: int = eqx.field(static=True, default=10)
+
+    def equations(self, system, node, previous, state):
+        return state
+
+
+def test_an_error_needs_an_order():
+    run = lg.simulate(spinning_top(P[0], length=P[1]), t1=P[2], num_steps=3)
+    with pytest.raises(ValueError, match="OrderUnsaid does not say its `convergence_order`"):
+        error_estimate(run, OrderUnsaid())

@@ -7,12 +7,13 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.linalg import expm
 
-from lgsens.liegroups import SO3, AbstractLieGroup, Pose, Poses, Power, Product, R3xSO3, Rn
+from lgsens.liegroups import SE3, SO3, AbstractLieGroup, Pose, Poses, Power, Product, R3xSO3, Rn
 
 GROUPS = {
     "Rn": Rn(3),
     "SO3": SO3(),
     "R3xSO3": R3xSO3(),
+    "SE3": SE3(),
     "Product": Product((Rn(2), SO3(), Rn(1))),
     "Power": Power(R3xSO3(), 3),
     # in turn: rotation, heave only, planar motion, all, nothing
