@@ -89,7 +89,8 @@ class AxleNumbers(eqx.Module):
                 (0.3: from 0.7 to 1.3 times), or for either a pair (lower, upper). Later patterns overrule earlier ones.
                 Names are keys of the file, then x, y or z of a point, 1, 2 or 3 for the axes of a bushing, before that
                 1 or 2 for the two points of a hinge: "links.upper_arm.subframe.1.z", "bushings.pivot.stiffness.2.1",
-                "spring.stiffness". A pattern has * and ? as for files, and stands for all names that it begins.
+                "spring.stiffness". Points are in the vehicle frame, z over the road. A pattern has * and ? as for
+                files, and stands for all names that it begins.
 
         Raises `ValueError` for a pattern that matches nothing, and bounds that do not contain the start.
         """
