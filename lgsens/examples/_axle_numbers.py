@@ -108,12 +108,13 @@ class AxleNumbers(eqx.Module):
         for kind, of in kept.items():
             for i, place in enumerate(of):
                 value = float(np.ravel(leaves[place.leaf])[place.index])
-                ends[kind][:, i] = _bounds(*chosen[place.name], value, kind == POINTS)
+                pattern, bound = chosen[place.name]
+                ends[kind][:, i] = _bounds(pattern, bound, value, kind == POINTS)
                 low, high = ends[kind][:, i]
                 if not low <= value <= high or (kind == RATES and not low > 0) or not low < high:
                     more = ", and rates stay positive" if kind == RATES else ""
                     raise ValueError(
-                        f"`vary`, {chosen[place.name][0]!r}: {place.name} is {value:.6g}, the bounds {low:.6g} and "
+                        f"`vary`, {pattern!r}: {place.name} is {value:.6g}, the bounds {low:.6g} and "
                         f"{high:.6g}; they must have it between them{more}."
                     )
         lower, upper = ({kind: as_float(end[i], None, "bounds") for kind, end in ends.items()} for i in (0, 1))
