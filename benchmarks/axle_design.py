@@ -36,7 +36,7 @@ def by_scipy(design):
     x0, unravel = ravel_pytree(design.start)
     lower, upper = (ravel_pytree(end)[0] for end in (design.numbers.lower, design.numbers.upper))
     half = (upper - lower) / 2
-    scale = float(jax.jit(design)(design.start)[0])
+    scale = float(jax.jit(lambda x: design(x)[0])(design.start))
 
     @jax.jit
     def values(z):
@@ -69,7 +69,7 @@ def main() -> None:
     design = AxleDesign.of(Axle.load("multi_link"), VARY, KEEP)
     started = time.perf_counter()
     bounds = {"lower": design.numbers.lower, "upper": design.numbers.upper}
-    best = minimize(design, design.start, **bounds, num_steps=100, progress=False)
+    best = minimize(design, design.start, **bounds, num_steps=300, progress=False)
     ours = {
         "objective": best.objective,
         "worst_constraint": float(best.constraints.max()),
