@@ -85,7 +85,7 @@ def study(name, car, options):
 
 
 def main() -> None:
-    arguments = benchmark.options(__doc__).parse_args()
+    arguments = benchmark.options(__doc__, repeats=False).parse_args()
     jax.config.update("jax_enable_x64", True)
     studies = [study(*car()) for car in (five_link, multi_link)]
     benchmark.write(arguments.out / "fidelity.json", {"studies": studies, "environment": benchmark.environment()})

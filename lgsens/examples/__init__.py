@@ -1,6 +1,7 @@
 """Scenes with published or independently computed numbers, defined once for tests, notebooks, benchmarks."""
 
 from lgsens.examples._axle import Axle as Axle
+from lgsens.examples._axle_numbers import AxleNumbers as AxleNumbers
 from lgsens.examples._comparison import COMPARISON as COMPARISON
 from lgsens.examples._curve_bounds import Band as Band, CurveBounds as CurveBounds
 from lgsens.examples._hardpoint_file import DEFAULT as DEFAULT, shipped as shipped

@@ -10,12 +10,23 @@ from jaxtyping import Array, Float
 
 from lgsens.examples._axle_file import axle_members
 from lgsens.examples._axle_parts import Bar, Rack
-from lgsens.examples._corner_scene import corner_scene
+from lgsens.examples._corner_scene import CornerScene, corner_scene
 from lgsens.examples._hardpoint_file import read
 from lgsens.examples._quarter_car import GRAVITY, QuarterCar, check_choice
 from lgsens.examples._suspension_file import reader
 from lgsens.examples._suspension_parts import Part, reflected
-from lgsens.model import FixedJoint, Gravity, Model, PrismaticJoint, TranslationDriver, TyreSpring, static_preload
+from lgsens.model import (
+    ALL_FREE,
+    BumpRoad,
+    FixedJoint,
+    FlatRoad,
+    Gravity,
+    Model,
+    PrismaticJoint,
+    TranslationDriver,
+    TyreSpring,
+    static_preload,
+)
 
 
 class Axle(eqx.Module):
@@ -104,35 +115,73 @@ class Axle(eqx.Module):
         chassis or links, and as `QuarterCar.model`.
         """
         check_choice("chassis", chassis, ("held", "guided"))
-        check_choice("links", links, ("bodies", "rods"))
-        cars = {"left": self.left, "right": self.right}
-        for car in (self.left, *(() if self.other is None else (self.other,))):
-            car._check(f"Suspension {self.name!r}")
         shared, joints = self._between(compliant)
+        cars = {"left": self.left, "right": self.right}
+        scene = self._sides(cars, joints, links, compliant, FlatRoad())
+        bodies = scene.bodies | {
+            name: part.body(scene.ends.get(name, ())) for name, part in shared.items() if name != "chassis"
+        }
+        frame = lambda free: {"chassis": shared["chassis"].body(scene.ends.get("chassis", ()), free)}
+        forces = _resting(Model(bodies | frame("z rx"), scene.joints, scene.forces), scene).forces
+        forces = {name: force for name, force in forces.items() if tyres or not name.endswith("_tyre")}
+        return Model(bodies | frame(() if chassis == "held" else "z rx"), scene.joints, forces)
+
+    def half(self, *, links: str = "rods", compliant: bool = True) -> Model:
+        """The left half of the axle over the bump of its file, which both wheels meet at once: as the whole axle moves.
+
+        A motion of both sides alike turns or moves nothing across the plane y = 0: half of the chassis heaves, half of
+        the subframe moves in x and z and pitches, half of the rack is fixed to what carries it, the bar does not twist.
+        Names, preloads and joints are those of `model(chassis="guided", tyres=True)` on the left.
+
+        Arguments:
+            links, compliant: as in `model`.
+
+        Raises `ValueError` for an axle whose sides have numbers of their own, and as `model`.
+        """
+        if self.other is not None:
+            raise ValueError("`other`: an axle with another corner on the right has no half; leave it out, None.")
+        car = self.left
+        road = BumpRoad(height=car.bump_height, duration=car.bump_duration)
+        _, joints = self._between(compliant)
+        joints.pop("steering", None)
+        if self.rack is not None:
+            joints[f"rack_{self.rack.carrier}"] = FixedJoint(self.rack.carrier, "rack", at=self.rack.part.centre)
+        scene = self._sides({"left": car}, joints, links, compliant, road)
+        ends = lambda body: scene.ends.get(body, ())
+        bodies = scene.bodies | {"chassis": car.chassis.body(ends("chassis"), "z")}
+        if self.subframe is not None:
+            free = ALL_FREE if "subframe" in joints else "x z ry"
+            bodies["subframe"] = self.subframe.halved().body(ends("subframe"), free)
+        if self.rack is not None:
+            bodies["rack"] = self.rack.part.halved().body(ends("rack"))
+        return _resting(Model(bodies, scene.joints, scene.forces), scene)
+
+    def _sides(
+        self, cars: dict[str, QuarterCar], joints: dict[str, Any], links: str, compliant: bool, road: Any
+    ) -> CornerScene:
+        """These corners and their parts of the bar, beside `joints`; with the tyres among what is sought."""
+        check_choice("links", links, ("bodies", "rods"))
         forces: dict[str, Any] = {"gravity": Gravity((0.0, 0.0, -GRAVITY))}
-        bodies: dict[str, Any] = {}
-        ends: dict[str, list[Any]] = {name: [] for name in shared}
-        sought, given = [], {}
+        bodies, ends, sought, given = {}, {}, [], {}
+        held = () if self.bar is None else (self.bar.link,)
         for side, car in cars.items():
-            mounts, held = car.mounts if compliant else {}, () if self.bar is None else (self.bar.link,)
+            if side == "left" or self.other is not None:
+                car._check(f"Suspension {self.name!r}")
+            mounts = car.mounts if compliant else {}
             scene = corner_scene(car, wheel="locked", links=links, side=side, mounts=mounts, held=held)
             bodies, joints, forces = bodies | scene.bodies, joints | scene.joints, forces | scene.forces
             for body, masses in scene.ends.items():
-                ends[body] += masses
-            tyre = TyreSpring(f"{side}_wheel", at=car.wheel.centre, stiffness=car.tyre_stiffness)
-            forces[f"{side}_tyre"] = tyre
+                ends.setdefault(body, []).extend(masses)
+            tyre = {"at": car.wheel.centre, "stiffness": car.tyre_stiffness, "road": road}
+            forces[f"{side}_tyre"] = TyreSpring(f"{side}_wheel", **tyre)
             sought, given = [*sought, f"{side}_tyre", *scene.sought], given | scene.given
             if self.bar is not None:
                 bar = self.bar if side == "left" else reflected(self.bar)
                 bodies[f"{side}_anti_roll_bar"] = bar.half().body()
                 joints |= bar.joints(side)
-        if self.bar is not None:
+        if self.bar is not None and len(cars) == 2:
             forces["anti_roll_bar"] = self.bar.element("left_anti_roll_bar", "right_anti_roll_bar")
-        bodies |= {name: part.body(ends[name]) for name, part in shared.items() if name != "chassis"}
-        frame = lambda free: {"chassis": shared["chassis"].body(ends["chassis"], free)}
-        forces = static_preload(Model(bodies | frame("z rx"), joints, forces), sought)[0].forces | given
-        forces = {name: force for name, force in forces.items() if tyres or not name.endswith("_tyre")}
-        return Model(bodies | frame(() if chassis == "held" else "z rx"), joints, forces)
+        return CornerScene(bodies, joints, forces, ends, sought, given)
 
     def _between(self, compliant: bool) -> tuple[dict[str, Part], dict[str, Any]]:
         """The bodies that both sides share, and their joints."""
@@ -147,3 +196,9 @@ class Axle(eqx.Module):
             joints[f"rack_{self.rack.carrier}"] = PrismaticJoint(self.rack.carrier, "rack", **line)
             joints["steering"] = TranslationDriver(self.rack.carrier, "rack", **line)
         return shared, joints
+
+
+def _resting(model: Model, scene: CornerScene) -> Model:
+    """The model at rest by the preloads that are sought, of which those that are given then take their place."""
+    forces = static_preload(model, scene.sought)[0].forces
+    return Model(model.bodies, model.joints, forces | scene.given)

@@ -73,6 +73,10 @@ class Part(eqx.Module):
         body = RigidBody(mass=self.mass, inertia=self.inertia, position=self.centre, free=free)
         return body.with_points(*zip(*points)) if points else body
 
+    def halved(self) -> "Part":
+        """Its half on either side of the plane y = 0, of which it is symmetric."""
+        return Part(self.centre, self.mass / 2, self.inertia / 2)
+
     def joined(self, other: "Part") -> "Part":
         """Both as one body."""
         both = jnp.stack([self.mass, other.mass]), jnp.stack([self.centre, other.centre])

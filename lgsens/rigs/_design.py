@@ -1,0 +1,133 @@
+"""The design of an axle: numbers of its file, bands on what the rig measures, and the bump."""
+
+from collections.abc import Mapping
+from operator import attrgetter
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lgsens._validate import as_count, as_float, suggestion
+from lgsens.criteria import time_integral
+from lgsens.examples import Axle, AxleNumbers, Band
+from lgsens.rigs._characteristics import CHARACTERISTICS
+from lgsens.rigs._kc import KC, kc
+from lgsens.rigs._sweeps import Sweep, standard_sweeps
+from lgsens.simulation import Trajectory, simulate
+
+Design = dict[str, Float[Array, " n"]]
+# Curves over the travel of both wheels, of the left one: toe inward, camber outward.
+CURVES = {"toe": ("parallel", "wheels.toe"), "camber": ("parallel", "wheels.camber")}
+
+
+class AxleDesign(eqx.Module):
+    """Least acceleration of the chassis over the bump, with what the rig measures kept in bands.
+
+        min ∫ z̈² dt [m²/s³] over hardpoints, bushing, spring and damper rates;  lower ≤ outputs of `kc` ≤ upper
+
+    The car goes over the bump of the file with both wheels at once (`Axle.half`). A problem for `optimize.minimize` and
+    `optimize.scipy_problem`: a function of `start`, between `lower` and `upper`, with its constraints in half widths of
+    the bands.
+
+    Attributes:
+        axle: the axle at the start.
+        numbers: which numbers of it are free, and their bounds.
+        bands: what is kept, by name of a curve or characteristic, SI units.
+        sweeps: of the rig, those that the bands ask for; `points` of each.
+        t1, num_steps: end and steps of the run over the bump.
+    """
+
+    axle: Axle
+    numbers: AxleNumbers
+    bands: dict[str, Band]
+    t1: Float[Array, ""]
+    sweeps: tuple[tuple[str, Sweep], ...] = eqx.field(static=True)
+    points: int = eqx.field(static=True)
+    num_steps: int = eqx.field(static=True)
+
+    @staticmethod
+    def of(
+        axle: Axle,
+        vary: Mapping[str, Any],
+        keep: Mapping[str, Any],
+        *,
+        travel=0.05,
+        points: int = 5,
+        t1=0.5,
+        num_steps: int = 250,
+    ) -> "AxleDesign":
+        """The problem of an axle.
+
+        Arguments:
+            axle: the axle at the start, both sides alike.
+            vary: which numbers are free and how far, by patterns of their names (`AxleNumbers.select`).
+            keep: by name of a curve, "toe" or "camber" over parallel travel [rad], or of a characteristic
+                (`CHARACTERISTICS`, SI units): how far it may be off its value at the start, or its bounds, a pair.
+            travel: how far the wheels travel up and down on the rig [m], shape ().
+            points: of each sweep, odd.
+            t1: end of the run over the bump [s], shape ().
+            num_steps: of it, static.
+
+        Raises `ValueError` for names that there are not, widths that are not positive, an output that the axle does not
+        have, and as `AxleNumbers.select`, `Axle.half` and `kc`.
+        """
+        numbers, bands = AxleNumbers.select(axle, vary), {}
+        known, every = (*CURVES, *CHARACTERISTICS), standard_sweeps(travel=travel)
+        for name in keep:
+            if name not in known:
+                raise ValueError(f"`keep`: {suggestion(name, known)}.")
+        used = {CURVES[name][0] if name in CURVES else CHARACTERISTICS[name].sweep for name in keep}
+        sweeps = tuple((name, every[name]) for name in every if name in used)
+        t1, num_steps = as_float(t1, (), "`t1`"), as_count(num_steps, "num_steps", " (it is static)")
+        problem = AxleDesign(axle, numbers, {}, t1, sweeps, points, num_steps)
+        now = problem.outputs(kc(axle.model(links="rods"), axle.wheel_centres, dict(sweeps), points=points), keep)
+        for name, bound in keep.items():
+            ends = [as_float(end, (), f"`keep[{name!r}]`") for end in (bound if np.ndim(bound) else (bound,))]
+            band = Band.around(now[name], ends[0]) if len(ends) == 1 else Band(*(0.0 * now[name] + end for end in ends))
+            if not bool(jnp.all(band.lower < band.upper)):
+                raise ValueError(f"`keep[{name!r}]` must be a positive width or a pair (lower, upper), got {bound!r}.")
+            bands[name] = band
+        return eqx.tree_at(lambda self: self.bands, problem, bands)
+
+    @property
+    def start(self) -> Design:
+        """The numbers of the axle as it is."""
+        return self.numbers.of(self.axle)
+
+    def with_design(self, x: Design) -> Axle:
+        """The axle with other numbers."""
+        return self.numbers.replaced(self.axle, x)
+
+    def test(self, x: Design, *, throw: bool = True) -> KC:
+        """The sweeps of the rig that the bands ask for."""
+        axle = self.with_design(x)
+        return kc(axle.model(links="rods"), axle.wheel_centres, dict(self.sweeps), points=self.points, throw=throw)
+
+    def bump(self, x: Design, *, throw: bool = True) -> Trajectory:
+        """The run of the left half over the bump."""
+        return simulate(self.with_design(x).half(), t1=self.t1, num_steps=self.num_steps, throw=throw)
+
+    def outputs(self, test: KC, names) -> dict[str, Float[Array, " n"]]:
+        """What a test says of the outputs of these names, each a vector."""
+        found: dict[str, Any] = {}
+        for name in names:
+            if name in CURVES:
+                sweep, member = CURVES[name]
+                found[name] = attrgetter(member)(test.sweeps[sweep])[:, 0]
+                continue
+            value = CHARACTERISTICS[name].of(test.sweeps[CHARACTERISTICS[name].sweep])
+            if value is None:
+                raise ValueError(f"`keep`: the axle has no {name!r}: {CHARACTERISTICS[name].label}.")
+            found[name] = value[None]
+        return found
+
+    def objective(self, trajectory: Trajectory) -> Float[Array, ""]:
+        """∫ z̈² dt of the chassis."""
+        return time_integral(trajectory.t, trajectory.body("chassis").acceleration[:, 2] ** 2)
+
+    def __call__(self, x: Design) -> tuple[Float[Array, ""], Float[Array, " m"]]:
+        found = self.outputs(self.test(x, throw=False), self.bands)
+        rows = [band.constraints(found[name]) for name, band in self.bands.items()]
+        return self.objective(self.bump(x, throw=False)), jnp.concatenate([jnp.zeros(0, self.t1.dtype), *rows])
