@@ -11,6 +11,7 @@ rotations per step, margins to singular configurations, kinks, growth; and in th
 
 import dataclasses
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -163,10 +164,8 @@ def of_numbers(model: Model):
             repr(wide),
             "No body is so much larger than its scene: inertia in kg mm² with lengths in m? lgsens wants SI.",
         )
-    fields = [getattr(force, "acceleration", None) for force in model.forces.values()]
-    for field in fields:
-        if field is None:
-            continue
+    fields = (getattr(force, "acceleration", None) for force in model.forces.values())
+    for field in filter(eqx.is_array, fields):
         yield Finding(
             "gravity [m/s²]",
             float(jnp.linalg.norm(field)),

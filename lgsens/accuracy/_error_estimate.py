@@ -15,14 +15,11 @@ import numpy as np
 
 from lgsens._validate import is_concrete, require
 from lgsens.accuracy._refined_run import refined_error
-from lgsens.dynamics import AbstractSystem, State
+from lgsens.dynamics import State
 from lgsens.integrate import (
-    AbstractGrid,
     AbstractIntegrator,
-    AbstractScheme,
     EqualGrid,
     GeneralizedAlpha,
-    Variation,
 )
 from lgsens.sensitivity import Parameters, linearized_trajectory
 from lgsens.simulation import StateError, Trajectory
@@ -103,11 +100,8 @@ def _estimated(integrator: AbstractIntegrator, trajectory: Trajectory) -> StateE
     scheme, states, system, t = integrator.scheme, trajectory.states, trajectory.system, trajectory.t
     grid = EqualGrid(t[0], (t[-1] - t[0]) / (t.shape[0] - 1), t.shape[0] - 1)
     defects = scheme.defects(system, grid, states) if integrator.equal_steps else None
-    return refined_error(scheme, trajectory) if defects is None else propagated(scheme, system, grid, states, defects)
-
-
-def propagated(scheme: AbstractScheme, system: AbstractSystem, grid: AbstractGrid, states: State, defects: Variation):
-    """What is missing, −e of L e = defects: a `StateError`."""
+    if defects is None:
+        return refined_error(scheme, trajectory)
     parameters = Parameters(system, grid)
     e = linearized_trajectory(scheme, states, parameters, defects, jax.tree.map(jnp.zeros_like, parameters))
     return StateError(-e.w, -e.v, -e.vdot, -e.lam)

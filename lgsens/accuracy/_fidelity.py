@@ -34,7 +34,7 @@ import numpy as np
 
 from lgsens import plotting
 from lgsens._validate import as_count
-from lgsens.accuracy._programs import Evaluated, Program, Study
+from lgsens.accuracy._programs import Evaluated, Program, Study, in_turns
 from lgsens.accuracy._setting import Build, Function, Setting
 from lgsens.criteria import Criterion
 from lgsens.integrate import AbstractIntegrator, GeneralizedAlpha
@@ -173,7 +173,7 @@ class Fidelity:
         found, _ = lean.evaluate()
         if found.failure:
             raise ValueError(f"The scene with {options!r} fails: {found.failure}")
-        seconds, of_rich = (float(np.median(taken)) for taken in zip(*((_taken(lean), _taken(rich)) for _ in range(5))))
+        (seconds, _), (of_rich, _) = in_turns({"lean": lean, "rich": rich}, 5).values()
         value, gradient = _changes(found, self.rich)
         unknowns = _unknowns(_Lean(self.runs.study.build, options), self.runs.study.p)
         return Reduced(options, value, gradient, np.nan, unknowns, seconds / of_rich)
@@ -199,12 +199,6 @@ class Fidelity:
         return "\n".join([*lines, f"the rich scene: Ψ = {self.value:.6g}, {self.unknowns} unknowns"])
 
     __repr__ = __str__
-
-
-def _taken(program: Program) -> float:
-    started = time.perf_counter()
-    program()
-    return time.perf_counter() - started
 
 
 def _time(unknowns: int, of: int) -> float:

@@ -1,8 +1,6 @@
 """Settings side by side: time, compile time, memory, errors of Ψ and dΨ/dp."""
 
 import dataclasses
-import statistics
-import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -11,7 +9,7 @@ import numpy as np
 from lgsens._progress import progress_bar
 from lgsens._validate import as_count
 from lgsens.accuracy._balance import quality
-from lgsens.accuracy._programs import Program, Study, crowded, failed, make_room
+from lgsens.accuracy._programs import Program, Study, crowded, failed, in_turns, make_room
 from lgsens.accuracy._reference import Reference, converge
 from lgsens.accuracy._setting import Build, Function, Setting, ladder
 from lgsens.accuracy._table import Row, Table
@@ -98,14 +96,8 @@ def _measured(study: Study, settings: list[Setting], reference: Reference, round
         found.append(_evaluated(study, setting, reference))
         bar.update()
     rows = [row for row, _ in found]
-    times = {i: [] for i, row in enumerate(rows) if not row.failure}
-    for _ in range(rounds):
-        for i, taken in times.items():
-            started, busy = time.perf_counter(), time.process_time()
-            found[i][1]()
-            taken.append((time.perf_counter() - started, time.process_time() - busy))
-    for i, taken in times.items():
-        seconds, cpu_seconds = map(statistics.median, zip(*taken))
+    programs = {i: program for i, (row, program) in enumerate(found) if not row.failure}
+    for i, (seconds, cpu_seconds) in in_turns(programs, rounds).items():
         rows[i] = dataclasses.replace(rows[i], seconds=seconds, cpu_seconds=cpu_seconds)
     return rows
 

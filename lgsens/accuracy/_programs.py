@@ -1,7 +1,8 @@
 """Ψ and dΨ/dp of a setting, compiled, what it costs, and how far two such results are apart."""
 
+import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -194,3 +195,15 @@ def evaluate(study: Study, setting: Setting) -> Evaluated:
 def failed(study: Study, error: BaseException) -> Evaluated:
     """What is left of a setting that raised."""
     return Evaluated(np.nan, np.full(study.scale.shape, np.nan), f"{type(error).__name__}: {error}")
+
+
+def in_turns(programs: Mapping[Any, Callable[[], Any]], rounds: int) -> dict[Any, tuple[float, float]]:
+    """Median wall and processor time of a call of each [s]: in every round each is called once."""
+    times = {key: [] for key in programs}
+    for _ in range(rounds):
+        for key, taken in times.items():
+            started, busy = time.perf_counter(), time.process_time()
+            programs[key]()
+            taken.append((time.perf_counter() - started, time.process_time() - busy))
+    medians = lambda taken: tuple(map(statistics.median, zip(*taken)))
+    return {key: medians(taken) for key, taken in times.items()}

@@ -1,7 +1,6 @@
 """Schemes, grids, and the march through time (paper, §4)."""
 
 from lgsens.integrate._alpha import AbstractAlpha as AbstractAlpha
-from lgsens.integrate._alpha_defects import second_differences as second_differences
 from lgsens.integrate._explicit import IndexReducedODE as IndexReducedODE
 from lgsens.integrate._explicit_step import ended as ended
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha as GeneralizedAlpha

@@ -47,7 +47,7 @@ from lgsens.integrate._grid import AbstractGrid
 from lgsens.integrate._linearized import Variation
 
 
-def second_differences(t: Float[Array, " n+1"], f: Float[Array, "n+1 ..."]) -> Float[Array, "n ..."]:
+def _second_differences(t: Float[Array, " n+1"], f: Float[Array, "n+1 ..."]) -> Float[Array, "n ..."]:
     """f̈ in the middle of each step, from the four values around it; those at the ends from their neighbours."""
     sized = lambda dt: dt.reshape((-1,) + (1,) * (f.ndim - 1))
     middle = (t[1:] + t[:-1]) / 2.0
@@ -65,7 +65,7 @@ def alpha_defects(scheme: AbstractAlpha, system: AbstractSystem, grid: AbstractG
     v, vdot = middle(states.v), middle(states.vdot)
     jerk = jnp.diff(states.vdot, axis=0) / h
     missed_x = jax.vmap(lambda *at: scheme.missed_increment(system, *at))(v, vdot, jerk)  # c
-    missed_v = (scheme.delta**2 - kappa - 1.0 / 12.0) * second_differences(t, states.vdot)  # l
+    missed_v = (scheme.delta**2 - kappa - 1.0 / 12.0) * _second_differences(t, states.vdot)  # l
     first = jax.tree.map(lambda leaf: leaf[0], states)
     slope = (missed_x[1] - missed_x[0]) / (middle(t)[1] - middle(t)[0])
     nu, omega = _start(system, first, t[0], missed_x[0] - 0.5 * h[0] * slope, slope + missed_v[0])

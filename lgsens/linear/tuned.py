@@ -67,7 +67,8 @@ LANES, LANES_ELSEWHERE = 256, 8192
 FREE_SHARE = 0.5  # of the memory that is free, what a batch may take
 
 # What a step costs whatever the scene, in unknowns (`accuracy.fidelity`): value and gradient of the quarter-car of 93
-# unknowns with rods and a heaving chassis, 35 of them, take 0.82 of the time, with a locked wheel too, 24, 0.72.
+# unknowns with rods and a heaving chassis, 35 of them, take 0.82 of the time, with a locked wheel too, 24, 0.72
+# (least processor times on a busy machine).
 RUN_UNKNOWNS = 180
 
 # What `accuracy` times in turns, and how many memory maps its programs may take: Linux gives a process 65,530, and a

@@ -1,6 +1,6 @@
 """The design of an axle: numbers of its file, bands on what the rig measures, and the bump."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from operator import attrgetter
 from typing import Any
 
@@ -81,15 +81,14 @@ class AxleDesign(eqx.Module):
         used = {CURVES[name][0] if name in CURVES else CHARACTERISTICS[name].sweep for name in keep}
         sweeps = tuple((name, every[name]) for name in every if name in used)
         t1, num_steps = as_float(t1, (), "`t1`"), as_count(num_steps, "num_steps", " (it is static)")
-        problem = AxleDesign(axle, numbers, {}, t1, sweeps, points, num_steps)
-        now = problem.outputs(kc(axle.model(links="rods"), axle.wheel_centres, dict(sweeps), points=points), keep)
+        now = _outputs(kc(axle.model(links="rods"), axle.wheel_centres, dict(sweeps), points=points), keep)
         for name, bound in keep.items():
             ends = [as_float(end, (), f"`keep[{name!r}]`") for end in (bound if np.ndim(bound) else (bound,))]
             band = Band.around(now[name], ends[0]) if len(ends) == 1 else Band(*(0.0 * now[name] + end for end in ends))
             if not bool(jnp.all(band.lower < band.upper)):
                 raise ValueError(f"`keep[{name!r}]` must be a positive width or a pair (lower, upper), got {bound!r}.")
             bands[name] = band
-        return eqx.tree_at(lambda self: self.bands, problem, bands)
+        return AxleDesign(axle, numbers, bands, t1, sweeps, points, num_steps)
 
     @property
     def start(self) -> Design:
@@ -109,25 +108,26 @@ class AxleDesign(eqx.Module):
         """The run of the left half over the bump."""
         return simulate(self.with_design(x).half(), t1=self.t1, num_steps=self.num_steps, throw=throw)
 
-    def outputs(self, test: KC, names) -> dict[str, Float[Array, " n"]]:
-        """What a test says of the outputs of these names, each a vector."""
-        found: dict[str, Any] = {}
-        for name in names:
-            if name in CURVES:
-                sweep, member = CURVES[name]
-                found[name] = attrgetter(member)(test.sweeps[sweep])[:, 0]
-                continue
-            value = CHARACTERISTICS[name].of(test.sweeps[CHARACTERISTICS[name].sweep])
-            if value is None:
-                raise ValueError(f"`keep`: the axle has no {name!r}: {CHARACTERISTICS[name].label}.")
-            found[name] = value[None]
-        return found
-
     def objective(self, trajectory: Trajectory) -> Float[Array, ""]:
         """∫ z̈² dt of the chassis."""
         return time_integral(trajectory.t, trajectory.body("chassis").acceleration[:, 2] ** 2)
 
     def __call__(self, x: Design) -> tuple[Float[Array, ""], Float[Array, " m"]]:
-        found = self.outputs(self.test(x, throw=False), self.bands)
+        found = _outputs(self.test(x, throw=False), self.bands)
         rows = [band.constraints(found[name]) for name, band in self.bands.items()]
         return self.objective(self.bump(x, throw=False)), jnp.concatenate([jnp.zeros(0, self.t1.dtype), *rows])
+
+
+def _outputs(test: KC, names: Iterable[str]) -> dict[str, Float[Array, " n"]]:
+    """What a test says of the outputs of these names, each a vector."""
+    found: dict[str, Any] = {}
+    for name in names:
+        if name in CURVES:
+            sweep, member = CURVES[name]
+            found[name] = attrgetter(member)(test.sweeps[sweep])[:, 0]
+            continue
+        value = CHARACTERISTICS[name].of(test.sweeps[CHARACTERISTICS[name].sweep])
+        if value is None:
+            raise ValueError(f"`keep`: the axle has no {name!r}: {CHARACTERISTICS[name].label}.")
+        found[name] = value[None]
+    return found
