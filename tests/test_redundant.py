@@ -278,7 +278,8 @@ def test_a_parallelogram_through_its_dead_centre_is_said_to_be_singular(factor_e
     # before it nothing is wrong; nor with lengths that leave b + c longer than the 1.2 m to the pin by 2 mm
     assert lg.simulate(linkage(2.8), t1=0.06, num_steps=100, integrator=scheme).result == 0
     near = lg.simulate(linkage(2.8, 0.88, 0.322), t1=0.1, num_steps=100, integrator=scheme)
-    assert jnp.nanmin(near.stats.margin) < 0.5 * jnp.nanmax(near.stats.margin)
+    known = near.stats.margin[jnp.isfinite(near.stats.margin)]
+    assert jnp.min(known) < 0.5 * jnp.max(known)
 
 
 OTHERS = {

@@ -153,7 +153,9 @@ def _certified(criterion, build, start, p, t0, t1, num_steps: int, integrator):
     grown = lax.cummax(jnp.max(jnp.abs(w) / system.coordinate_scale()[None], axis=1))
     growth = grown[-1] / jnp.max(jnp.abs(random))
     margins = trajectory.stats.margin
-    margin = jnp.where(jnp.all(jnp.isnan(margins)), jnp.inf, jnp.nanmin(margins) / jnp.nanmax(margins))
+    margin = jnp.min(margins) / jnp.max(
+        margins, where=jnp.isfinite(margins), initial=0.0
+    )  # infinite: none was looked at
     margin = jnp.where(jnp.any(singular_steps(margins)), 0.0, margin)
     newton = jnp.full((), jnp.nan, flat.dtype)
     if integrator.scheme.physical(system, states) is states:  # nothing of them was left out

@@ -77,7 +77,11 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
         def body(carry):
             z, _, iteration = carry
             step = jnp.linalg.lstsq(matrix(z), equation(z), rcond=1e3 * eps)[0]
-            size, moved = (jnp.max(jnp.abs(step[:end])) for end in (k, k - system.num_states))
+            # Multipliers too: where joint forces alone are stiff, as in a pendulum, the first step moves nothing.
+            size = jnp.max(
+                jnp.abs(step) / jnp.where(np.arange(k + m) < k, 1.0, 1.0 + jnp.max(jnp.abs(z[k:]), initial=0.0))
+            )
+            moved = jnp.max(jnp.abs(step[: k - system.num_states]))
             # At most 0.2 rad or a fifth of the scene at a time.
             return z - step * jnp.minimum(1.0, 0.2 / jnp.maximum(moved, 0.2)), size, iteration + 1
 

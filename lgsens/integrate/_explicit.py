@@ -239,7 +239,7 @@ class IndexReducedODE(AbstractScheme):
         converged = running & jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state)]))
         state = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), state)
         left = jnp.where(running, left, jnp.nan)
-        return state, memory, Stats(running.astype(jnp.int32), 0.0 * h, left, converged, jnp.nan * h)
+        return state, memory, Stats(running.astype(jnp.int32), 0.0 * h, left, converged, jnp.full_like(h, jnp.inf))
 
     def equations(self, system, node, previous, state):
         found: Inner = state.inner

@@ -54,7 +54,7 @@ class Pace(NamedTuple):
         where steps differ."""
         if self.h is None:
             return of_matrix
-        return renewed_where(jnp.asarray(made), by_mass, jnp.full_like(of_matrix, jnp.nan))
+        return renewed_where(jnp.asarray(made), by_mass, jnp.full_like(of_matrix, jnp.inf))
 
 
 class PastValues(NamedTuple):

@@ -145,7 +145,7 @@ def take_step(
         full=no,
         due=no,
         going=running,
-        margin=jnp.full((), jnp.nan, scale.dtype),
+        margin=jnp.full((), jnp.inf, scale.dtype),
     )
     made = True
     if matrix is None:
@@ -168,7 +168,7 @@ def take_step(
         increment=jnp.where(iterate.settled, jnp.minimum(iterate.increment, tolerance), iterate.increment),
         residual=iterate.residual,
         converged=converged,
-        margin=jnp.where(converged, iterate.margin, jnp.nan),
+        margin=jnp.where(converged, iterate.margin, jnp.inf),
     )
     guess = guess.after(previous, jnp.maximum(iterate.contraction, _FASTEST), weights, h)
     if matrix is not None:

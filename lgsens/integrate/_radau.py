@@ -175,7 +175,7 @@ class RadauIIA(AbstractScheme):
         state = State(q, v[-1], vdot, lam, vdot, found)
         converged = running & finite(state) & (size <= tolerance)
         state = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), state)
-        return state, memory, Stats(jnp.where(running, count, 0), size, rest, converged, jnp.nan * node.h)
+        return state, memory, Stats(jnp.where(running, count, 0), size, rest, converged, jnp.full_like(node.h, jnp.inf))
 
     def equations(self, system, node, previous, state):
         x, v = _advanced(node, previous, state.inner)

@@ -31,8 +31,8 @@ class Stats(NamedTuple):
         increment: the last increment of each step, relative as in `GeneralizedAlpha.tolerance`, shape (n,).
         residual: the largest entry of the residual r before that increment [N or N m], shape (n,).
         converged: whether each step converged, shape (n,), bool.
-        margin: how far the step is from a singular configuration (`_singular`), NaN where that was not looked at,
-            shape (n,).
+        margin: how far the step is from a singular configuration (`_singular`), infinite where that was not looked at
+            and without joints, shape (n,).
     """
 
     iterations: Int[Array, " n"]
@@ -45,7 +45,7 @@ class Stats(NamedTuple):
     def none(cls, like) -> "Stats":
         """Of no step, with floats like one given."""
         zero = jnp.zeros_like(like)
-        return cls(jnp.zeros((), jnp.int32), zero, zero, jnp.ones((), bool), jnp.full_like(like, jnp.nan))
+        return cls(jnp.zeros((), jnp.int32), zero, zero, jnp.ones((), bool), jnp.full_like(like, jnp.inf))
 
 
 class Start(NamedTuple):
@@ -279,7 +279,7 @@ class AbstractScheme(AbstractIntegrator):
         state, size, left, count, _ = while_loop(lambda carry: carry[-1], corrected, first)
         converged = running & finite(state) & (size <= tolerance)
         state = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), state)
-        return state, memory, Stats(jnp.where(running, count, 0), size, left, converged, jnp.nan * node.h)
+        return state, memory, Stats(jnp.where(running, count, 0), size, left, converged, jnp.full_like(node.h, jnp.inf))
 
     # Sensitivities.
 

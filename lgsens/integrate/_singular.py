@@ -68,7 +68,13 @@ class Watch(NamedTuple):
 
 
 def singular_steps(margins: Float[Array, " n"]):
-    """For each step whether a singular configuration is passed in it or in the next; margins not known are NaN."""
-    before = jnp.concatenate([jnp.full(1, jnp.nan, margins.dtype), margins[:-1]])
-    largest = jnp.nanmax(margins)
-    return (2.0 * margins <= before) & (margins <= _SMALL * largest) & jnp.isfinite(margins)  # infinite without joints
+    """For each step whether a singular configuration is passed in it or in the next; margins not known are infinite.
+
+    Not NaN: under `jax_debug_nans` that would be an error in every run.
+    """
+    before = jnp.concatenate([jnp.full(1, jnp.inf, margins.dtype), margins[:-1]])
+    known, largest = (
+        jnp.isfinite(margins) & jnp.isfinite(before),
+        jnp.max(margins, where=jnp.isfinite(margins), initial=0.0),
+    )
+    return (2.0 * margins <= before) & (margins <= _SMALL * largest) & known

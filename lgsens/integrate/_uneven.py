@@ -256,7 +256,7 @@ def _controlled_steps(
             return others._replace(done=done.where(trial.trying, trial.done))
 
         none = jnp.zeros((), jnp.int32)
-        stats = Stats(none, h * 0.0, h * 0.0, progress.running, jnp.nan * h)
+        stats = Stats(none, h * 0.0, h * 0.0, progress.running, jnp.full_like(h, jnp.inf))
         trial = while_loop(
             lambda trial: in_any_lane(trial.trying), attempt, _Trial(wanted, progress, stats, h * 0.0, none, active)
         )

@@ -7,7 +7,7 @@ Before any discretization, with ẇ = v' − ad(v) w and v̇' = ẅ + ad(v) ẇ 
 
 linear equations on a linear space, integrated by generalized-α with the numbers of the nominal scheme. The brackets
 ad(v), ad(v̇) are what the Lie group adds. The solution is not the derivative of the numerical trajectory (that is §6.2,
-`_direct.py`) but converges to the same limit, at second order.
+`_sweeps.py`) but converges to the same limit, at second order.
 
 The derivative of the initial state gives w_0, v'_0, v̇'_0, λ'_0 and, through a'_0, ẅ at t0 + (α_m − α_f) h. v_0 has been
 moved off B v = 0 by O(h²) for the nominal scheme (`GeneralizedAlpha.second_order_start`); ẇ_0 must solve its own hidden

@@ -9,8 +9,8 @@ system and of the grid. Row 0 of L is δ_0 = b_0, those of a step are its equati
 and the last row is p' = b.p. A step of size 0 has the equations δ_{n+1} − δ_n = b. L is block lower bidiagonal with a
 border for p. A derivative has b_0 and b.p only (all other rows zero); derivatives of derivatives fill the other rows.
 
-Forward substitution with L is the direct differentiation method (`_direct.py`), back substitution with Lᵀ the
-discrete adjoint variable method (`_adjoint.py`). Both solve with the exact iteration matrix of eq. (30).
+Forward substitution with L is the direct differentiation method , back substitution with Lᵀ the
+discrete adjoint variable method (`_sweeps.py`). Both solve with the exact iteration matrix of eq. (30).
 """
 
 from typing import Any, NamedTuple

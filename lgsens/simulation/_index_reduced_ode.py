@@ -85,7 +85,7 @@ def integrate_ode(settings: IndexReducedODE, system: AbstractSystem, grid: Equal
         converged = running & finished & finite
         end = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), end)
         steps = jnp.where(running, steps, 0).astype(jnp.int32)
-        return (end, converged), (end, Stats(steps, 0.0 * h, left, converged, jnp.nan * h))
+        return (end, converged), (end, Stats(steps, 0.0 * h, left, converged, jnp.full_like(h, jnp.inf)))
 
     count = jnp.arange(grid.num_steps, dtype=h.dtype)
     later, stats = scan(step, (first, jnp.ones((), bool)), count)[1]

@@ -237,3 +237,12 @@ def test_quarter_car_settles_on_a_spring_of_another_rate(car, design):
     # Differences over 1e-4 of k err by 1e-8/6 of k³ d³z/dk³, a few times k dz/dk, and by round-off
     # 1e-14/1e-4 of it.
     assert abs(float(rate / difference) - 1.0) < 1e-7
+
+
+@pytest.mark.parametrize("aside", [0.01, 3.0])
+def test_pendulum_comes_to_hang(aside):
+    """Its stiffness is that of the joint's force, which the first iteration does not know: (0, 0, −√(1 + a²))."""
+    body = lg.RigidBody(1.0, (0.1, 0.1, 0.1), position=(aside, 0.0, -1.0))
+    hinge = lg.RevoluteJoint(None, "bob", at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+    state = lg.equilibrium(lg.Model({"bob": body}, {"hinge": hinge}, {"gravity": lg.Gravity(GRAVITY)}))
+    close(state.q.position[0], [0.0, 0.0, -np.hypot(1.0, aside)], 32, scale=np.hypot(1.0, aside))
