@@ -1,6 +1,7 @@
 """Design of an axle: its numbers by the keys of its file, half of it over the bump, and bands on what the rig says."""
 
 import dataclasses
+import json
 import tomllib
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 
 import lgsens as lg
+from lgsens.cli import main
+from lgsens.cli._optimize_axle import _si
 from lgsens.examples import Axle, AxleNumbers
 from lgsens.examples._axle_numbers import places
 from lgsens.rigs import AxleDesign
@@ -65,6 +68,55 @@ def test_chosen_numbers_are_replaced_on_both_sides_and_no_others():
 def test_bad_input(vary, keep, message):
     with pytest.raises(ValueError, match=message):
         AxleDesign.of(AXLE, vary, keep)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--keep", "toe=0.1"], "--keep is of an axle, with --vary"),
+        (["--vary", "spring.stiffness=0.3", "--keep-toe", "0.1"], "--keep-toe is of a corner; of an axle"),
+        (["--vary", "spring.stiffnes=0.3"], "'spring.stiffnes' matches no number of the axle"),
+        (["--vary", "spring.stiffness=0.3", "--keep", "tow=0.1"], "'tow'"),
+        (["--vary", "spring.stiffness"], "must be NAME=NUMBER or NAME=LOWER:UPPER, got 'spring.stiffness'"),
+        (["--vary", "spring.stiffness=1:2:3"], "must be NAME=NUMBER or NAME=LOWER:UPPER"),
+        (["--vary", "spring.stiffness=nan"], "must be NAME=NUMBER or NAME=LOWER:UPPER"),
+    ],
+)
+def test_bad_arguments_of_the_command(arguments, message, tmp_path, capsys):
+    try:
+        status = main(["optimize", "multi_link", "--out", str(tmp_path / "new"), *arguments])
+    except SystemExit as stop:  # argparse's way out
+        status = stop.code
+    assert status == 2 and message in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_units_of_the_command():
+    """As `lgsens kc` shows them: degrees, °/kN, and roll camber in % with the other sign: bounds change places."""
+    assert _si("toe", 0.1) == pytest.approx(np.radians(0.1), rel=1e-14)
+    assert _si("lateral_steer", (-0.02, 0.01)) == pytest.approx(tuple(np.radians([-2e-5, 1e-5])), rel=1e-14)
+    assert _si("roll_camber", (80.0, 90.0)) == pytest.approx((-0.9, -0.8), rel=1e-14)
+
+
+@pytest.mark.slow  # the programs of a whole axle
+def test_the_command_designs_an_axle(tmp_path, capsys):
+    """Within its band, better than at the start, and the same numbers as the search in Python."""
+    out, asked = tmp_path / "new", ["--t1", "0.2", "--dt", "2e-3", "--steps", "30", "--quiet"]
+    vary = {"spring.stiffness": 0.3, "damper.damping": 0.3}
+    free = [word for name, width in vary.items() for word in ("--vary", f"{name}={width}")]
+    status = main(["optimize", "multi_link", "--out", str(out), *asked, *free, "--keep", "wheel_rate=1.0"])
+    found = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    assert status == 0 and found["feasible"] and found["objective"]["reduction"] > 0
+    (kept,) = found["constraints"]
+    assert kept["unit"] == "N/mm" and abs(kept["after"]["worst_value"]) <= 1.0 * (
+        1 + 1e-3
+    )  # the tolerance of the search
+    design = AxleDesign.of(AXLE, vary, {"wheel_rate": 1e3}, t1=0.2, num_steps=100)
+    assert found["design"]["rates"]["before"]["spring.stiffness"] == pytest.approx(float(AXLE.left.spring.rate))
+    x = {"rates": jnp.asarray([found["design"]["rates"]["after"][name] for name in design.numbers.names["rates"]])}
+    objective, _ = jax.jit(lambda x: design(x))(x)
+    assert float(objective) == pytest.approx(found["objective"]["after"], rel=1e-9)  # round-off of accelerations
+    assert {path.name for path in out.iterdir()} == {"convergence.png", "mechanism.png", "response.png", "result.json"}
 
 
 @pytest.mark.slow  # two large scenes

@@ -273,7 +273,7 @@ def test_an_interrupt_before_there_is_anything(tmp_path, capsys, monkeypatch):
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_optimize, "_optimize", stop)
+    monkeypatch.setattr(_optimize, "search", stop)
     status, _, said = run(capsys, "optimize", "quarter-car", *QUICK, "--out", tmp_path / "new")
     assert status == 130 and "interrupted before anything was found" in said
     assert not (tmp_path / "new").exists()

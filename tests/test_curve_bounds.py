@@ -2,6 +2,7 @@
 
 import csv
 import json
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -11,7 +12,7 @@ import pytest
 
 from lgsens import plotting
 from lgsens.cli._main import main
-from lgsens.cli._report import kept_curves
+from lgsens.cli._optimize_quarter_car import Outcome
 from lgsens.examples import CurveBounds, QuarterCar, SuspensionDesign
 
 CAMBER, TOE = np.radians(0.3), np.radians(0.1)
@@ -71,15 +72,15 @@ def test_the_report_says_how_far_they_stray(car, bounds):
     design = SuspensionDesign.load(parameters="hardpoints", keep=bounds)
     points = design.start["hardpoints"].at[0, 2].add(0.004)
     x = {"hardpoints": points}
-    outcome = type("Outcome", (), {"design": design, "result": type("Result", (), {"x": x})})
-    camber, toe = kept_curves(outcome, 1e-3)
+    found = SimpleNamespace(result=SimpleNamespace(x=x))
+    camber, toe = Outcome(design, found).kept_curves()
     assert (camber["name"], toe["name"]) == ("change of camber", "change of toe")
     expected = np.asarray(bounds.curves(design.with_design(x)).toe - bounds.curves(car).toe)
     worst = np.argmax(np.abs(expected))
     assert toe["after"]["worst_value"] == pytest.approx(expected[worst], abs=1e-12)
     assert toe["after"]["violation_over_scale"] == pytest.approx(abs(expected[worst]) / TOE - 1, abs=1e-9)
     assert toe["before"]["violation_over_scale"] == pytest.approx(-1, abs=1e-9)
-    assert kept_curves(type("Outcome", (), {"design": SuspensionDesign.load()}), 1e-3) == []
+    assert Outcome(SuspensionDesign.load(), found).kept_curves() == []
 
 
 @pytest.mark.parametrize(

@@ -71,6 +71,18 @@ def _count(text: str) -> int:
     return value
 
 
+def _named(text: str) -> tuple[str, float | tuple[float, float]]:
+    """NAME=NUMBER or NAME=LOWER:UPPER."""
+    name, _, bound = text.rpartition("=")
+    try:
+        low, *more = (float(end) for end in bound.split(":"))
+    except ValueError:
+        low, more = math.nan, []
+    if not name or len(more) > 1 or not all(map(math.isfinite, (low, *more))):
+        raise argparse.ArgumentTypeError(f"must be NAME=NUMBER or NAME=LOWER:UPPER, got {text!r}")
+    return name, (low, more[0]) if more else low
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser("lgsens", description="Differentiable constrained multibody dynamics on Lie groups in JAX.")
     parser.add_argument("--version", action="version", version=f"lgsens {version()}")
@@ -92,6 +104,16 @@ def _parser() -> argparse.ArgumentParser:
         "what to change: stiffness k and damping c, chassis hardpoints, or all",
         choices=list(PARAMETERS),
     )
+    free = (
+        "of an axle: numbers that are free, by keys of its file, and how far: points either way [m], rates by a share"
+    )
+    free += " of their value, or either between LOWER:UPPER; as often as needed"
+    optimize.add_argument("--vary", type=_named, action="append", metavar="PATTERN=WIDTH", help=free)
+    kept = (
+        "of an axle: its toe or camber curve [degree], or a characteristic that `lgsens kc` shows, in its unit, that "
+    )
+    kept += "stays within a width of its start, or between LOWER:UPPER; as often as needed"
+    optimize.add_argument("--keep", type=_named, action="append", metavar="NAME=WIDTH", help=kept)
     optimize.option("--t1", 2.0, "duration [s]", type=_positive)
     optimize.option("--dt", 2e-3, "step size [s]", type=_positive)
     optimize.option("--steps", 300, "most gradients that the optimizer takes", type=_count)

@@ -95,6 +95,11 @@ class AxleDesign(eqx.Module):
         """The numbers of the axle as it is."""
         return self.numbers.of(self.axle)
 
+    @property
+    def bounds(self) -> tuple[Design, Design]:
+        """The least and the greatest numbers."""
+        return self.numbers.lower, self.numbers.upper
+
     def with_design(self, x: Design) -> Axle:
         """The axle with other numbers."""
         return self.numbers.replaced(self.axle, x)
@@ -108,12 +113,16 @@ class AxleDesign(eqx.Module):
         """The run of the left half over the bump."""
         return simulate(self.with_design(x).half(), t1=self.t1, num_steps=self.num_steps, throw=throw)
 
+    def outputs(self, x: Design) -> dict[str, Float[Array, " n"]]:
+        """What is kept in bands, SI units; NaN where the rig finds no equilibrium."""
+        return _outputs(self.test(x, throw=False), self.bands)
+
     def objective(self, trajectory: Trajectory) -> Float[Array, ""]:
         """∫ z̈² dt of the chassis."""
         return time_integral(trajectory.t, trajectory.body("chassis").acceleration[:, 2] ** 2)
 
     def __call__(self, x: Design) -> tuple[Float[Array, ""], Float[Array, " m"]]:
-        found = _outputs(self.test(x, throw=False), self.bands)
+        found = self.outputs(x)
         rows = [band.constraints(found[name]) for name, band in self.bands.items()]
         return self.objective(self.bump(x, throw=False)), jnp.concatenate([jnp.zeros(0, self.t1.dtype), *rows])
 

@@ -1,0 +1,123 @@
+"""The axle of `lgsens optimize FILE --vary … --keep …`: designed to bands of what the rig says, over the bump."""
+
+import argparse
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from lgsens import plotting
+from lgsens.cli._report import suspension_file
+from lgsens.cli._search import Search, band_row, closing_rows, point_row, run_length, stages, table_lines
+from lgsens.examples import Axle
+from lgsens.rigs import CHARACTERISTICS, AxleDesign
+
+DEGREE = float(np.degrees(1.0))
+
+
+class Response(NamedTuple):
+    """What is said of a design: the run over the bump, Ψ₀ [m²/s³], and by name what is kept, SI units."""
+
+    t: Float[Array, " n"]
+    acceleration: Float[Array, " n"]
+    objective: Float[Array, ""]
+    kept: dict[str, Float[Array, " m"]]
+
+
+class AxleJob(NamedTuple):
+    """The problem."""
+
+    problem: AxleDesign
+
+    @staticmethod
+    def of(arguments: argparse.Namespace) -> "AxleJob":
+        """The problem that the arguments ask for."""
+        for name in ("camber", "toe"):
+            if getattr(arguments, f"keep_{name}"):
+                raise ValueError(f"--keep-{name} is of a corner; of an axle, with --vary, it is --keep {name}=DEG")
+        keep = {name: _si(name, bound) for name, bound in arguments.keep or ()}
+        settings = {"travel": arguments.travel} | run_length(arguments)
+        return AxleJob(AxleDesign.of(Axle.load(suspension_file(arguments)), dict(arguments.vary), keep, **settings))
+
+    def criteria(self, x):
+        """The response of a design, and the result of its simulation."""
+        run = self.problem.bump(x, throw=False)
+        acceleration = run.body("chassis").acceleration[:, 2]
+        return Response(run.t, acceleration, self.problem.objective(run), self.problem.outputs(x)), run.result
+
+    @property
+    def scale(self) -> dict[str, Any]:
+        """Half of what is between the bounds is a large change of the design."""
+        lower, upper = self.problem.bounds
+        return {kind: (upper[kind] - lower[kind]) / 2 for kind in lower}
+
+    def outcome(self, found: Search) -> "Outcome":
+        """What was found."""
+        return Outcome(self.problem, found)
+
+
+class Outcome(NamedTuple):
+    """What report and figures are made of."""
+
+    problem: AxleDesign
+    search: Search
+
+    def document(self) -> dict[str, Any]:
+        """What is particular to the axle, as JSON: SI units, what is kept in the units shown."""
+        names = self.problem.numbers.names
+        return {
+            "problem": "axle",
+            "suspension": self.problem.axle.name,
+            "design": {
+                kind: {label: dict(zip(names[kind], np.asarray(x[kind]).tolist())) for label, x in stages(self.search)}
+                for kind in names
+            },
+            "constraints": [
+                band_row(name, band, {label: end.kept[name] for label, end in self._ends.items()}, unit, factor)
+                for name, band in self.problem.bands.items()
+                for factor, unit in [_shown(name)]
+            ],
+        }
+
+    @property
+    def _ends(self) -> dict[str, Response]:
+        return {"before": self.search.before, "after": self.search.after}
+
+    def figures(self) -> dict[str, Any]:
+        """The chassis over the bump, and both mechanisms."""
+        series = {label: end.acceleration for label, end in self._ends.items()}
+        panels = [plotting.Panel("chassis acceleration\n[m/s²]", series, {})]
+        title = f"Axle over a bump: {self.search.change}"
+        axles = {"before": self.problem.axle, "after": self.problem.with_design(self.search.result.x)}
+        models = {label: axle.model(links="rods") for label, axle in axles.items()}
+        axes = ("x, forward", "y, left", "z, up")
+        return {
+            "response": plotting.time_histories(self.search.before.t, panels, title),
+            "mechanism": plotting.mechanism(models, title=self.problem.axle.name, axes_names=axes),
+        }
+
+    def table(self, found: dict[str, Any]) -> list[str]:
+        """The design, the objective, what is kept and the gradient check of a document, before and after."""
+        rows = []
+        for kind, design in found["design"].items():
+            for name in design["before"]:
+                before, after, lower, upper = (design[label][name] for label in ("before", "after", "lower", "upper"))
+                if kind == "hardpoints":
+                    rows.append(point_row(name, *(1e3 * end for end in (before, after, lower, upper))))
+                else:
+                    rows.append((name, before, after, f"{lower:.6g} .. {upper:.6g}", 3 if before < 1e3 else 0))
+        return table_lines(found, rows + closing_rows(found))
+
+
+def _shown(name: str) -> tuple[float, str]:
+    """Factor and unit in which what is kept is shown."""
+    return CHARACTERISTICS[name].shown if name in CHARACTERISTICS else (DEGREE, "deg")
+
+
+def _si(name: str, bound: float | tuple[float, float]) -> float | tuple[float, float]:
+    """A width, or two bounds, from the unit shown; where that has another sign the bounds change places."""
+    factor, _ = _shown(name)
+    if not isinstance(bound, tuple):
+        return bound / abs(factor)
+    low, high = sorted(end / factor for end in bound) if bound[0] < bound[1] else bound
+    return low, high
