@@ -21,6 +21,10 @@ def _dual(mv, x, y):
     return jnp.concatenate([translation, rotation])
 
 
+def _exchanged(z):
+    return jnp.concatenate([z[3:], z[:3]])
+
+
 class SE3(AbstractLieGroup):
     """The group of rigid motions SE(3), `k = 6`: an element is a `Pose`, and `p q` is the pose q in the frame of p.
 
@@ -81,11 +85,14 @@ class SE3(AbstractLieGroup):
 
     def tangent_rmv(self, x, y):
         # [[A, B], [0, A]]ᵀ [f, m] = [Aᵀ f, Bᵀ f + Aᵀ m]: the dual covector is f + ε m.
-        exchanged = lambda z: jnp.concatenate([z[3:], z[:3]])
-        return exchanged(_dual(_ROTATION.tangent_rmv, x, exchanged(y)))
+        return _exchanged(_dual(_ROTATION.tangent_rmv, x, _exchanged(y)))
 
     def tangent_inv_mv(self, x, y):
         return _dual(_ROTATION.tangent_inv_mv, x, y)
+
+    def tangent_inv_rmv(self, x, y):
+        """`T(x)^{-T} y`, the transpose of `tangent_inv_mv`. `y`: a covector, shape (6,)."""
+        return _exchanged(_dual(lambda w, y: _ROTATION.tangent_inv_mv(-w, y), x, _exchanged(y)))
 
     def to_ambient(self, q, w):
         return Pose(turn(q.orientation, w[:3]), _ROTATION.to_ambient(q.orientation, w[3:]))

@@ -1,5 +1,8 @@
 """Rigid bodies, joints and forces: one implementation of the abstract system (paper, §3 and §9)."""
 
+from lgsens.model._beam_load import SectionState as SectionState
+from lgsens.model._beam_sections import BeamSection as BeamSection
+from lgsens.model._beams import Beam as Beam, BeamElement as BeamElement
 from lgsens.model._body import RigidBody as RigidBody, lumped as lumped
 from lgsens.model._bushing import Bushing as Bushing
 from lgsens.model._checks import invalid_numbers as invalid_numbers

@@ -1,0 +1,141 @@
+"""Cross-sections of beams: stiffness and mass per length, from shape and material or given.
+
+A section has axis 1 along the beam, 2 and 3 across it, principal of area here. With strains ε = [ε₁, γ₂, γ₃], stretch
+and shears, and κ = [κ₁, κ₂, κ₃], twist and bendings per length [1/m], forces and moments are linear in them,
+
+    [N, Q₂, Q₃, M₁, M₂, M₃] = K [ε, κ],     K = diag(E A, k₂ G A, k₃ G A, G J, E I₂, E I₃),     G = E / 2(1 + ν).
+
+Shear coefficients k: Cowper (1966), J. Appl. Mech. 33, 335, table 1. Torsion constants J: Timoshenko & Goodier (1970),
+Theory of Elasticity, §109.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lgsens._validate import as_float, require
+
+_ODD = np.arange(1.0, 11.0, 2.0)  # 2/(exp(nπ) + 1) is 5e-14 of the first at n = 9
+_SUM = 1.0045237627951382  # Σ n⁻⁵ of odd n, 31 ζ(5)/32
+
+
+class BeamSection(eqx.Module):
+    """A cross-section of a beam.
+
+    Arguments:
+        stiffness: K of strains [ε₁, γ₂, γ₃, κ₁, κ₂, κ₃], its diagonal E A, k₂ G A, k₃ G A [N], G J, E I₂, E I₃ [N m²],
+            shape (6,), or all of it, shape (6, 6), symmetric and positive.
+        mass: per length [kg/m], shape (), positive.
+        inertia: moments of inertia per length about the axes 1, 2, 3 [kg m], shape (3,), positive.
+        damping: η [s], shape (): forces and moments are K (ε + η ε̇), damping proportional to stiffness.
+
+    Raises `ValueError` for wrong shapes, and numbers that are not positive or, of the damping, negative.
+    """
+
+    stiffness: Float[Array, "6"] | Float[Array, "6 6"]
+    mass: Float[Array, ""]
+    inertia: Float[Array, "3"]
+    damping: Float[Array, ""]
+
+    def __init__(self, stiffness, mass, inertia, damping=0.0):
+        self.stiffness = as_float(stiffness, None, "BeamSection: `stiffness`")
+        if self.stiffness.shape not in ((6,), (6, 6)):
+            raise ValueError(f"BeamSection: `stiffness` must have shape (6,) or (6, 6), got {self.stiffness.shape}.")
+        self.mass = as_float(mass, (), "BeamSection: `mass`")
+        self.inertia = as_float(inertia, (3,), "BeamSection: `inertia`")
+        self.damping = as_float(damping, (), "BeamSection: `damping`")
+        for name, value in (("mass", self.mass), ("inertia", self.inertia)):
+            require(lambda value: np.all(value > 0), f"BeamSection: `{name}` must be positive, got {value}.", value)
+        require(
+            lambda value: value >= 0, f"BeamSection: `damping` must not be negative, got {self.damping}.", self.damping
+        )
+        require(
+            lambda K: np.all(np.linalg.eigvalsh(np.diag(K) if K.ndim == 1 else K) > 0),
+            f"BeamSection: `stiffness` {self.stiffness} must be positive; what does not bend is a RigidBody.",
+            self.stiffness,
+        )
+
+    @property
+    def matrix(self) -> Float[Array, "6 6"]:
+        """K."""
+        return jnp.diag(self.stiffness) if self.stiffness.ndim == 1 else self.stiffness
+
+    @staticmethod
+    def round(diameter, *, young, poisson, density, damping=0.0) -> "BeamSection":
+        """A round bar.
+
+        Arguments:
+            diameter: [m], shape ().
+            young, poisson, density: E [N/m²], ν [–], ρ [kg/m³] of the material, shape ().
+            damping: η [s], shape ().
+
+        Raises `ValueError` for numbers that are not positive, and ν outside of −1 to ½.
+        """
+        return BeamSection.tube(diameter, None, young=young, poisson=poisson, density=density, damping=damping)
+
+    @staticmethod
+    def tube(diameter, thickness, *, young, poisson, density, damping=0.0) -> "BeamSection":
+        """A round tube.
+
+        Arguments:
+            diameter: outer diameter [m], shape ().
+            thickness: of the wall [m], shape (), up to half the diameter; None: a bar.
+            young, poisson, density, damping: as of `round`.
+
+        Raises `ValueError` as `round`, and for a wall that is thicker than the radius.
+        """
+        (outer,) = _positive("BeamSection", diameter=diameter)
+        inner = 0.0 * outer
+        if thickness is not None:
+            (wall,) = _positive("BeamSection", thickness=thickness)
+            inner = outer - 2.0 * wall
+            require(lambda inner: inner >= 0, "BeamSection: `thickness` is more than the radius; take `round`.", inner)
+        ratio = (inner / outer) ** 2
+        area = jnp.pi / 4.0 * (outer**2 - inner**2)
+        second = jnp.pi / 64.0 * (outer**4 - inner**4)
+        nu = as_float(poisson, (), "BeamSection: `poisson`")
+        shear = 6.0 * (1.0 + nu) * (1.0 + ratio) ** 2
+        shear = shear / ((7.0 + 6.0 * nu) * (1.0 + ratio) ** 2 + (20.0 + 12.0 * nu) * ratio)
+        return _of_shape(area, second, second, 2.0 * second, (shear, shear), young, nu, density, damping)
+
+    @staticmethod
+    def rectangle(width, height, *, young, poisson, density, damping=0.0) -> "BeamSection":
+        """A rectangle.
+
+        Arguments:
+            width, height: along the axes 2 and 3 [m], shape ().
+            young, poisson, density, damping: as of `round`.
+
+        Raises `ValueError` as `round`.
+        """
+        w, h = _positive("BeamSection", width=width, height=height)
+        nu = as_float(poisson, (), "BeamSection: `poisson`")
+        shear = 10.0 * (1.0 + nu) / (12.0 + 11.0 * nu)
+        # J = a b³/3 (1 − 192/π⁵ (b/a) Σ tanh(nπa/2b)/n⁵), n odd, b ≤ a; tanh = 1 − 2/(exp(nπa/b) + 1).
+        short, long = jnp.minimum(w, h), jnp.maximum(w, h)
+        odd = jnp.asarray(_ODD, w.dtype)
+        series = _SUM - jnp.sum(2.0 / (jnp.exp(odd * jnp.pi * long / short) + 1.0) / odd**5)
+        torsion = long * short**3 / 3.0 * (1.0 - 192.0 / jnp.pi**5 * short / long * series)
+        return _of_shape(w * h, w * h**3 / 12.0, h * w**3 / 12.0, torsion, (shear, shear), young, nu, density, damping)
+
+
+def _positive(what: str, **numbers) -> list[Float[Array, ""]]:
+    found = []
+    for name, number in numbers.items():
+        value = as_float(number, (), f"{what}: `{name}`")
+        require(lambda value: value > 0, f"{what}: `{name}` must be positive, got {value}.", value)
+        found.append(value)
+    return found
+
+
+def _of_shape(area, second, third, torsion, shear, young, poisson, density, damping) -> BeamSection:
+    """I₂ and I₃ are `second` and `third`."""
+    E, rho = _positive("BeamSection", young=young, density=density)
+    require(
+        lambda nu: -1 < nu <= 0.5, f"BeamSection: `poisson` must be above -1 and at most 0.5, got {poisson}.", poisson
+    )
+    G = E / (2.0 * (1.0 + poisson))
+    k2, k3 = shear
+    stiffness = jnp.stack([E * area, k2 * G * area, k3 * G * area, G * torsion, E * second, E * third])
+    return BeamSection(stiffness, rho * area, rho * jnp.stack([second + third, second, third]), damping)

@@ -1,0 +1,162 @@
+"""Flexible beams: nodes that are bodies, and elements between them that are forces."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lgsens._validate import as_count, as_float, point_field, require
+from lgsens.liegroups import cross
+from lgsens.model._beam_load import element
+from lgsens.model._beam_sections import BeamSection
+from lgsens.model._body import RigidBody
+from lgsens.model._forces import AbstractForce, Attached, _frame
+
+
+class BeamElement(AbstractForce):
+    """An element of a geometrically exact beam between a section of a and one of b: straight, curved or twisted.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at_a, at_b: centroids of the end sections in the reference configuration [m], inertial frame, shape (3,).
+        axes_a, axes_b: their axes as columns, the first along the beam, inertial frame, shape (3, 3), rotations.
+        section: what is between them.
+
+    Strains are zero in the reference configuration; the element is massless (`Beam` has nodes with mass). It may be of
+    any size and turn and move as it likes; section b turns by less than π in section a. `Trajectory.force(name)` is a
+    `SectionState`. Raises `ValueError` for wrong shapes and sections at the same point. Source: `_beam_load`.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at_a: Float[Array, "3"] = point_field("at_a")
+    at_b: Float[Array, "3"] = point_field("at_b")
+    axes_a: Float[Array, "3 3"] = eqx.field(converter=lambda axes: as_float(axes, (3, 3), "`axes_a`"))
+    axes_b: Float[Array, "3 3"] = eqx.field(converter=lambda axes: as_float(axes, (3, 3), "`axes_b`"))
+    section: BeamSection
+
+    def __check_init__(self):
+        if not isinstance(self.section, BeamSection):
+            raise ValueError(f"BeamElement: `section` must be a BeamSection, got {self.section!r}.")
+        require(
+            lambda length: length > 0,
+            f"BeamElement: `at_a` and `at_b` are the same point, {self.at_a}; an element has a length.",
+            jnp.linalg.norm(self.at_b - self.at_a),
+        )
+
+    @property
+    def bodies(self):
+        return (self.a, self.b)
+
+    def loads(self, bodies):
+        a, b = (_frame(bodies, name, self.at_a.dtype) for name in (self.a, self.b))
+        sections = (self.at_a, self.at_b), (self.axes_a, self.axes_b)
+        return (Attached(element(a, b, *sections, self.section.matrix, self.section.damping), self.a, self.b),)
+
+
+class Beam(eqx.Module):
+    """A flexible beam: bodies at its nodes, and elements between them, for a `Model`.
+
+        link = Beam("link", section, [[0, 0, 0], [1, 0, 0]], elements=8)
+        Model(bodies | link.bodies, joints, forces | link.forces)
+
+    The nodes "link.0" … "link.8" are bodies, whose frames have their origin on the axis and their first axis along it:
+    joints, forces and drivers take them by name, `Trajectory.body("link.8")` is the motion of the tip, and
+    `Trajectory.force("link.3")` the `SectionState` of the element from node 3 to node 4. A clamp is a `FixedJoint`,
+    which costs nothing with `merge_fixed`.
+
+    Arguments:
+        name: what its nodes and elements begin with, static.
+        section: a `BeamSection`, along all of it.
+        points: of its axis in the reference configuration [m], inertial frame, shape (m, 3): two ends, or, of a curved
+            beam, m > 2 nodes. Its tangent at a node is that of the circle through the node and its neighbours.
+        elements: of a straight beam, static; a curved one has m − 1.
+        up: a direction, inertial frame, shape (3,), in whose plane with the tangent axis 3 of the sections lies: of a
+            rectangle that of its height.
+
+    Each node carries half the mass of the elements beside it, and their sections' rotary inertia; all masses of the
+    scene are constant. Errors are O(1/elements²); for large rotations too, a beam bent to a circle by end moments is
+    exact with any number of elements. Raises `ValueError` for wrong shapes, points that coincide, and an `up` along the
+    beam. Source: Sonneville, Cardona & Brüls (2014), CMAME 268, 451.
+    """
+
+    name: str = eqx.field(static=True)
+    section: BeamSection
+    points: Float[Array, "n 3"]
+    axes: Float[Array, "n 3 3"]
+
+    def __init__(self, name: str, section: BeamSection, points, *, elements: int | None = None, up=(0.0, 0.0, 1.0)):
+        if not isinstance(section, BeamSection):
+            raise ValueError(f"Beam: `section` must be a BeamSection, got {section!r}.")
+        points, up = as_float(points, None, "Beam: `points`"), as_float(up, (3,), "Beam: `up`")
+        if points.ndim != 2 or points.shape[1] != 3 or points.shape[0] < 2:
+            raise ValueError(f"Beam: `points` must have shape (m, 3) with m of at least 2, got {points.shape}.")
+        if points.shape[0] > 2 and elements is not None:
+            raise ValueError("Beam: `elements` is for a straight beam, between two points; a curved one has m - 1.")
+        if points.shape[0] == 2:
+            count = as_count(1 if elements is None else elements, "elements", " (it is static)")
+            along = jnp.asarray(np.arange(count + 1)[:, None] / count, points.dtype)
+            points = points[:1] + along * (points[1:] - points[:1])
+        chords = points[1:] - points[:-1]
+        require(
+            lambda chords: np.all(np.linalg.norm(chords, axis=1) > 0),
+            f"Beam: `points` {points} has two after each other that coincide.",
+            chords,
+        )
+        axes = jax.vmap(lambda tangent: _triad(tangent, up))(_tangents(chords))
+        require(
+            lambda axes: np.all(np.isfinite(axes)) and np.all(np.abs(np.linalg.det(axes) - 1.0) < 1e-6),
+            f"Beam: `up` {up} lies along the beam; give a direction across it.",
+            axes,
+        )
+        self.name, self.section, self.points, self.axes = name, section, points, axes
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """The names of its bodies, in order."""
+        return tuple(f"{self.name}.{i}" for i in range(self.points.shape[0]))
+
+    @property
+    def forces(self) -> dict[str, BeamElement]:
+        """Its elements by name: that from node i to node i + 1 has the name of node i."""
+        sections = list(zip(self.nodes, self.points, self.axes))
+        return {
+            a: BeamElement(a, b, at_a, at_b, axes_a, axes_b, self.section)
+            for (a, at_a, axes_a), (b, at_b, axes_b) in zip(sections, sections[1:])
+        }
+
+    @property
+    def bodies(self) -> dict[str, RigidBody]:
+        """Its nodes by name."""
+        lengths = jnp.linalg.norm(self.points[1:] - self.points[:-1], axis=1)
+        none = jnp.zeros_like(lengths[:1])
+        carried = (jnp.concatenate([none, lengths]) + jnp.concatenate([lengths, none])) / 2.0
+        return {
+            node: RigidBody(
+                mass=carried[i] * self.section.mass,
+                inertia=carried[i] * self.section.inertia,
+                position=self.points[i],
+                orientation=self.axes[i],
+            )
+            for i, node in enumerate(self.nodes)
+        }
+
+
+def _tangents(chords: Float[Array, "n 3"]) -> Float[Array, "m 3"]:
+    """Unit tangents at nodes: with the circle through a node and its neighbours c₁/|c₁|² + c₂/|c₂|², and at an end,
+    where chord and both tangents are symmetric, 2 (ĉ·t) ĉ − t."""
+    unit = chords / jnp.linalg.norm(chords, axis=1, keepdims=True)
+    if chords.shape[0] == 1:
+        return jnp.concatenate([unit, unit])
+    slopes = chords / jnp.sum(chords**2, axis=1, keepdims=True)
+    inner = slopes[:-1] + slopes[1:]
+    inner = inner / jnp.linalg.norm(inner, axis=1, keepdims=True)
+    end = lambda c, t: 2.0 * jnp.sum(c * t) * c - t
+    return jnp.concatenate([end(unit[0], inner[0])[None], inner, end(unit[-1], inner[-1])[None]])
+
+
+def _triad(tangent: Float[Array, "3"], up: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    across = cross(up, tangent)
+    across = across / jnp.sqrt(jnp.sum(across**2))
+    return jnp.stack([tangent, across, cross(tangent, across)], axis=1)

@@ -1,0 +1,267 @@
+"""Beams: the element against its energy, statics against the rod's own equations and closed forms, motion, derivatives."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.linalg
+import scipy.optimize
+
+import lgsens as lg
+from lgsens.testing import check_force
+
+STEEL = {"young": 2.1e11, "poisson": 0.3, "density": 7850.0}
+UNIT = lg.BeamSection([3.0, 2.0, 2.5, 1.0, 1.5, 0.7], 1.0, [0.2, 0.1, 0.1], damping=0.05)
+LOADS = {"P": jnp.linspace(0.0, 1.0, 4)}
+
+
+def homogeneous(R, x):
+    H = jnp.zeros((4, 4)).at[3, 3].set(1.0)
+    return H.at[:3, :3].set(R).at[:3, 3].set(x)
+
+
+def potential(load, a, b, t):
+    """½ L εᵀK ε, with the logarithm of the 4×4 matrix of the motion by its power series in (H − I), summed by squaring:
+    log H = 2ᵏ log H^(1/2ᵏ), the root by Newton (Denman & Beavers)."""
+    ends = [
+        homogeneous(frame.orientation @ triad, frame.position + frame.orientation @ point)
+        for frame, point, triad in ((a, load.point_a, load.triad_a), (b, load.point_b, load.triad_b))
+    ]
+    H, eye = jnp.linalg.inv(ends[0]) @ ends[1], jnp.eye(4)
+    for _ in range(6):
+        root, other = H, eye
+        for _ in range(12):
+            root, other = (root + jnp.linalg.inv(other)) / 2, (other + jnp.linalg.inv(root)) / 2
+        H = root
+    X, power, D = H - eye, H - eye, jnp.zeros((4, 4))
+    for n in range(1, 13):  # |X| is at most π/64 and the translation's: X¹³ is round-off
+        D, power = D - (-1.0) ** n / n * power, power @ X
+    D = 64.0 * D
+    d = jnp.stack([D[0, 3], D[1, 3], D[2, 3], D[2, 1], D[0, 2], D[1, 0]])
+    strain = (d - load.reference) / load.length
+    return 0.5 * load.length * strain @ load.stiffness @ strain
+
+
+def test_element_is_the_gradient_of_its_energy():
+    """Also tangents, action and reaction, damping that takes energy, and derivatives by every number."""
+    rotation = lambda w: lg.liegroups.SO3().exp(jnp.asarray(w))
+    bodies = {
+        "a": lg.RigidBody(1.0, (1.0, 1.0, 1.0), (0.1, 0.0, 0.2), rotation([0.3, -0.2, 0.1])),
+        "b": lg.RigidBody(1.0, (1.0, 1.0, 1.0), (0.9, 0.1, -0.1), rotation([-0.1, 0.4, 0.2])),
+    }
+    axes = rotation([0.1, 0.2, 0.0]), rotation([0.2, 0.1, 0.3])
+    element = lg.BeamElement("a", "b", [0.2, 0.1, 0.0], [1.1, 0.2, 0.1], *axes, UNIT)
+    report = check_force(element, potential=potential, bodies=bodies, length=0.3)
+    assert report.passed, report
+
+
+def tip(model, node):
+    return lg.statics(model, loads=LOADS, throw=False).body(node).position[-1]
+
+
+def cantilever(beam, force=(0.0, 0.0, 0.0), moment=(0.0, 0.0, 0.0)):
+    end = beam.nodes[-1]
+    load = lg.AppliedForce(end, at=beam.points[-1], force=force, moment=moment)
+    clamp = lg.FixedJoint(None, beam.nodes[0], at=beam.points[0])
+    return lg.Model(beam.bodies, {"clamp": clamp}, beam.forces | {"P": load}, merge_fixed=True)
+
+
+def test_bent_to_a_circle():
+    """M = 2π EI/L closes a straight beam: tip at the clamp, with two elements as with many, no shear that locks."""
+    bending, length = 86900.0, 10.0
+    section = lg.BeamSection([1e6, 1e6, 1e6, bending, bending, bending], 1.0, [1.0, 0.5, 0.5])
+    beam = lg.Beam("b", section, [[0, 0, 0], [length, 0, 0]], elements=4)
+    moment = 2 * np.pi * bending / length
+    # Half of it bends it to a half circle of diameter 2L/π. Newton ends below 1e-10 of a meter.
+    for factor, end in ((0.5, (0.0, 2 * length / np.pi, 0.0)), (1.0, (0.0, 0.0, 0.0))):
+        found = tip(cantilever(beam, moment=(0.0, 0.0, factor * moment)), "b.4")
+        np.testing.assert_allclose(found, end, rtol=0, atol=1e-9)
+
+
+def rod(section, force, length, bend=0.0):
+    """The tip by shooting on the equations of the rod: r′ = R (e₁ + K⁻¹ Rᵀn), R′ = R κ~, m′ = −r′ × n, with n = P all
+    along, κ = κ₀ + K⁻¹ Rᵀm, and m = 0 at the tip."""
+    K, initial = np.asarray(section.stiffness), np.array([0.0, 0.0, bend])
+
+    def slope(_, y):
+        R, m = y[3:12].reshape(3, 3), y[12:]
+        along = R @ (np.array([1.0, 0.0, 0.0]) + R.T @ force / K[:3])
+        k = initial + R.T @ m / K[3:]
+        turning = np.array([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]])
+        return np.concatenate([along, (R @ turning).ravel(), -np.cross(along, force)])
+
+    def end(moment):
+        y = np.concatenate([np.zeros(3), np.eye(3).ravel(), moment])
+        return scipy.integrate.solve_ivp(slope, (0.0, length), y, rtol=1e-10, atol=1e-12).y[:, -1]
+
+    guess = np.cross([length, 0.0, 0.0], force) / 2
+    found = scipy.optimize.root(lambda m: end(m)[12:], guess, tol=1e-11)
+    assert found.success
+    return end(found.x)[:3]
+
+
+PRINCETON = {"width": 3.2024e-3, "height": 12.3777e-3, "young": 71.7e9, "poisson": 0.31, "density": 2800.0}
+
+
+def princeton(elements, angle, force=8.896):
+    section = lg.BeamSection.rectangle(**PRINCETON)
+    beam = lg.Beam("b", section, [[0, 0, 0], [0.508, 0, 0]], elements=elements)
+    load = force * np.array([0.0, np.sin(angle), np.cos(angle)])
+    return beam, load
+
+
+@pytest.mark.slow  # programs of two statics
+def test_princeton_beam():
+    """Bent about both axes and twisted: order two against the rod's equations, and the published deflection."""
+    angle = np.radians(45.0)
+    found = {}
+    for elements in (4, 8):
+        beam, load = princeton(elements, angle)
+        found[elements] = np.asarray(tip(cantilever(beam, load), beam.nodes[-1]))
+    exact = rod(beam.section, load, 0.508)
+    errors = {elements: np.abs(end - exact).max() for elements, end in found.items()}
+    assert errors[8] < 3e-3 * np.abs(exact[1])
+    assert errors[4] / errors[8] == pytest.approx(4.0, abs=0.4)  # order 2, with the next term
+    extrapolated = (4 * found[8] - found[4]) / 3
+    assert abs(extrapolated[1]) == pytest.approx(0.1089879, rel=5e-3)  # Ansys, of another torsion constant
+
+
+@pytest.mark.slow  # programs of two statics
+def test_curved_cantilever():
+    """An eighth of a circle, clamped, loaded across its plane: 8 elements are ten times as good as of order one."""
+    section = lg.BeamSection([1e7, 5e6, 5e6, 7e5, 8.3e5, 8.3e5], 1.0, [0.2, 0.1, 0.1])
+    radius, angle, load = 100.0, np.pi / 4, np.array([0.0, 0.0, 300.0])
+    errors = []
+    for elements in (4, 8):
+        along = np.linspace(0.0, angle, elements + 1)
+        points = radius * np.stack([np.sin(along), 1 - np.cos(along), 0 * along], axis=1)
+        beam = lg.Beam("b", section, points)
+        exact = rod(section, load, radius * angle, bend=1 / radius)
+        errors.append(np.abs(np.asarray(tip(cantilever(beam, load), beam.nodes[-1])) - exact).max())
+    assert errors[0] / errors[1] == pytest.approx(4.0, abs=0.4)
+
+
+def frequencies(section, elements, length=1.0):
+    beam = lg.Beam("b", section, [[0, 0, 0], [length, 0, 0]], elements=elements)
+    clamp = lg.FixedJoint(None, "b.0", at=[0.0, 0.0, 0.0])
+    model = lg.Model(beam.bodies, {"clamp": clamp}, beam.forces, merge_fixed=True)
+    return lg.linearize(model, lg.initial_state(model)).frequencies
+
+
+def test_frequencies_of_a_cantilever():
+    """β₁² √(EI/ρA)/L² for bending (Euler–Bernoulli, for a section so slender), π/2 √(GJ/ρJ)/L for torsion, order two."""
+    section = lg.BeamSection([1e8, 1e8, 1e8, 1.0, 1.0, 4.0], 1.0, [1e-6, 1e-6, 1e-6])
+    expected = 1.8751040687**2 * np.array([1.0, 2.0])
+    errors = [np.abs(np.sort(np.abs(frequencies(section, n)))[[0, 1]] / expected - 1) for n in (4, 8)]
+    assert np.all(errors[1] < 0.01)
+    np.testing.assert_allclose(errors[0] / errors[1], 4.0, atol=0.4)  # order 2, with the next term
+
+
+def swinging(p):
+    section = lg.BeamSection.rectangle(
+        p["width"], p["height"], young=p["young"], poisson=p["poisson"], density=p["density"], damping=p["damping"]
+    )
+    points = p["points"]
+    beam = lg.Beam("b", section, points, up=p["up"])
+    joints = {"hinge": lg.RevoluteJoint(None, "b.0", at=points[0], axis=p["up"])}
+    return lg.Model(beam.bodies, joints, beam.forces | {"gravity": lg.Gravity((0.0, -9.81, -3.0))})
+
+
+NUMBERS = {
+    "width": jnp.asarray(0.02),
+    "height": jnp.asarray(0.03),
+    "young": jnp.asarray(5e6),
+    "poisson": jnp.asarray(0.4),
+    "density": jnp.asarray(1000.0),
+    "damping": jnp.asarray(1e-3),
+    "points": jnp.asarray([[0.0, 0.0, 0.0], [0.3, 0.05, 0.0], [0.6, 0.0, 0.02]]),
+    "up": jnp.asarray([0.1, 0.0, 1.0]),
+}
+
+
+def test_derivatives_of_a_swinging_beam():
+    """DDM, AVM and differences by shape, material, points and direction of a soft curved beam on a hinge."""
+
+    def end(p, sensitivity):
+        run = lg.simulate(swinging(p), t1=0.02, num_steps=10, sensitivity=sensitivity)
+        state = run.force("b.1")
+        return jnp.sum(run.body("b.2").position[-1]) + 1e-2 * jnp.sum(state.fibre_strain(0.01, 0.015))
+
+    adjoint = jax.jit(jax.grad(partial(end, sensitivity=lg.AdjointVariable())))(NUMBERS)
+    direct = jax.jit(jax.grad(partial(end, sensitivity=lg.DirectDifferentiation())))(NUMBERS)
+    value = jax.jit(partial(end, sensitivity=lg.DirectDifferentiation()))
+    rng = np.random.default_rng(0)
+    for name, number in NUMBERS.items():
+        scale = np.abs(np.asarray(direct[name])).max()
+        np.testing.assert_allclose(adjoint[name], direct[name], rtol=0, atol=1e-10 * scale)
+        along = jnp.asarray(rng.normal(size=number.shape)) * jnp.abs(number).max()
+        at = lambda s: value(NUMBERS | {name: number + s * along})
+        step = 1e-4  # of fourth order; the round-off of Newton 1e-11 over the step
+        difference = (8 * (at(step) - at(-step)) - (at(2 * step) - at(-2 * step))) / (12 * step)
+        size = scale * float(jnp.abs(along).max())
+        np.testing.assert_allclose(jnp.sum(direct[name] * along), difference, rtol=0, atol=1e-5 * size + 1e-7)
+
+
+def test_free_flight_keeps_momenta():
+    """A soft beam thrown: a rigid motion leaves strains at round-off, and forces between nodes move no centre of mass."""
+    beam = lg.Beam("b", UNIT, [[0, 0, 0], [2.0, 0, 0]], elements=3)
+    still = lg.Model(
+        {name: dataclasses.replace(body, velocity=jnp.asarray([1.0, 2.0, 3.0])) for name, body in beam.bodies.items()},
+        {},
+        beam.forces,
+    )
+    run = lg.simulate(still, t1=1.0, num_steps=20)
+    assert np.abs(run.force("b.1").strain).max() < 1e-13  # positions of 3 m to round-off
+    kicked = eqx_velocity(still, "b.3", jnp.asarray([0.0, 5.0, 1.0]))
+    run = lg.simulate(kicked, t1=1.0, num_steps=100)
+    masses = np.array([float(body.mass) for body in beam.bodies.values()])
+    momentum = sum(m * np.asarray(run.body(name).velocity) for m, name in zip(masses, beam.nodes))
+    assert np.abs(run.force("b.1").curvature).max() > 0.1
+    np.testing.assert_allclose(momentum, np.broadcast_to(momentum[0], momentum.shape), rtol=0, atol=1e-9)  # of Newton
+
+
+def eqx_velocity(model, name, velocity):
+    bodies = model.bodies | {name: dataclasses.replace(model.bodies[name], velocity=velocity)}
+    return lg.Model(bodies, model.joints, model.forces)
+
+
+def test_sections():
+    """A round bar is a tube of all its radius; the torsion of a square 0.1406 a⁴, of a strip a b³/3 (1 − 0.630 b/a)."""
+    bar = lg.BeamSection.round(0.02, **STEEL)
+    solid = lg.BeamSection.tube(0.02, 0.01, **STEEL)
+    np.testing.assert_allclose(bar.stiffness, solid.stiffness, rtol=1e-14)
+    shear = 2.1e11 / 2.6
+    np.testing.assert_allclose(bar.stiffness[3], shear * np.pi * 0.01**4 / 2, rtol=1e-14)
+    thin = lg.BeamSection.tube(0.5, 1e-4, **STEEL).stiffness  # k = 1/2 but for ν: 2 (1 + ν)/(4 + 3ν), Cowper
+    np.testing.assert_allclose(thin[1] / (thin[0] / 2.6), 2 * 1.3 / 4.9, rtol=1e-3)  # the wall over the radius
+    square = lg.BeamSection.rectangle(0.02, 0.02, **STEEL)
+    np.testing.assert_allclose(square.stiffness[3] / shear / 0.02**4, 0.1406, atol=5e-5)  # the digits of the table
+    strip = [lg.BeamSection.rectangle(*sides, **STEEL).stiffness[3] for sides in ((0.001, 0.1), (0.1, 0.001))]
+    np.testing.assert_allclose(strip[0], strip[1], rtol=1e-13)
+    np.testing.assert_allclose(strip[0] / shear, 0.1 * 0.001**3 / 3 * (1 - 0.630249 * 0.01), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: lg.BeamSection([1.0] * 5, 1.0, [1.0] * 3), r"`stiffness` must have shape \(6,\) or \(6, 6\)"),
+        (lambda: lg.BeamSection([-1.0] + [1.0] * 5, 1.0, [1.0] * 3), "must be positive; what does not bend"),
+        (lambda: lg.BeamSection([1.0] * 6, 0.0, [1.0] * 3), "`mass` must be positive"),
+        (lambda: lg.BeamSection([1.0] * 6, 1.0, [1.0] * 3, damping=-1.0), "`damping` must not be negative"),
+        (lambda: lg.BeamSection.tube(0.02, 0.02, **STEEL), "`thickness` is more than the radius"),
+        (lambda: lg.BeamSection.round(0.02, **(STEEL | {"poisson": 0.7})), "`poisson` must be above -1"),
+        (lambda: lg.Beam("b", UNIT, [[0, 0, 0]]), r"`points` must have shape \(m, 3\)"),
+        (lambda: lg.Beam("b", UNIT, [[0, 0, 0], [0, 0, 0]]), "coincide"),
+        (lambda: lg.Beam("b", UNIT, [[0, 0, 0], [0, 0, 1]]), "`up` .* lies along the beam"),
+        (lambda: lg.Beam("b", UNIT, np.eye(3), elements=2), "`elements` is for a straight beam"),
+        (lambda: lg.Beam("b", None, [[0, 0, 0], [1, 0, 0]]), "`section` must be a BeamSection"),
+        (lambda: lg.BeamElement("a", "b", [0, 0, 0], [0, 0, 0], np.eye(3), np.eye(3), UNIT), "are the same point"),
+    ],
+)
+def test_bad_input(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
