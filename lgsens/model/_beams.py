@@ -1,5 +1,7 @@
 """Flexible beams: nodes that are bodies, and elements between them that are forces."""
 
+from itertools import pairwise
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -32,9 +34,9 @@ class BeamElement(AbstractForce):
     b: str | None = eqx.field(static=True)
     at_a: Float[Array, "3"] = point_field("at_a")
     at_b: Float[Array, "3"] = point_field("at_b")
-    axes_a: Float[Array, "3 3"] = eqx.field(converter=lambda axes: as_float(axes, (3, 3), "`axes_a`"))
-    axes_b: Float[Array, "3 3"] = eqx.field(converter=lambda axes: as_float(axes, (3, 3), "`axes_b`"))
-    section: BeamSection
+    axes_a: Float[Array, "3 3"] = eqx.field(kw_only=True, converter=lambda axes: as_float(axes, (3, 3), "`axes_a`"))
+    axes_b: Float[Array, "3 3"] = eqx.field(kw_only=True, converter=lambda axes: as_float(axes, (3, 3), "`axes_b`"))
+    section: BeamSection = eqx.field(kw_only=True)
 
     def __check_init__(self):
         if not isinstance(self.section, BeamSection):
@@ -120,10 +122,10 @@ class Beam(eqx.Module):
     @property
     def forces(self) -> dict[str, BeamElement]:
         """Its elements by name: that from node i to node i + 1 has the name of node i."""
-        sections = list(zip(self.nodes, self.points, self.axes))
+        place = lambda i, end: {f"at_{end}": self.points[i], f"axes_{end}": self.axes[i]}
         return {
-            a: BeamElement(a, b, at_a, at_b, axes_a, axes_b, self.section)
-            for (a, at_a, axes_a), (b, at_b, axes_b) in zip(sections, sections[1:])
+            a: BeamElement(a, b, **place(i, "a"), **place(i + 1, "b"), section=self.section)
+            for i, (a, b) in enumerate(pairwise(self.nodes))
         }
 
     @property
