@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from ._base import AbstractLieGroup
+from ._coefficients import inverse_tangent_coefficient
 from ._groups import Pose
 from ._rotation import SO3, cross, skew, turn, turn_back, unskew
 
@@ -23,6 +24,11 @@ def _dual(mv, x, y):
 
 def _exchanged(z):
     return jnp.concatenate([z[3:], z[:3]])
+
+
+def _skew_product(x, y):
+    """x~ y~ = y xᵀ − (x·y) I."""
+    return y[:, None] * x[None, :] - jnp.sum(x * y) * jnp.eye(3, dtype=x.dtype)
 
 
 class SE3(AbstractLieGroup):
@@ -93,6 +99,41 @@ class SE3(AbstractLieGroup):
     def tangent_inv_rmv(self, x, y):
         """`T(x)^{-T} y`, the transpose of `tangent_inv_mv`. `y`: a covector, shape (6,)."""
         return _exchanged(_dual(lambda w, y: _ROTATION.tangent_inv_mv(-w, y), x, _exchanged(y)))
+
+    def tangent_inv_gradient(self, x, y):
+        """`∂(T(x)^{-1} y)/∂x`, shape (6, 6). `x`, `y`: shape (6,).
+
+        With ε: (u, ω) → (ω, 0), p = u·ω, and e(s) and its derivatives of SO(3), s = ω·ω, the dual vectors of `_dual` give
+
+            T(x)⁻¹ = I + ad/2 + (e + 2 p e′ ε) ad²,     ad = ad(x) = [[ω~, u~], [0, ω~]],
+
+        and as ad(δx) z = −ad(z) δx and ε commutes with ad, with S = ad(ad y) + ad ad(y),
+
+            ∂/∂x = −ad(y)/2 − (e + 2 p e′ ε) S + (2 e′ + 4 p e″ ε) ad² y [0, ω]ᵀ + 2 e′ ε ad² y [ω, u]ᵀ.
+        """
+        (u, w), zero = (x[:3], x[3:]), jnp.zeros_like(x[:3])
+        s, p = jnp.sum(w * w), jnp.sum(u * w)
+        e, first, second = (inverse_tangent_coefficient(s, order) for order in range(3))
+        once = self.ad_mv(x, y)
+        twice = self.ad_mv(x, once)
+        moved = jnp.concatenate([twice[3:], zero])
+        (yu, yw), (zu, zw) = (y[:3], y[3:]), (once[:3], once[3:])
+        rotation = skew(zw) + _skew_product(w, yw)
+        translation = skew(zu) + _skew_product(u, yw) + _skew_product(w, yu)
+        diagonal = -0.5 * skew(yw) - e * rotation
+        corner = -0.5 * skew(yu) - e * translation - 2.0 * p * first * rotation
+        by_angle = 2.0 * first * twice + 4.0 * p * second * moved
+        matrix = jnp.block([[diagonal, corner], [jnp.zeros_like(corner), diagonal]])
+        return (
+            matrix
+            + by_angle[:, None] * jnp.concatenate([zero, w])[None, :]
+            + 2.0 * first * moved[:, None] * jnp.concatenate([w, u])[None, :]
+        )
+
+    def tangent_inv_rmv_gradient(self, x, y):
+        """`∂(T(x)^{-T} y)/∂x`, shape (6, 6). `y`: a covector, shape (6,)."""
+        # T(x)⁻ᵀ y is T(−x)⁻¹ y with both exchanged, as in `tangent_inv_rmv`.
+        return -_exchanged(self.tangent_inv_gradient(-x, _exchanged(y)))
 
     def to_ambient(self, q, w):
         return Pose(turn(q.orientation, w[:3]), _ROTATION.to_ambient(q.orientation, w[3:]))

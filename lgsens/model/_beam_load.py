@@ -1,4 +1,4 @@
-"""The two-node element of a geometrically exact beam, as stacked numbers.
+"""The two-node element of a geometrically exact beam, as stacked numbers, with closed-form tangents.
 
 Between the frames H_a, H_b ∈ SE(3) of its end sections the beam is a helix, of constant strain: with d = log(H_a⁻¹H_b),
 d₀ in the reference configuration and L its length,
@@ -6,15 +6,23 @@ d₀ in the reference configuration and L its length,
     ε = (d − d₀)/L,     U = ½ L εᵀK ε,     σ = K (ε + η ε̇)
 
 ε = [stretch and shears, twist and bendings] in the frame of the sections, and σ the six forces and moments conjugate.
-A rigid motion of both sections leaves H_a⁻¹H_b, and so U; bending to an arc has no shear, so nothing locks. With
-V_a, V_b the twists of the sections, each in its own frame, and T the tangent operator of SE(3),
-exp(d)⁻¹ δ(exp d) = δh_b − Ad(exp −d) δh_a and T(d)⁻¹ Ad(exp −d) = T(−d)⁻¹ give
+A rigid motion of both sections leaves H_a⁻¹H_b, and so U; bending to an arc has no shear, so nothing locks.
 
-    δd = T(d)⁻¹ δh_b − T(−d)⁻¹ δh_a,     ḋ = T(d)⁻¹ V_b − T(−d)⁻¹ V_a,
-    wrenches on the sections:  T(−d)⁻ᵀσ on a,  −T(d)⁻ᵀσ on b.
+A section is fixed to a body: H = (p, B) = (x + R X, R A). With V the twist of b's section against a's, in the axes of
+b's, and T the tangent operator of SE(3),
 
-A section is fixed to a body: H = (x + R X, R A). Its wrench [f, m] is on the body the force R A f and the moment A m +
-X × A f. Source: Sonneville, Cardona & Brüls (2014), CMAME 268, 451, §4.
+    V = E v,   ḋ = T(d)⁻¹ V,   Q = −Eᵀλ,   λ = T(d)⁻ᵀσ = [f, m]
+    V = [B_bᵀ(ẋ_b + R_b (Ω_b × X_b) − ẋ_a − R_a (Ω_a × r)),  A_bᵀ(Ω_b − R_bᵀR_a Ω_a)],     r = R_aᵀ(p_b − x_a)
+
+as V = h_b − Ad(exp −d) h_a for the twists h of the sections. With U = ∂r/∂q = [−R_aᵀ, r̃, R_aᵀ, −R_aᵀR_b X̃_b], z = A_b
+times the translation of V, c = Ω_b × X_b, w = R_bᵀR_a Ω_a, and what λ is on b in its frame, φ = A_b f and μ = A_b m,
+and in that of a, h = R_aᵀR_b φ and n = R_aᵀR_b μ, the tangents are
+
+    A_b ∂V/∂q|_v:  translation  (z̃ − c̃) δθ_b + R_bᵀR_a ((Ω_a × r)~ δθ_a − Ω̃_a U δq),  rotation  R_bᵀR_a Ω̃_a δθ_a − w̃ δθ_b
+    −∂(Eᵀλ)/∂q|_λ:  rows  −R_b φ̃ δθ_b,  (ñ + r̃ h̃) δθ_a − (r̃ R_aᵀR_b φ̃ + R_aᵀR_b μ̃) δθ_b − h̃ U δq,  R_b φ̃ δθ_b,  0
+    ∂λ/∂q = (∂(T⁻ᵀσ)/∂d + T⁻ᵀK/L (1 + η ∂(T⁻¹V)/∂d)) T⁻¹E + η/L T⁻ᵀK T⁻¹ ∂V/∂q,     ∂λ/∂v = η/L T⁻ᵀK T⁻¹E.
+
+from δ(Rᵀx) = (Rᵀx)~ δθ and δ(R x) = −R x̃ δθ. Source: Sonneville, Cardona & Brüls (2014), CMAME 268, 451, §4.
 """
 
 from typing import NamedTuple
@@ -22,9 +30,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens.liegroups import SE3, Pose, cross, turn, turn_back
-from lgsens.model._frames import ROTATION, Frame
-from lgsens.model._loads import AbstractLoad
+from lgsens.liegroups import SE3, Pose, cross, skew, turn, turn_back
+from lgsens.model._frames import ROTATION, ROTATION_A, ROTATION_B, Frame, embedded
+from lgsens.model._loads import AbstractClosedFormLoad, LoadTangents
 
 _GROUP = SE3()
 
@@ -53,7 +61,18 @@ class SectionState(NamedTuple):
         return along + third * self.curvature[..., 1] - second * self.curvature[..., 2]
 
 
-class BeamLoad(AbstractLoad):
+class _Motion(NamedTuple):
+    """d, V, ε and σ, with r and R_aᵀR_b."""
+
+    screw: Float[Array, "6"]
+    twist: Float[Array, "6"]
+    strain: Float[Array, "6"]
+    stress: Float[Array, "6"]
+    arm: Float[Array, "3"]
+    b_in_a: Float[Array, "3 3"]
+
+
+class BeamLoad(AbstractClosedFormLoad):
     """An element between a section of a, at `point_a` with axes the columns of `triad_a` in its frame, and one of b."""
 
     point_a: Float[Array, "3"]
@@ -71,7 +90,7 @@ class BeamLoad(AbstractLoad):
     def fixed(self, kind, bodies="ab"):
         return [getattr(self, f"point_{body}") for body in bodies] if kind == "point" else []
 
-    def _screw(self, a: Frame, b: Frame):
+    def screw(self, a: Frame, b: Frame) -> Float[Array, "6"]:
         """d."""
         of, to = (
             Pose(frame.point(point), frame.orientation @ triad)
@@ -79,36 +98,64 @@ class BeamLoad(AbstractLoad):
         )
         return _GROUP.log(_GROUP.compose(_GROUP.inverse(of), to))
 
-    def _strains(self, a, b, va, vb):
-        """d, ε and σ."""
-
-        def twist(frame, point, triad, v):
-            velocity = frame.local_axis(v[: ROTATION.start]) + cross(v[ROTATION], point)
-            return jnp.concatenate([turn_back(triad, velocity), turn_back(triad, v[ROTATION])])
-
-        d = self._screw(a, b)
-        of, to = twist(a, self.point_a, self.triad_a, va), twist(b, self.point_b, self.triad_b, vb)
-        rate = _GROUP.tangent_inv_mv(d, to) - _GROUP.tangent_inv_mv(-d, of)
+    def _motion(self, a, b, va, vb) -> _Motion:
+        arm, b_in_a = a.local_point(b.point(self.point_b)), a.orientation.T @ b.orientation
+        speed = b.local_axis(vb[: ROTATION.start] - va[: ROTATION.start]) + cross(vb[ROTATION], self.point_b)
+        speed -= turn_back(b_in_a, cross(va[ROTATION], arm))
+        spin = vb[ROTATION] - turn_back(b_in_a, va[ROTATION])
+        twist = jnp.concatenate([turn_back(self.triad_b, speed), turn_back(self.triad_b, spin)])
+        d = self.screw(a, b)
         strain = (d - self.reference) / self.length
-        return d, strain, self.stiffness @ (strain + self.damping / self.length * rate)
+        rate = _GROUP.tangent_inv_mv(d, twist) / self.length
+        stress = self.stiffness @ (strain + self.damping * rate)
+        return _Motion(d, twist, strain, stress, arm, b_in_a)
 
     def measure(self, a, b, va, vb, t) -> SectionState:
-        _, strain, stress = self._strains(a, b, va, vb)
-        return SectionState(strain[:3], strain[3:], stress[:3], stress[3:])
+        motion = self._motion(a, b, va, vb)
+        return SectionState(motion.strain[:3], motion.strain[3:], motion.stress[:3], motion.stress[3:])
+
+    def _on_b(self, motion):
+        """φ and μ."""
+        wrench = _GROUP.tangent_inv_rmv(motion.screw, motion.stress)
+        return turn(self.triad_b, wrench[:3]), turn(self.triad_b, wrench[3:])
 
     def force(self, a, b, va, vb, t):
-        d, _, stress = self._strains(a, b, va, vb)
+        motion = self._motion(a, b, va, vb)
+        force, moment = self._on_b(motion)
+        on_a = cross(motion.arm, turn(motion.b_in_a, force)) + turn(motion.b_in_a, moment)
+        force_b = b.axis(force)
+        return jnp.concatenate([force_b, on_a, -force_b, -moment - cross(self.point_b, force)])
 
-        def on_body(frame, point, triad, wrench):
-            force = turn(triad, wrench[:3])
-            return frame.axis(force), turn(triad, wrench[3:]) + cross(point, force)
+    def tangents(self, a, b, va, vb, t):
+        motion = self._motion(a, b, va, vb)
+        d, arm, b_in_a, spin = motion.screw, motion.arm, motion.b_in_a, va[ROTATION]
+        force, moment = self._on_b(motion)
+        in_a, back = turn(b_in_a, force), a.orientation.T
+        by_arm = jnp.concatenate([-back, skew(arm), back, -b_in_a @ skew(self.point_b)], axis=1)  # U
+        to_axes = self.triad_b.T @ b_in_a.T
+        at_a, at_b = (lambda part, place=place: embedded(part, None, place) for place in (ROTATION_A, ROTATION_B))
+        gradient = jnp.concatenate([to_axes @ by_arm, at_b(self.triad_b.T) - at_a(to_axes)])  # E
 
-        return jnp.concatenate(
-            [
-                *on_body(a, self.point_a, self.triad_a, _GROUP.tangent_inv_rmv(-d, stress)),
-                *on_body(b, self.point_b, self.triad_b, -_GROUP.tangent_inv_rmv(d, stress)),
-            ]
-        )
+        slope = _GROUP.tangent_inv(d)
+        by_screw = slope @ gradient
+        softness = slope.T @ self.stiffness / self.length
+        by_rate = self.damping * softness
+        velocity = by_rate @ by_screw
+
+        swing = cross(vb[ROTATION], self.point_b)
+        speed = turn(self.triad_b, motion.twist[:3]) - swing
+        turned = turn_back(b_in_a, spin)
+        by_translation = at_b(self.triad_b.T @ skew(speed)) + to_axes @ (at_a(skew(cross(spin, arm))) - skew(spin) @ by_arm)
+        by_rotation = at_a(to_axes @ skew(spin)) - at_b(self.triad_b.T @ skew(turned))
+        stress = _GROUP.tangent_inv_rmv_gradient(d, motion.stress) + softness
+        stress += by_rate @ _GROUP.tangent_inv_gradient(d, motion.twist)
+        position = stress @ by_screw + by_rate @ slope @ jnp.concatenate([by_translation, by_rotation])
+
+        moved = at_b(b.orientation @ skew(force))
+        on_a = at_a(skew(turn(b_in_a, moment)) + skew(arm) @ skew(in_a)) - skew(in_a) @ by_arm
+        on_a -= at_b(skew(arm) @ b_in_a @ skew(force) + b_in_a @ skew(moment))
+        geometric = jnp.concatenate([-moved, on_a, moved, jnp.zeros_like(moved)])
+        return LoadTangents(geometric - gradient.T @ position, -gradient.T @ velocity)
 
 
 def element(a: Frame, b: Frame, points, triads, stiffness, damping) -> BeamLoad:
@@ -123,6 +170,6 @@ def element(a: Frame, b: Frame, points, triads, stiffness, damping) -> BeamLoad:
         stiffness=stiffness,
         damping=damping,
     )
-    reference = load._screw(a, b)
+    reference = load.screw(a, b)
     length = jnp.sqrt(jnp.sum(reference[:3] ** 2))  # of the helix
     return BeamLoad(load.point_a, load.point_b, load.triad_a, load.triad_b, reference, length, stiffness, damping)
