@@ -103,7 +103,7 @@ class SE3(AbstractLieGroup):
     def tangent_inv_gradient(self, x, y):
         """`∂(T(x)^{-1} y)/∂x`, shape (6, 6). `x`, `y`: shape (6,).
 
-        With ε: (u, ω) → (ω, 0), p = u·ω, and e(s) and its derivatives of SO(3), s = ω·ω, the dual vectors of `_dual` give
+        With ε: (u, ω) → (ω, 0), p = u·ω and the e(s) of SO(3), s = ω·ω, the dual vectors of `_dual` give
 
             T(x)⁻¹ = I + ad/2 + (e + 2 p e′ ε) ad²,     ad = ad(x) = [[ω~, u~], [0, ω~]],
 

@@ -11,7 +11,7 @@ import numpy as np
 from lgsens.liegroups import Pose
 from lgsens.model._body import RigidBody
 from lgsens.model._evaluate_by_kind import StackRow, evaluated, joined, stacked
-from lgsens.model._forces import AbstractForce
+from lgsens.model._forces import AbstractConnection, AbstractForce
 from lgsens.model._frames import Frame, ground_frame
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._loads import carriers, num_states
@@ -100,9 +100,17 @@ def _assemble(
             if any(kept):
                 constraints.append(Placed(StackRow(of, row.index), a, b, name, kept, i, more))
     loads, free = [], [body.coordinates for body in ordered]
-    for name, force in sorted(forces.items()):
-        acting = force.on(joints)
-        for load, *ends in acting.loads(moving if force.on_merged else bodies):
+    acting = {name: force.on(joints) for name, force in sorted(forces.items())}
+    connections = {name: force for name, force in acting.items() if isinstance(force, AbstractConnection)}
+    members = [
+        (force, frame[force.a], frame[force.b], places[force.a].offset, places[force.b].offset)
+        for force in connections.values()
+    ]
+    kinds = [(_kind(force), *(end is None for end in ends)) for force, *ends in members]
+    rows = dict(zip(connections, evaluated(_load, members, kinds)))
+    for name, force in acting.items():
+        for element, *ends in _attached(force, moving if force.on_merged else bodies, rows.get(name), places):
+            load = element.of
             a, b = (places[end] for end in ends)
             own = carriers(num_states(load))
             if own and a.body is b.body is None:
@@ -112,8 +120,7 @@ def _assemble(
                 )
             if own or a.body != b.body or (a.body is not None and not load.balanced):
                 here = tuple(range(len(free), len(free) + len(own)))
-                element = carried(load, a.offset, b.offset)
-                loads.append(Placed(element, number[a.body], number[b.body], name, carriers=here, joint=acting.reads))
+                loads.append(Placed(element, number[a.body], number[b.body], name, carriers=here, joint=force.reads))
                 free.extend(own)
     kinds = [
         (jnp.shape(body.inertia) if body.inertia is not None else None, body.pivot is None, body.mass.dtype)
@@ -146,19 +153,35 @@ def _assemble(
     )
 
 
-def _kind(joint: AbstractJoint) -> Hashable:
-    """What joints have in common whose constraints are made by the same operations."""
-    fields = [getattr(joint, field.name) for field in dataclasses.fields(joint) if field.name not in ("a", "b")]
+def _kind(member: AbstractJoint | AbstractConnection) -> Hashable:
+    """What joints have in common whose constraints are made by the same operations, and forces whose loads are."""
+    fields = [getattr(member, field.name) for field in dataclasses.fields(member) if field.name not in ("a", "b")]
     leaves, structure = jax.tree.flatten(fields, is_leaf=lambda x: x is None)
-    return type(joint), structure, tuple((leaf.shape, leaf.dtype) if eqx.is_array(leaf) else leaf for leaf in leaves)
+    return type(member), structure, tuple((leaf.shape, leaf.dtype) if eqx.is_array(leaf) else leaf for leaf in leaves)
 
 
 def _constraints(joint: AbstractJoint, *frames_and_parts: Frame | None):
     """The constraints of a joint between its bodies: their frames, and the poses of merged parts there."""
     frames, parts = frames_and_parts[: len(frames_and_parts) // 2], frames_and_parts[len(frames_and_parts) // 2 :]
+    return tuple(carried(element, *parts) for element in joint.constraints(*_or_ground(frames)))
+
+
+def _load(force: AbstractConnection, a: Frame | None, b: Frame | None, *parts: Frame | None):
+    """The load of a force between its bodies, likewise."""
+    return carried(force.load(*_or_ground((a, b))), *parts)
+
+
+def _or_ground(frames):
     ground = ground_frame(next(end.position.dtype for end in frames if end is not None))
-    elements = joint.constraints(*(ground if end is None else end for end in frames))
-    return tuple(carried(element, *parts) for element in elements)
+    return (ground if end is None else end for end in frames)
+
+
+def _attached(force: AbstractForce, bodies: Mapping[str, RigidBody], row: StackRow | None, places: Placements):
+    """The loads of a force as rows, each with the names of its bodies; `row`: that of what is known already."""
+    if isinstance(force, AbstractConnection):
+        return [(row, force.a, force.b)]
+    one = lambda load: StackRow(jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], load), 0)
+    return [(one(carried(load, places[a].offset, places[b].offset)), a, b) for load, a, b in force.loads(bodies)]
 
 
 def _inertia(body: RigidBody):

@@ -18,7 +18,7 @@ as V = h_b − Ad(exp −d) h_a for the twists h of the sections. With U = ∂r/
 times the translation of V, c = Ω_b × X_b, w = R_bᵀR_a Ω_a, and what λ is on b in its frame, φ = A_b f and μ = A_b m,
 and in that of a, h = R_aᵀR_b φ and n = R_aᵀR_b μ, the tangents are
 
-    A_b ∂V/∂q|_v:  translation  (z̃ − c̃) δθ_b + R_bᵀR_a ((Ω_a × r)~ δθ_a − Ω̃_a U δq),  rotation  R_bᵀR_a Ω̃_a δθ_a − w̃ δθ_b
+    A_b ∂V/∂q|_v:  rows  (z̃ − c̃) δθ_b + R_bᵀR_a ((Ω_a × r)~ δθ_a − Ω̃_a U δq),  R_bᵀR_a Ω̃_a δθ_a − w̃ δθ_b
     −∂(Eᵀλ)/∂q|_λ:  rows  −R_b φ̃ δθ_b,  (ñ + r̃ h̃) δθ_a − (r̃ R_aᵀR_b φ̃ + R_aᵀR_b μ̃) δθ_b − h̃ U δq,  R_b φ̃ δθ_b,  0
     ∂λ/∂q = (∂(T⁻ᵀσ)/∂d + T⁻ᵀK/L (1 + η ∂(T⁻¹V)/∂d)) T⁻¹E + η/L T⁻ᵀK T⁻¹ ∂V/∂q,     ∂λ/∂v = η/L T⁻ᵀK T⁻¹E.
 
@@ -27,10 +27,12 @@ from δ(Rᵀx) = (Rᵀx)~ δθ and δ(R x) = −R x̃ δθ. Source: Sonneville, 
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens.liegroups import SE3, Pose, cross, skew, turn, turn_back
+from lgsens.model._elements import body_fixed
 from lgsens.model._frames import ROTATION, ROTATION_A, ROTATION_B, Frame, embedded
 from lgsens.model._loads import AbstractClosedFormLoad, LoadTangents
 
@@ -75,10 +77,10 @@ class _Motion(NamedTuple):
 class BeamLoad(AbstractClosedFormLoad):
     """An element between a section of a, at `point_a` with axes the columns of `triad_a` in its frame, and one of b."""
 
-    point_a: Float[Array, "3"]
-    point_b: Float[Array, "3"]
-    triad_a: Float[Array, "3 3"]
-    triad_b: Float[Array, "3 3"]
+    point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
+    point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
+    triad_a: Float[Array, "3 3"] = eqx.field(metadata=body_fixed("axes", "a"))
+    triad_b: Float[Array, "3 3"] = eqx.field(metadata=body_fixed("axes", "b"))
     reference: Float[Array, "6"]  # d₀
     length: Float[Array, ""]
     stiffness: Float[Array, "6 6"]
@@ -86,9 +88,6 @@ class BeamLoad(AbstractClosedFormLoad):
 
     balanced = True
     drawn = "link"
-
-    def fixed(self, kind, bodies="ab"):
-        return [getattr(self, f"point_{body}") for body in bodies] if kind == "point" else []
 
     def screw(self, a: Frame, b: Frame) -> Float[Array, "6"]:
         """d."""
@@ -145,7 +144,9 @@ class BeamLoad(AbstractClosedFormLoad):
         swing = cross(vb[ROTATION], self.point_b)
         speed = turn(self.triad_b, motion.twist[:3]) - swing
         turned = turn_back(b_in_a, spin)
-        by_translation = at_b(self.triad_b.T @ skew(speed)) + to_axes @ (at_a(skew(cross(spin, arm))) - skew(spin) @ by_arm)
+        by_translation = at_b(self.triad_b.T @ skew(speed)) + to_axes @ (
+            at_a(skew(cross(spin, arm))) - skew(spin) @ by_arm
+        )
         by_rotation = at_a(to_axes @ skew(spin)) - at_b(self.triad_b.T @ skew(turned))
         stress = _GROUP.tangent_inv_rmv_gradient(d, motion.stress) + softness
         stress += by_rate @ _GROUP.tangent_inv_gradient(d, motion.twist)

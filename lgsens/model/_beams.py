@@ -13,10 +13,10 @@ from lgsens.liegroups import cross
 from lgsens.model._beam_load import element
 from lgsens.model._beam_sections import BeamSection
 from lgsens.model._body import RigidBody
-from lgsens.model._forces import AbstractForce, Attached, _frame
+from lgsens.model._forces import AbstractConnection
 
 
-class BeamElement(AbstractForce):
+class BeamElement(AbstractConnection):
     """An element of a geometrically exact beam between a section of a and one of b: straight, curved or twisted.
 
     Arguments:
@@ -47,14 +47,9 @@ class BeamElement(AbstractForce):
             jnp.linalg.norm(self.at_b - self.at_a),
         )
 
-    @property
-    def bodies(self):
-        return (self.a, self.b)
-
-    def loads(self, bodies):
-        a, b = (_frame(bodies, name, self.at_a.dtype) for name in (self.a, self.b))
+    def load(self, a, b):
         sections = (self.at_a, self.at_b), (self.axes_a, self.axes_b)
-        return (Attached(element(a, b, *sections, self.section.matrix, self.section.damping), self.a, self.b),)
+        return element(a, b, *sections, self.section.matrix, self.section.damping)
 
 
 class Beam(eqx.Module):

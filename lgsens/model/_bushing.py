@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, is_concrete, point_field, require
 from lgsens.liegroups import cross
-from lgsens.model._forces import AbstractForce, Attached, _frame
+from lgsens.model._forces import AbstractConnection
 from lgsens.model._joints import FixedJoint, RevoluteJoint, SphericalJoint
 from lgsens.model._loads import BushingLoad
 from lgsens.model._signals import AbstractSignal, prepared
@@ -21,7 +21,7 @@ _CURVES = ("springs", "dampers")
 _SOFT = 1e-2  # of the largest rotational rate: below, a joint turns
 
 
-class Bushing(AbstractForce):
+class Bushing(AbstractConnection):
     """A rubber bushing in place of a joint: a spring and damper along, and about, each of three axes fixed to body a.
 
         g = g₀ + K u + C u̇,     u the vector from the point on a to the point on b, in the frame of a
@@ -87,10 +87,6 @@ class Bushing(AbstractForce):
             f"Bushing: `axes` {self.axes} lie along each other or are zero; give two directions.",
             np.eye(2, 3) if self.axes is None else self.axes,
         )
-
-    @property
-    def bodies(self):
-        return (self.a, self.b)
 
     @property
     def _turns(self) -> bool:
@@ -163,8 +159,7 @@ class Bushing(AbstractForce):
         turns |= {name: curves(getattr(self, f"rotational_{name}")) if len(axes) else None for name in _CURVES}
         return dataclasses.replace(self, **{f"rotational_{name}": value for name, value in turns.items()})
 
-    def loads(self, bodies):
-        a, b = (_frame(bodies, name, self.at.dtype) for name in (self.a, self.b))
+    def load(self, a, b):
         triads = [frame.orientation.T for frame in (a, b)]
         if self.axes is not None:
             triads = [triad @ self.triad for triad in triads]
@@ -184,7 +179,7 @@ class Bushing(AbstractForce):
         if any(numbers is not None for numbers in (*about, *curves.values())):
             k, c, m = (jnp.zeros_like(self.at) if numbers is None else numbers for numbers in about)
             load = LoadSum((load, RotationLoad(triads[0], triads[1], k, c, m, **curves)))
-        return (Attached(load, self.a, self.b),)
+        return load
 
 
 def _slopes(curves: Curves | None, dtype) -> Float[Array, "3"]:

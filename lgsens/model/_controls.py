@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from lgsens._validate import number_field, point_field, require_positive
 from lgsens.model._constraints import AbstractConstraint
 from lgsens.model._elements import body_fixed
-from lgsens.model._forces import AbstractForce, Attached, _distance, _frame
+from lgsens.model._forces import AbstractConnection, AbstractForce, Attached, _distance, _frame
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._loads import AbstractDynamicLoad, AbstractLoad, LineForce, SpringDamperLoad
 from lgsens.model._signals import Prescribed, at_time, prepared, prescribed_field
@@ -259,7 +259,7 @@ class PIDController(_AbstractAlong):
         return PIDLoad(along, *gains, self.time_constant, self.initial_integral)
 
 
-class MaxwellElement(AbstractForce):
+class MaxwellElement(AbstractConnection):
     """A spring and a damper in series between two points, which relaxes: tension F = k (ℓ − r), c ṙ = F.
 
     Its force decays with the time constant c/k. Beside a `SpringDamper` it is the standard linear solid: rubber, or a
@@ -287,11 +287,6 @@ class MaxwellElement(AbstractForce):
     def __check_init__(self):
         require_positive(self, "damping")
 
-    @property
-    def bodies(self):
-        return (self.a, self.b)
-
-    def loads(self, bodies):
-        a, b = (_frame(bodies, name, self.stiffness.dtype) for name in (self.a, self.b))
+    def load(self, a, b):
         points = a.local_point(self.at_a), b.local_point(self.at_b)
-        return (Attached(MaxwellLoad(*points, self.stiffness, self.damping, self.initial), self.a, self.b),)
+        return MaxwellLoad(*points, self.stiffness, self.damping, self.initial)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from lgsens._validate import as_float, number_field, point_field, require, suggestion
 from lgsens.liegroups import SO3, skew, turn_back
 from lgsens.model._constraints import AbstractClosedFormConstraint
-from lgsens.model._forces import AbstractForce, Attached, _frame
+from lgsens.model._forces import AbstractConnection, AbstractForce, Attached, _frame
 from lgsens.model._frames import BODY_DIM, ROTATION, TURNING_A, TURNING_B, Frame
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, LoadTangents
@@ -180,7 +180,7 @@ class BallLoad(AbstractLoad):
         return jnp.concatenate([zero, a.local_axis(moment), zero, -b.local_axis(moment)])
 
 
-class RotationalSpringDamper(AbstractForce):
+class RotationalSpringDamper(AbstractConnection):
     """Spring and damper against all rotations between two bodies, of a ball joint say: the moment −k φ − c ω on b.
 
     φ is the rotation vector of `b` in `a`, |φ| < π, and ω their relative angular velocity. A `Bushing` has a stiffness
@@ -201,13 +201,9 @@ class RotationalSpringDamper(AbstractForce):
     damping: Float[Array, ""] = number_field("damping", default=0.0)
     turned: Float[Array, "3"] = point_field("turned", default=(0.0, 0.0, 0.0))
 
-    @property
-    def bodies(self):
-        return (self.a, self.b)
-
-    def loads(self, bodies):
-        a, b = (_frame(bodies, name, self.turned.dtype).orientation.T for name in (self.a, self.b))
-        return (Attached(BallLoad(a, b @ SO3().exp(self.turned), self.stiffness, self.damping), self.a, self.b),)
+    def load(self, a, b):
+        triad_b = b.orientation.T @ SO3().exp(self.turned)
+        return BallLoad(a.orientation.T, triad_b, self.stiffness, self.damping)
 
 
 class Coupled(AbstractClosedFormConstraint):

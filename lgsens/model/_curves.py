@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import number_field, point_field
 from lgsens.model._elements import body_fixed
-from lgsens.model._forces import AbstractForce, Attached, _distance, _frame
+from lgsens.model._forces import AbstractConnection, _distance
 from lgsens.model._loads import AbstractClosedFormLoad, LineForce, SpringDamperLoad
 from lgsens.model._signals import AbstractSignal, Prescribed, prepared, prescribed_field
 
@@ -52,7 +52,7 @@ class CurveLoad(AbstractClosedFormLoad):
         return self._osculating(a, b, va, vb, t).tangents(a, b, va, vb, t)
 
 
-class CurveSpringDamper(AbstractForce):
+class CurveSpringDamper(AbstractConnection):
     """A spring and a damper in parallel between two points by their curves; tension F = F₀ + f(ℓ − ℓ₀) + g(ℓ̇).
 
     Arguments:
@@ -86,21 +86,14 @@ class CurveSpringDamper(AbstractForce):
                 f"{self.spring!r} and {self.damper!r}; with two numbers it is a SpringDamper."
             )
 
-    @property
-    def bodies(self):
-        return (self.a, self.b)
-
     preload_shape = ()
 
-    def loads(self, bodies):
-        a, b = (_frame(bodies, name, self.at_a.dtype) for name in (self.a, self.b))
-        free_length = _distance(self.at_a, self.at_b) if self.free_length is None else self.free_length
-        load = CurveLoad(
+    def load(self, a, b):
+        return CurveLoad(
             point_a=a.local_point(self.at_a),
             point_b=b.local_point(self.at_b),
             spring=prepared(self.spring),
             damper=prepared(self.damper),
-            free_length=free_length,
+            free_length=_distance(self.at_a, self.at_b) if self.free_length is None else self.free_length,
             preload=self.preload,
         )
-        return (Attached(load, self.a, self.b),)

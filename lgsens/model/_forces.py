@@ -87,6 +87,28 @@ class AbstractForce(eqx.Module):
         """
 
 
+class AbstractConnection(AbstractForce):
+    """A force between two bodies a and b, whose load follows from its own numbers and their frames."""
+
+    a: eqx.AbstractVar[str | None]
+    b: eqx.AbstractVar[str | None]
+
+    @property
+    def bodies(self):
+        return (self.a, self.b)
+
+    @abc.abstractmethod
+    def load(self, a: Frame, b: Frame) -> AbstractLoad | AbstractDynamicLoad:
+        """The load, given the frames of its bodies in their reference configuration."""
+
+    def loads(self, bodies):
+        """As in `AbstractForce`, of one alone; those of a model are made together, one program for each kind."""
+        known = [bodies[name].frame for name in (self.a, self.b) if name is not None]
+        ground = ground_frame(known[0].position.dtype)
+        ends = (ground if name is None else bodies[name].frame for name in (self.a, self.b))
+        return (Attached(self.load(*ends), self.a, self.b),)
+
+
 def _distance(a, b):
     """|b − a|; of points that coincide, where it has no derivative, the mean of those to both sides: zero."""
     square = jnp.sum((b - a) ** 2)
@@ -126,7 +148,7 @@ class Gravity(AbstractForce):
         return PointForce(body.centre, body.mass * self.acceleration, no_moment, _one())
 
 
-class SpringDamper(AbstractForce):
+class SpringDamper(AbstractConnection):
     """A spring and a damper in parallel between two points; tension F = F₀ + k (ℓ − ℓ₀) + c ℓ̇.
 
     Arguments:
@@ -159,27 +181,20 @@ class SpringDamper(AbstractForce):
                 "(preload = stiffness · (reference length − free_length))."
             )
 
-    @property
-    def bodies(self):
-        return (self.a, self.b)
-
     preload_shape = ()
 
     def with_preload(self, preload):
         return dataclasses.replace(self, preload=preload, free_length=None)
 
-    def loads(self, bodies):
-        dtype = self.stiffness.dtype
-        free_length = _distance(self.at_a, self.at_b) if self.free_length is None else self.free_length
-        load = SpringDamperLoad(
-            point_a=_frame(bodies, self.a, dtype).local_point(self.at_a),
-            point_b=_frame(bodies, self.b, dtype).local_point(self.at_b),
+    def load(self, a, b):
+        return SpringDamperLoad(
+            point_a=a.local_point(self.at_a),
+            point_b=b.local_point(self.at_b),
             stiffness=self.stiffness,
             damping=self.damping,
-            free_length=free_length,
-            preload=jnp.zeros((), dtype) if self.preload is None else self.preload,
+            free_length=_distance(self.at_a, self.at_b) if self.free_length is None else self.free_length,
+            preload=jnp.zeros_like(self.stiffness) if self.preload is None else self.preload,
         )
-        return (Attached(load, self.a, self.b),)
 
 
 class TyreSpring(AbstractForce):

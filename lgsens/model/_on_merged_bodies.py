@@ -1,7 +1,7 @@
 """Elements on a part of a body, as elements on the body itself.
 
 The frame of a part is x_p = x + R c, R_p = R C with the constant pose (c, C) of the part in its body, so a point X of
-the part is c + C X in the body, an axis e is C e, a tensor K is C K Cᵀ. Elements that say what of them is fixed to
+the part is c + C X in the body, axes e are C e, a tensor K is C K Cᵀ. Elements that say what of them is fixed to
 bodies are rewritten, and cost no more than on the body itself; others see the frame of the part, and what they do to it
 is brought back by the transpose of
 
@@ -23,6 +23,7 @@ from lgsens.model._loads import AbstractDynamicLoad, AbstractLoad
 _SEEN = {
     "point": Frame.point,
     "axis": Frame.axis,
+    "axes": lambda part, columns: part.orientation @ columns,
     "tensor": lambda part, tensor: part.orientation @ tensor @ part.orientation.T,
 }
 

@@ -9,21 +9,20 @@ from jaxtyping import Array, Float
 from lgsens._validate import axis_field, number_field, point_field, require, require_positive
 from lgsens.model._contacts import PlaneContactLoad
 from lgsens.model._curves import CurveLoad
-from lgsens.model._forces import AbstractForce, Attached, _distance, _frame
+from lgsens.model._forces import AbstractConnection, AbstractForce, Attached, _distance
 from lgsens.model._frames import normals
 from lgsens.model._signals import AbstractSignal, Prescribed, prepared, prescribed_field
 from lgsens.model._turning_loads import DragLoad, TorsionLoad
 
 
-def _torsion(bodies, force, stiffness, free_angle=None, preload=None, motor=None) -> tuple[Attached, ...]:
+def _torsion(a, b, force, stiffness, free_angle=None, preload=None, motor=None) -> TorsionLoad:
     _, first, second = normals(force.axis)
-    a, b = (_frame(bodies, name, first.dtype) for name in (force.a, force.b))
     axes = a.local_axis(first), a.local_axis(second), b.local_axis(first)
     angle, moment = (jnp.zeros((), first.dtype) if value is None else value for value in (free_angle, preload))
-    return (Attached(TorsionLoad(*axes, stiffness, force.damping, angle, moment, motor), force.a, force.b),)
+    return TorsionLoad(*axes, stiffness, force.damping, angle, moment, motor)
 
 
-class TorsionSpringDamper(AbstractForce):
+class TorsionSpringDamper(AbstractConnection):
     """Spring, damper and motor about a hinge axis: the moment M(t) − M₀ − k (θ − θ₀) − c θ̇ on b, its opposite on a.
 
     θ is the angle by which `b` has turned about the axis, fixed in `a`, since the reference configuration; within half
@@ -59,21 +58,17 @@ class TorsionSpringDamper(AbstractForce):
                 "(preload = −stiffness · free_angle)."
             )
 
-    @property
-    def bodies(self):
-        return (self.a, self.b)
-
     preload_shape = ()
 
     def with_preload(self, preload):
         return dataclasses.replace(self, preload=preload, free_angle=None)
 
-    def loads(self, bodies):
+    def load(self, a, b):
         motor = None if self.motor is None else prepared(self.motor)
-        return _torsion(bodies, self, self.stiffness, self.free_angle, self.preload, motor)
+        return _torsion(a, b, self, self.stiffness, self.free_angle, self.preload, motor)
 
 
-class AntiRollBar(AbstractForce):
+class AntiRollBar(AbstractConnection):
     """A round bar that is twisted between two bodies: the moment −k θ − c θ̇ on b, k = π G (d⁴ − d_i⁴)/(32 L).
 
     θ is the angle by which `b` has turned about the bar, fixed in `a`, seen from `a` since the reference configuration;
@@ -114,13 +109,9 @@ class AntiRollBar(AbstractForce):
             self.shear_modulus,
         )
 
-    @property
-    def bodies(self):
-        return (self.a, self.b)
-
-    def loads(self, bodies):
+    def load(self, a, b):
         section = jnp.pi * (self.diameter**4 - self.bore**4) / 32.0
-        return _torsion(bodies, self, self.shear_modulus * section / self.length)
+        return _torsion(a, b, self, self.shear_modulus * section / self.length)
 
 
 class StopCurve(AbstractSignal):
@@ -141,7 +132,7 @@ class StopCurve(AbstractSignal):
         return sign * force
 
 
-class BumpStop(AbstractForce):
+class BumpStop(AbstractConnection):
     """A stop between two points, which pushes them apart once they have come closer by a gap.
 
         F = k x³/(x² + w²) (1 + x²/p²),     x = max(0, ℓ₀ − ℓ − gap)
@@ -182,18 +173,13 @@ class BumpStop(AbstractForce):
             self.at_b,
         )
 
-    @property
-    def bodies(self):
-        return (self.a, self.b)
-
-    def loads(self, bodies):
+    def load(self, a, b):
         curve = StopCurve(self.gap, self.stiffness, self.rounding, self.progression, self.rebound)
-        a, b = (_frame(bodies, name, self.gap.dtype) for name in (self.a, self.b))
         points, length = (a.local_point(self.at_a), b.local_point(self.at_b)), _distance(self.at_a, self.at_b)
-        return (Attached(CurveLoad(*points, curve, None, length, jnp.zeros_like(length)), self.a, self.b),)
+        return CurveLoad(*points, curve, None, length, jnp.zeros_like(length))
 
 
-class PlaneContact(AbstractForce):
+class PlaneContact(AbstractConnection):
     """A point of `b` on a plane of `a`, into which it may be pressed and from which it may lift off.
 
         F = k ⌈x⌉_w ⌈1 + c ẋ⌉_½  along the normal,     x how far it is in the plane
@@ -232,17 +218,11 @@ class PlaneContact(AbstractForce):
         if (self.coefficient is None) != (self.slip_speed is None):
             raise ValueError("PlaneContact: give both `coefficient` and `slip_speed`, or neither.")
 
-    @property
-    def bodies(self):
-        return (self.a, self.b)
-
-    def loads(self, bodies):
-        a, b = (_frame(bodies, name, self.gap.dtype) for name in (self.a, self.b))
+    def load(self, a, b):
         unit = self.axis / jnp.linalg.norm(self.axis)
         places = a.local_point(self.at - self.gap * unit), a.local_axis(unit), b.local_point(self.at)
         numbers = self.stiffness, self.damping, self.rounding, self.coefficient, self.slip_speed
-        load = PlaneContactLoad(*places, *numbers)
-        return (Attached(load, self.a, self.b),)
+        return PlaneContactLoad(*places, *numbers)
 
 
 class Drag(AbstractForce):
