@@ -37,6 +37,7 @@ from lgsens.model._drivers import (
     TranslationDriver as TranslationDriver,
 )
 from lgsens.model._elements import AbstractElement as AbstractElement, body_fixed as body_fixed
+from lgsens.model._flexible import Rigid as Rigid
 from lgsens.model._forces import (
     AbstractForce as AbstractForce,
     AppliedForce as AppliedForce,

@@ -3,7 +3,7 @@
 Between the frames H_a, H_b ∈ SE(3) of its end sections the beam is a helix, of constant strain: with d = log(H_a⁻¹H_b),
 d₀ in the reference configuration and L its length,
 
-    ε = (d − d₀)/L,     U = ½ L εᵀK ε,     σ = K (ε + η ε̇)
+    ε = (d − d₀)/L,     U = L (σ₀ᵀε + ½ εᵀK ε),     σ = σ₀ + K (ε + η ε̇)
 
 ε = [stretch and shears, twist and bendings] in the frame of the sections, and σ the six forces and moments conjugate.
 A rigid motion of both sections leaves H_a⁻¹H_b, and so U; bending to an arc has no shear, so nothing locks.
@@ -25,6 +25,7 @@ and in that of a, h = R_aᵀR_b φ and n = R_aᵀR_b μ, the tangents are
 from δ(Rᵀx) = (Rᵀx)~ δθ and δ(R x) = −R x̃ δθ. Source: Sonneville, Cardona & Brüls (2014), CMAME 268, 451, §4.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -40,11 +41,11 @@ _GROUP = SE3()
 
 
 class SectionState(NamedTuple):
-    """Strains and stress resultants of an element, in the frame of its sections.
+    """Strains, those of the beam without stress being 0, and stress resultants of an element, in its sections' frame.
 
     Attributes:
         strain: ε₁ stretch, γ₂ and γ₃ shears [–], shape (3,).
-        curvature: κ₁ twist, κ₂ and κ₃ bendings, beyond those of the reference [1/m], shape (3,).
+        curvature: κ₁ twist, κ₂ and κ₃ bendings [1/m], shape (3,).
         force: N, Q₂, Q₃ [N], shape (3,).
         moment: M₁, M₂, M₃ [N m], shape (3,).
 
@@ -85,6 +86,7 @@ class BeamLoad(AbstractClosedFormLoad):
     length: Float[Array, ""]
     stiffness: Float[Array, "6 6"]
     damping: Float[Array, ""]
+    preload: Float[Array, "6"]  # σ₀
 
     balanced = True
     drawn = "link"
@@ -106,12 +108,13 @@ class BeamLoad(AbstractClosedFormLoad):
         d = self.screw(a, b)
         strain = (d - self.reference) / self.length
         rate = _GROUP.tangent_inv_mv(d, twist) / self.length
-        stress = self.stiffness @ (strain + self.damping * rate)
+        stress = self.preload + self.stiffness @ (strain + self.damping * rate)
         return _Motion(d, twist, strain, stress, arm, b_in_a)
 
     def measure(self, a, b, va, vb, t) -> SectionState:
         motion = self._motion(a, b, va, vb)
-        return SectionState(motion.strain[:3], motion.strain[3:], motion.stress[:3], motion.stress[3:])
+        strain = motion.strain + jnp.linalg.solve(self.stiffness, self.preload)
+        return SectionState(strain[:3], strain[3:], motion.stress[:3], motion.stress[3:])
 
     def _on_b(self, motion):
         """φ and μ."""
@@ -159,7 +162,7 @@ class BeamLoad(AbstractClosedFormLoad):
         return LoadTangents(geometric - gradient.T @ position, -gradient.T @ velocity)
 
 
-def element(a: Frame, b: Frame, points, triads, stiffness, damping) -> BeamLoad:
+def element(a: Frame, b: Frame, points, triads, stiffness, damping, preload) -> BeamLoad:
     """The load between sections at these points, with these axes as columns, all of the reference configuration."""
     load = BeamLoad(
         point_a=a.local_point(points[0]),
@@ -170,7 +173,8 @@ def element(a: Frame, b: Frame, points, triads, stiffness, damping) -> BeamLoad:
         length=jnp.ones((), stiffness.dtype),
         stiffness=stiffness,
         damping=damping,
+        preload=preload,
     )
     reference = load.screw(a, b)
     length = jnp.sqrt(jnp.sum(reference[:3] ** 2))  # of the helix
-    return BeamLoad(load.point_a, load.point_b, load.triad_a, load.triad_b, reference, length, stiffness, damping)
+    return dataclasses.replace(load, reference=reference, length=length)

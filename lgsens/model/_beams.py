@@ -24,6 +24,7 @@ class BeamElement(AbstractConnection):
         at_a, at_b: centroids of the end sections in the reference configuration [m], inertial frame, shape (3,).
         axes_a, axes_b: their axes as columns, the first along the beam, inertial frame, shape (3, 3), rotations.
         section: what is between them.
+        preload: σ₀, forces [N] and moments [N m] of its sections in the reference configuration, shape (6,); None: 0.
 
     Strains are zero in the reference configuration; the element is massless (`Beam` has nodes with mass). It may be of
     any size and turn and move as it likes; section b turns by less than π in section a. `Trajectory.force(name)` is a
@@ -37,6 +38,15 @@ class BeamElement(AbstractConnection):
     axes_a: Float[Array, "3 3"] = eqx.field(kw_only=True, converter=lambda axes: as_float(axes, (3, 3), "`axes_a`"))
     axes_b: Float[Array, "3 3"] = eqx.field(kw_only=True, converter=lambda axes: as_float(axes, (3, 3), "`axes_b`"))
     section: BeamSection = eqx.field(kw_only=True)
+    preload: Float[Array, "6"] | None = eqx.field(
+        default=None, kw_only=True, converter=lambda s: None if s is None else as_float(s, (6,), "`preload`")
+    )
+
+    preload_shape = (6,)
+
+    @property
+    def preload_rates(self):
+        return jnp.diagonal(self.section.matrix) / jnp.linalg.norm(self.at_b - self.at_a)
 
     def __check_init__(self):
         if not isinstance(self.section, BeamSection):
@@ -49,7 +59,8 @@ class BeamElement(AbstractConnection):
 
     def load(self, a, b):
         sections = (self.at_a, self.at_b), (self.axes_a, self.axes_b)
-        return element(a, b, *sections, self.section.matrix, self.section.damping)
+        preload = jnp.zeros(6, self.at_a.dtype) if self.preload is None else self.preload
+        return element(a, b, *sections, self.section.matrix, self.section.damping, preload)
 
 
 class Beam(eqx.Module):

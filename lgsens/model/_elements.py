@@ -16,8 +16,8 @@ def body_fixed(kind: str, body: str) -> dict[str, Any]:
     """What a field of an element says whose number is fixed to a body, in its frame: `eqx.field(metadata=…)`.
 
     It is a "point", an "axis", "axes" as columns or a "tensor" of "a" or "b". Points place the element in plots and in
-    the scale of coordinates. An element that says so of one number says so of all: on a part of a merged body it becomes the same
-    element on that body, without a change of frames at every instant. `lgsens.testing` compares both.
+    the scale of coordinates. An element that says so of one number says so of all: on a part of a merged body it
+    becomes the same element on that body, without a change of frames at every instant. `lgsens.testing` compares both.
     """
     return {"fixed": (kind, body)}
 

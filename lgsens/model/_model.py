@@ -14,9 +14,11 @@ from lgsens._validate import is_concrete, require
 from lgsens.liegroups import nearest_rotation
 from lgsens.linear import AbstractLinearSolver
 from lgsens.model._assemble import assemble, assemble_merged
+from lgsens.model._beam_sections import BeamSection
 from lgsens.model._body import RigidBody
 from lgsens.model._checks import checked, far_from_rotation, is_inertia, strong
 from lgsens.model._evaluate_by_kind import stacked
+from lgsens.model._flexible import flexible
 from lgsens.model._forces import AbstractForce
 from lgsens.model._frames import Frame
 from lgsens.model._joints import AbstractJoint
@@ -214,12 +216,42 @@ class Model(eqx.Module):
         ```
 
         Arguments:
-            reductions: `Rod`, `Joint`, `Merged`, `Fixed`, `Frozen` and `Without` of `lgsens.model`, applied in turn.
+            reductions: `Rod`, `Joint`, `Merged`, `Fixed`, `Frozen`, `Without` and, of beams, `Rigid` of `lgsens.model`,
+                applied in turn.
 
         Numbers of the lean model are functions of those of this one and derivatives go through.
         `lgsens.accuracy.fidelity` says what each of them changes. Raises `ValueError` as these do and as `Model`.
         """
         return self._of(reduced(self._scene, reductions))
+
+    def flexible(
+        self,
+        links: Mapping[str, BeamSection],
+        *,
+        elements: int = 4,
+        up=(0.0, 0.0, 1.0),
+        nodes: Mapping[str, int] | None = None,
+    ) -> "Model":
+        """A richer model: links that two joints hold bend, each a `Beam` of its name between the points of both.
+
+        ```python
+        steel = {"young": 2.1e11, "poisson": 0.3, "density": 7850.0}
+        model = model.flexible({"trailing_arm": lg.BeamSection.tube(0.04, 0.003, **steel)})
+        ```
+
+        Arguments:
+            links: the section of each link, by the names of bodies. Mass and inertia are now those of the beam.
+            elements: of each, static.
+            up: as in `Beam`.
+            nodes: numbers of the nodes that carry joints and forces, by their names. The two joints that are not named
+                hold node 0, the first of them by name, and the last one; a force holds the nearest node, which is
+                known only where points are.
+
+        The bodies are then "trailing_arm.0" … "trailing_arm.4". Preloads are as before, so that the scene is a little
+        off its rest (`equilibrium`). `lgsens.accuracy.fidelity` with `lgsens.model.Rigid("trailing_arm")` says what it
+        changes. Raises `ValueError` for unknown names, links that other than two joints hold, and what `Beam` refuses.
+        """
+        return self._of(flexible(self._scene, links, elements, up, nodes or {}))
 
     @property
     def _scene(self) -> Scene:

@@ -4,12 +4,13 @@ A reduction is a value that names what it leaves out. `applied` makes the lean s
 *rich* structure that depends on a number s: at s = 0 it is the rich one, and as s → 1 its motion becomes that of the
 lean one, so that derivatives by s tell what the reduction does (`lgsens.accuracy.fidelity`):
 
+    beam → rigid         its forces K ε as K ε/(1 − s): at 1 it does not bend (`_flexible.py`)
     link → rod           its mass and inertia times 1 − s, the shares of its ends times s: at 1 a massless link
     bushing → joint      its force g = g₀ + K u + C u̇ + … as g₀ + (g − g₀)/(1 − s): at 1 it does not yield
     force left out       the force, or some of its numbers, times 1 − s
     body held            a spring s K and a damper s D on the coordinates that are held, far faster than the motion
 
-Along the first three s is a small parameter of a rich scene that is nearly lean. The last has no such parameter: what a
+Along the first four s is a small parameter of a rich scene that is nearly lean. The last has no such parameter: what a
 coordinate does that is free says nothing of what happens when it is held; K at s = 1 is the virtual compliance 1/K.
 """
 
@@ -316,7 +317,8 @@ def reduced(scene: Scene, reductions: Iterable[Any]) -> Scene:
     for reduction in reductions:
         if not isinstance(reduction, AbstractReduction):
             raise ValueError(
-                f"Model.reduced: reductions must be Rod, Without, Joint, Merged, Frozen or Fixed, got {reduction!r}."
+                "Model.reduced: reductions must be Rod, Without, Joint, Merged, Frozen, Fixed or Rigid, got "
+                f"{reduction!r}."
             )
         scene = reduction.applied(scene)
     return scene

@@ -28,9 +28,10 @@ def static_preload(model: Model, forces: Sequence[str], *, t0=0.0) -> tuple[Mode
 
     Arguments:
         model: the scene.
-        forces: names of elements with a preload (`SpringDamper`, `TyreSpring`, `Bushing`, one's own), as many as the
-            mechanism has degrees of freedom that weight or other forces move; a bushing counts for three. Bushings that
-            resist rotations may be any number if they, joints and the springs named let nothing move.
+        forces: names of elements with a preload (`SpringDamper`, `TyreSpring`, `Bushing`, `BeamElement`, one's own), as
+            many as the mechanism has degrees of freedom that weight or other forces move; a bushing counts for three.
+            Bushings that resist rotations, and elements of beams, may be any number if they, joints and the springs
+            named let nothing move.
         t0: the time at which time-dependent forces are taken [s].
 
     Returns the model and the largest force [N] or moment [N m] that remains unbalanced. Differentiable: a gradient

@@ -25,7 +25,7 @@ def homogeneous(R, x):
 
 
 def potential(load, a, b, t):
-    """½ L εᵀK ε, with the logarithm of the 4×4 matrix of the motion by its power series in (H − I), summed by squaring:
+    """L (σ₀ᵀε + ½ εᵀK ε), with the logarithm of the 4×4 matrix of the motion by its power series in H − I near I:
     log H = 2ᵏ log H^(1/2ᵏ), the root by Newton (Denman & Beavers)."""
     ends = [
         homogeneous(frame.orientation @ triad, frame.position + frame.orientation @ point)
@@ -43,7 +43,7 @@ def potential(load, a, b, t):
     D = 64.0 * D
     d = jnp.stack([D[0, 3], D[1, 3], D[2, 3], D[2, 1], D[0, 2], D[1, 0]])
     strain = (d - load.reference) / load.length
-    return 0.5 * load.length * strain @ load.stiffness @ strain
+    return load.length * (load.preload @ strain + 0.5 * strain @ load.stiffness @ strain)
 
 
 def test_element_is_the_gradient_of_its_energy():
@@ -54,7 +54,15 @@ def test_element_is_the_gradient_of_its_energy():
         "b": lg.RigidBody(1.0, (1.0, 1.0, 1.0), (0.9, 0.1, -0.1), rotation([-0.1, 0.4, 0.2])),
     }
     axes = {"axes_a": rotation([0.1, 0.2, 0.0]), "axes_b": rotation([0.2, 0.1, 0.3])}
-    element = lg.BeamElement("a", "b", at_a=[0.2, 0.1, 0.0], at_b=[1.1, 0.2, 0.1], **axes, section=UNIT)
+    element = lg.BeamElement(
+        "a",
+        "b",
+        at_a=[0.2, 0.1, 0.0],
+        at_b=[1.1, 0.2, 0.1],
+        **axes,
+        section=UNIT,
+        preload=[0.3, -0.1, 0.2, 0.1, -0.2, 0.1],
+    )
     report = check_force(element, potential=potential, bodies=bodies, length=0.3)
     assert report.passed, report
 
