@@ -1,5 +1,6 @@
 """Flexible beams: nodes that are bodies, and elements between them that are forces."""
 
+import dataclasses
 from itertools import pairwise
 
 import equinox as eqx
@@ -14,6 +15,7 @@ from lgsens.model._beam_load import element
 from lgsens.model._beam_sections import BeamSection
 from lgsens.model._body import RigidBody
 from lgsens.model._forces import AbstractConnection
+from lgsens.model._joints import FixedJoint
 
 
 class BeamElement(AbstractConnection):
@@ -56,6 +58,11 @@ class BeamElement(AbstractConnection):
             f"BeamElement: `at_a` and `at_b` are the same point, {self.at_a}; an element has a length.",
             jnp.linalg.norm(self.at_b - self.at_a),
         )
+
+    def as_joint(self, kind, what):
+        if kind not in (None, "fixed"):
+            raise ValueError(f"{what}: `kind` must be 'fixed' or None for an element of a beam, got {kind!r}.")
+        return FixedJoint(self.a, self.b, at=self.at_b), dataclasses.replace(self, preload=None), None
 
     def load(self, a, b):
         sections = (self.at_a, self.at_b), (self.axes_a, self.axes_b)

@@ -11,9 +11,10 @@ from jaxtyping import Array, Float
 from lgsens._validate import is_concrete, suggestion
 from lgsens.liegroups import cross
 from lgsens.model._beam_sections import BeamSection
-from lgsens.model._beams import Beam, BeamElement
+from lgsens.model._beams import Beam
 from lgsens.model._body import RigidBody
-from lgsens.model._joints import FixedJoint
+from lgsens.model._forces import AbstractForce
+from lgsens.model._joints import AbstractJoint
 from lgsens.model._reductions import AbstractReduction, Scene
 from lgsens.model._scaled import ScaledForce
 
@@ -32,24 +33,23 @@ class Rigid(AbstractReduction):
 
     holds = False
 
-    def _elements(self, scene: Scene) -> dict[str, BeamElement]:
-        beams: dict[str, dict[str, BeamElement]] = {}
-        for name, force in scene.forces.items():
-            if isinstance(force, BeamElement):
-                beams.setdefault(name.rpartition(".")[0], {})[name] = force
+    def _rigid(self, scene: Scene) -> dict[str, tuple[AbstractJoint, AbstractForce, Any]]:
+        """Of each element the joint that it becomes, and what it does as it yields."""
+        beams: dict[str, list[str]] = {}
+        for name in scene.forces:
+            beams.setdefault(name.rpartition(".")[0], []).append(name)
         if self.beam not in beams:
-            raise ValueError(f"{self!r}: `beam`: {suggestion(self.beam, beams)}.")
-        return beams[self.beam]
+            raise ValueError(f"{self!r}: `beam`: {suggestion(self.beam, {*beams} - {''})}.")
+        return {name: scene.forces[name].as_joint("fixed", repr(self)) for name in beams[self.beam]}
 
     def applied(self, scene):
-        elements = self._elements(scene)
-        fixed = {name: FixedJoint(element.a, element.b, at=element.at_b) for name, element in elements.items()}
+        fixed = {name: joint for name, (joint, _, _) in self._rigid(scene).items()}
         if taken := sorted({*fixed} & {*scene.joints}):
             raise ValueError(f"{self!r}: a joint is called {taken[0]!r} already; give the beam another name.")
-        return scene.replaced(forces=dict.fromkeys(elements), joints=fixed)._replace(merge_fixed=True)
+        return scene.replaced(forces=dict.fromkeys(fixed), joints=fixed)._replace(merge_fixed=True)
 
     def toward(self, scene, before, s, rate):
-        yielding = {name: dataclasses.replace(of, preload=None) for name, of in self._elements(before).items()}
+        yielding = {name: blocked for name, (_, blocked, _) in self._rigid(before).items()}
         more = {f"{name}: stiffer": ScaledForce(of, factor=s / (1.0 - s)) for name, of in yielding.items()}
         return scene.replaced(forces=more)
 

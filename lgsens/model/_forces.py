@@ -77,7 +77,9 @@ class AbstractForce(eqx.Module):
 
     def as_joint(self, kind: str | None, what: str) -> tuple[AbstractJoint, "AbstractForce", "AbstractForce | None"]:
         """The joint that it becomes if it does not yield; what it does as it yields, and what the joint leaves out."""
-        raise ValueError(f"{what}: no joint takes the place of a {type(self).__name__}; one does of a Bushing.")
+        raise ValueError(
+            f"{what}: no joint takes the place of a {type(self).__name__}; one does of a Bushing and of a BeamElement."
+        )
 
     @abc.abstractmethod
     def loads(self, bodies: Mapping[str, RigidBody]) -> tuple[Attached, ...]:
