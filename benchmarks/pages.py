@@ -155,6 +155,7 @@ TABLES: dict[str, tuple[str, tuple[str, ...], Callable[..., str]]] = {
     "compile time": ("results/compile_time", ("compile_time",), of("compile_time", "markdown")),
     "loops": ("results/loops", ("loops",), of("loops", "markdown")),
     "chains": ("results/chains", ("chain",), of("chain", "table")),
+    "beams": ("flexible", ("beams",), of("beams", "table")),
     "memory": ("results/memory", ("memory",), of("memory", "table")),
     "precision": ("results/precision", ("precision",), of("precision", "table")),
     "design": ("results/optimizers", ("design",), of("design", "table", "methods")),

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Hashable, Mapping
+from typing import TypeGuard
 
 import equinox as eqx
 import jax
@@ -101,7 +102,7 @@ def _assemble(
                 constraints.append(Placed(StackRow(of, row.index), a, b, name, kept, i, more))
     loads, free = [], [body.coordinates for body in ordered]
     acting = {name: force.on(joints) for name, force in sorted(forces.items())}
-    connections = {name: force for name, force in acting.items() if isinstance(force, AbstractConnection)}
+    connections = {name: force for name, force in acting.items() if _is_connection(force)}
     members = [
         (force, frame[force.a], frame[force.b], places[force.a].offset, places[force.b].offset)
         for force in connections.values()
@@ -109,7 +110,7 @@ def _assemble(
     kinds = [(_kind(force), *(end is None for end in ends)) for force, *ends in members]
     rows = dict(zip(connections, evaluated(_load, members, kinds)))
     for name, force in acting.items():
-        for element, *ends in _attached(force, moving if force.on_merged else bodies, rows.get(name), places):
+        for element, *ends in _attached(name, force, moving if force.on_merged else bodies, rows, places):
             load = element.of
             a, b = (places[end] for end in ends)
             own = carriers(num_states(load))
@@ -176,10 +177,17 @@ def _or_ground(frames):
     return (ground if end is None else end for end in frames)
 
 
-def _attached(force: AbstractForce, bodies: Mapping[str, RigidBody], row: StackRow | None, places: Placements):
-    """The loads of a force as rows, each with the names of its bodies; `row`: that of what is known already."""
-    if isinstance(force, AbstractConnection):
-        return [(row, force.a, force.b)]
+def _is_connection(force: AbstractForce) -> TypeGuard[AbstractConnection]:
+    """One of one's own may have other loads than its base class says."""
+    return isinstance(force, AbstractConnection) and type(force).loads is AbstractConnection.loads
+
+
+def _attached(
+    name: str, force: AbstractForce, bodies: Mapping[str, RigidBody], rows: Mapping[str, StackRow], places: Placements
+) -> list[tuple[StackRow, str | None, str | None]]:
+    """The loads of a force as rows, each with the names of its bodies; `rows`: of connections."""
+    if _is_connection(force):
+        return [(rows[name], force.a, force.b)]
     one = lambda load: StackRow(jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], load), 0)
     return [(one(carried(load, places[a].offset, places[b].offset)), a, b) for load, a, b in force.loads(bodies)]
 

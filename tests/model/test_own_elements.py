@@ -297,3 +297,19 @@ def test_order_and_frames_of_a_force_of_ones_own():
     speed = [v[:3] + np.cross(R @ v[3:], place - origin) for v, R, origin in zip(twist, orientation, x)]
     f = 3.0 * np.sin(np.pi * 0.7 * 0.4**2) * np.asarray(vector)
     np.testing.assert_allclose(power, f @ (speed[1] - speed[0]), rtol=1e-12)
+
+
+class Doubled(lg.SpringDamper):
+    """Two of them: what a class of one's own says of its loads counts, not what its base class says of its load."""
+
+    def loads(self, bodies):
+        return 2 * super().loads(bodies)
+
+
+def test_loads_of_a_spring_of_ones_own():
+    body = {"mass": lg.RigidBody(2.0, (1.0, 1.0, 1.0), position=(0.0, 0.0, 1.5))}
+    of = lambda kind: lg.Model(
+        body, {}, {"s": kind(None, "mass", at_a=(0, 0, 0), at_b=(0, 0, 1.5), stiffness=100.0, free_length=1.0)}
+    )
+    falls = [lg.initial_state(of(kind)).vdot[2] for kind in (lg.SpringDamper, Doubled)]
+    np.testing.assert_allclose(falls, [-25.0, -50.0], rtol=1e-14)

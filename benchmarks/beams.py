@@ -1,0 +1,145 @@
+"""Beams: what elements cost, how fast they converge, and which links of a suspension have to bend.
+
+    python benchmarks/beams.py [--elements 8 32 128] [--repeats 5] [--out benchmarks/results]
+
+Cost: a beam on a hinge falls, h = 1 ms; the gradient is that of the height of its tip by the stiffnesses of its
+section, in reverse mode. Time per step as in chain.py, the difference of two runs. Convergence: the Princeton beam,
+loaded at 45° by 8.896 N, its tip against that of 16 and 32 elements extrapolated. Links: the five-link quarter-car with
+its strut, which carries spring and damper, and its trailing arm as steel tubes of 30 × 3 mm in four elements each; what
+bending changes of its comfort and the gradient, predicted by one program of the rich scene and run. Writes beams.json
+and prints tables.
+"""
+
+import itertools
+import json
+import math
+import os
+import statistics
+import time
+
+from benchmark import SINGLE_THREAD, circumstances, environment, interleaved, options, write
+
+STEPS, H = (20, 100), 1e-3
+STEEL = {"young": 2.1e11, "poisson": 0.3, "density": 7850.0}
+
+
+def cost(elements: int, repeats: int) -> dict:
+    import jax
+    import jax.numpy as jnp
+
+    import lgsens as lg
+
+    def height(stiffness, steps):
+        section = lg.BeamSection(stiffness, 1.0, [0.02, 0.01, 0.01], damping=1e-4)
+        beam = lg.Beam("b", section, [[0, 0, 0], [10.0, 0, 0]], elements=elements)
+        hinge = {"hinge": lg.RevoluteJoint(None, "b.0", at=[0, 0, 0], axis=[0, 0, 1.0])}
+        model = lg.Model(beam.bodies, hinge, beam.forces | {"gravity": lg.Gravity([0, -9.81, 0])})
+        return lg.simulate(model, t1=steps * H, num_steps=steps).body(beam.nodes[-1]).position[-1, 1]
+
+    stiffness, found, calls = jnp.array([1e6, 5e5, 5e5, 1e3, 1e3, 1e3]), {"elements": elements}, {}
+    for steps, (name, function) in itertools.product(STEPS, (("simulate", height), ("gradient", jax.grad(height)))):
+        started = time.perf_counter()
+        compiled = jax.jit(function, static_argnums=1).lower(stiffness, steps).compile()
+        found[f"{name}_compile_s"] = time.perf_counter() - started
+        calls[name, steps] = lambda compiled=compiled: jax.block_until_ready(compiled(stiffness))
+        calls[name, steps]()
+    times = interleaved(calls, repeats, seconds=3.0)
+    for name in ("simulate", "gradient"):
+        few, many = (times[name, steps].wall for steps in STEPS)
+        taken = statistics.median(long - short for short, long in zip(few, many))
+        found[f"{name}_us_per_step"] = taken / (STEPS[1] - STEPS[0]) * 1e6
+    return found
+
+
+def convergence() -> list[dict]:
+    import numpy as np
+
+    import lgsens as lg
+
+    section = lg.BeamSection.rectangle(3.2024e-3, 12.3777e-3, young=71.7e9, poisson=0.31, density=2800.0)
+    force, ends = 8.896 * np.array([0.0, np.sin(np.radians(45.0)), np.cos(np.radians(45.0))]), {}
+    for elements in (2, 4, 8, 16, 32):
+        beam = lg.Beam("b", section, [[0, 0, 0], [0.508, 0, 0]], elements=elements)
+        load = {"P": lg.AppliedForce(beam.nodes[-1], at=beam.points[-1], force=force)}
+        clamp = {"clamp": lg.FixedJoint(None, "b.0", at=beam.points[0])}
+        model = lg.Model(beam.bodies, clamp, beam.forces | load, merge_fixed=True)
+        run = lg.statics(model, loads={"P": np.linspace(0.0, 1.0, 4)})
+        ends[elements] = np.asarray(run.body(beam.nodes[-1]).position[-1])
+    limit = (4 * ends[32] - ends[16]) / 3
+    return [{"elements": n, "error": float(np.abs(end - limit).max() / np.abs(limit[1]))} for n, end in ends.items()]
+
+
+def links() -> list[dict]:
+    import lgsens as lg
+    from lgsens.accuracy import fidelity
+    from lgsens.examples import QuarterCar
+    from lgsens.model import Rigid
+
+    car, tube = QuarterCar.load(), lg.BeamSection.tube(0.03, 0.003, **STEEL)
+    bars = {"rollover_strut": tube, "trailing_arm": tube}
+    p = {"stiffness": car.spring.rate, "damping": car.damper.rate, "hardpoints": car.hardpoints}
+
+    def build(p):
+        model = car.with_values(**p).model(wheel="locked").flexible(bars, nodes={"spring": 2, "damper": 2})
+        elements = [name for name in model.forces if name.rpartition(".")[0] in bars]
+        return lg.static_preload(model, ["spring", "tyre", *elements])[0]
+
+    comfort = lg.Criterion(integrand=lambda s, p: s.body("chassis").acceleration[2] ** 2)
+    found = fidelity(comfort, build, p, [Rigid(name) for name in bars], t1=1.0, num_steps=200)
+    print(found)
+    rows = []
+    for row in found.rows:
+        verified = found.verified(row)
+        numbers = {"value": row.value, "gradient": row.gradient, "value_run": verified.value}
+        rows.append({"link": row.options[0][0].beam, **numbers, "gradient_run": verified.gradient})
+    return rows
+
+
+def table(document: dict) -> str:
+    lines = [circumstances(document["environment"]), ""]
+    lines += ["| elements | simulate [µs/step] | with gradient [µs/step] | compile: simulate, gradient [s] |"]
+    lines += ["|---|---|---|---|"]
+    lines += [
+        f"| {row['elements']} | {row['simulate_us_per_step']:.0f} | {row['gradient_us_per_step']:.0f} "
+        f"| {row['simulate_compile_s']:.1f}, {row['gradient_compile_s']:.1f} |"
+        for row in document["cost"]
+    ]
+    for short, long in itertools.pairwise(document["cost"]):
+        ratio = math.log(long["elements"] / short["elements"])
+        slopes = [
+            math.log(long[f"{name}_us_per_step"] / short[f"{name}_us_per_step"]) / ratio
+            for name in ("simulate", "gradient")
+        ]
+        lines.append(
+            f"\nSlope from {short['elements']} to {long['elements']} elements: simulate {slopes[0]:.2f}, with gradient "
+            f"{slopes[1]:.2f}."
+        )
+    lines += ["", "| elements | error of the tip, over its deflection |", "|---|---|"]
+    lines += [f"| {row['elements']} | {row['error']:.1e} |" for row in document["convergence"]]
+    lines += ["", "| rigid | of Ψ, predicted | run | of dΨ/dp, predicted | run |", "|---|---|---|---|---|"]
+    lines += [
+        f"| {row['link']} | {row['value']:+.2e} | {row['value_run']:+.2e} | {row['gradient']:.2e} "
+        f"| {row['gradient_run']:.2e} |"
+        for row in document["links"]
+    ]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = options(__doc__)
+    parser.add_argument("--elements", nargs="+", type=int, default=[8, 32, 128])
+    arguments = parser.parse_args()
+    path = arguments.out / "beams.json"
+    os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    document: dict = {"environment": environment(SINGLE_THREAD)}
+    document["cost"] = [cost(elements, arguments.repeats) for elements in arguments.elements]
+    document |= {"convergence": convergence(), "links": links()}
+    write(path, document)
+    print(table(json.loads(path.read_text(encoding="utf-8"))))
+
+
+if __name__ == "__main__":
+    main()
