@@ -194,7 +194,8 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
     for item in placed:
         of, axes = (item.element.of, 1) if isinstance(item.element, StackRow) else (item.element, 0)
         leaves, structure = jax.tree.flatten(of)
-        key = (structure, tuple((leaf.shape[axes:], leaf.dtype) for leaf in leaves), item.a is None, item.b is None)
+        shapes = tuple((leaf.shape[axes:], leaf.dtype) for leaf in leaves)
+        key = (structure, shapes, item.a is None, item.b is None, axes)
         groups.setdefault(key, []).append(item)
     stacks = []
     for members in groups.values():
