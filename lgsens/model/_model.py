@@ -247,8 +247,8 @@ class Model(eqx.Module):
                 hold node 0, the first of them by name, and the last one; a force holds the nearest node, which is
                 known only where points are.
 
-        The bodies are then "trailing_arm.0" … "trailing_arm.4". Preloads are as before, so that the scene is a little
-        off its rest (`equilibrium`). `lgsens.accuracy.fidelity` with `lgsens.model.Rigid("trailing_arm")` says what it
+        The bodies are then "trailing_arm.0" … "trailing_arm.4". Preloads are as before, so that the scene is not at
+        rest: `static_preload` also of its beam elements, or `equilibrium`. `lgsens.accuracy.fidelity` with `lgsens.model.Rigid("trailing_arm")` says what it
         changes. Raises `ValueError` for unknown names, links that other than two joints hold, and what `Beam` refuses.
         """
         return self._of(flexible(self._scene, links, elements, up, nodes or {}))

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
@@ -31,7 +32,7 @@ def static_preload(model: Model, forces: Sequence[str], *, t0=0.0) -> tuple[Mode
         forces: names of elements with a preload (`SpringDamper`, `TyreSpring`, `Bushing`, `BeamElement`, one's own), as
             many as the mechanism has degrees of freedom that weight or other forces move; a bushing counts for three.
             Bushings that resist rotations, and elements of beams, may be any number if they, joints and the springs
-            named let nothing move.
+            named let nothing move that a load moves.
         t0: the time at which time-dependent forces are taken [s].
 
     Returns the model and the largest force [N] or moment [N m] that remains unbalanced. Differentiable: a gradient
@@ -81,9 +82,26 @@ def _solve(model: Model, forces: tuple[str, ...], t):
     else:
         upper = jnp.eye(k, dtype=a.dtype)
     matrix = jnp.block([[upper, a], [a.T, jnp.zeros((n, n), a.dtype)]])
-    solution = jnp.linalg.solve(matrix, jnp.concatenate([-unbalanced, jnp.zeros(n, a.dtype)]))
+    rhs = jnp.concatenate([-unbalanced, jnp.zeros(n, a.dtype)])
+    solution = _shortest(matrix, rhs) if yields.any() else jnp.linalg.solve(matrix, rhs)
     values = no_preload.at[~yields].set(solution[k + jacobian.shape[0] :])
     if yields.any():
         values = values.at[yields].set(rate * (soft.T @ solution[:k]))
     left = unbalanced + jacobian.T @ solution[k : k + jacobian.shape[0]] + by_preload @ values
     return each(values), jnp.max(jnp.abs(left))
+
+
+def _shortest(matrix, rhs):
+    """The shortest solution of symmetric equations, in the sense of least squares.
+
+    They are singular where something moves freely that no load moves, a wheel on its hinge. No force depends on how far
+    it does, so that the derivative is that of regular equations, A δx = δb − δA x.
+    """
+    largest = lax.stop_gradient(jnp.max(jnp.abs(matrix), axis=1))
+    scale = lax.rsqrt(jnp.where(largest > 0.0, largest, 1.0))  # rates of a beam along and across it differ by 1e6
+
+    def solve(_, b):
+        scaled = scale[:, None] * matrix * scale[None, :]
+        return scale * (jnp.linalg.pinv(scaled, rtol=64 * float(jnp.finfo(matrix.dtype).eps)) @ (scale * b))
+
+    return lax.custom_linear_solve(lambda x: matrix @ x, rhs, solve, symmetric=True)

@@ -94,6 +94,25 @@ def test_a_beam_that_bears_its_load_in_the_reference_configuration():
     assert np.abs(start.vdot).max() < 1e-7  # 1e-11 N on nodes of 1 kg, and moments on their inertias of 1e-3 kg m²
 
 
+def test_what_moves_freely_at_the_end_of_a_beam_does_not_hinder_its_preloads():
+    """A wheel on a hinge, whose turning no load moves: N, Q and M of its weight; and their derivative by the weight."""
+
+    def held(weight):
+        model, beam = cantilever((0.0, 0.0, 0.0), elements=1)
+        wheel = lg.RigidBody(weight / 10.0, (0.1, 0.2, 0.1), position=(1.5, 0.3, 0.0))
+        hinge = lg.RevoluteJoint("b.1", "wheel", at=(1.5, 0.3, 0.0), axis=(0, 1.0, 0))
+        gravity = {"gravity": lg.Gravity((0.0, 0.0, -10.0))}
+        # Nodes of no weight: the wheel's is all that there is.
+        light = {name: dataclasses.replace(body, mass=jnp.asarray(1e-9)) for name, body in model.bodies.items()}
+        model = lg.Model(light | {"wheel": wheel}, model.joints | {"hinge": hinge}, {**model.forces, **gravity})
+        return lg.static_preload(model, list(beam.forces))[0].forces["b.0"].preload
+
+    expected = np.array([0.0, 0.0, -1.0, -0.3, 0.75, 0.0])  # of 1 N at 0.75 m and 0.3 m from the middle of the element
+    preload, slope = jax.jvp(held, (20.0,), (1.0,))
+    np.testing.assert_allclose(preload, 20.0 * expected, rtol=0, atol=1e-6)  # the nodes' 1e-8 N
+    np.testing.assert_allclose(slope, expected, rtol=0, atol=1e-7)
+
+
 @pytest.mark.slow  # three programs
 def test_fidelity_predicts_what_bending_does():
     """A beam on a torsion spring, with a mass at its end: rigid, in fact, and by the derivative by its stiffness."""
