@@ -181,6 +181,14 @@ class SO3(AbstractLieGroup):
         e = inverse_tangent_coefficient(s)
         return (1.0 - s * e) * y + 0.5 * cross(x, y) + (e * _dot(x, y)) * x
 
+    def tangent_inv_gradient(self, x, y):
+        """`∂(T(x)^{-1} y)/∂x`, shape (3, 3), `T(x)⁻¹ y = (1 - s e) y + x × y/2 + e (x·y) x`. `x`, `y`: shape (3,)."""
+        s, along = _dot(x, x), _dot(x, y)
+        e, slope = (inverse_tangent_coefficient(s, order) for order in range(2))
+        by_angle = 2.0 * slope * along * x - 2.0 * (e + s * slope) * y
+        products = by_angle[:, None] * x[None, :] + e * x[:, None] * y[None, :]
+        return products + e * along * jnp.eye(3, dtype=x.dtype) - 0.5 * skew(y)
+
     def to_ambient(self, q, w):
         return _matmul(q, skew(w))
 

@@ -192,7 +192,7 @@ def _attached(
 ) -> list[tuple[Any, str | None, str | None]]:
     """The loads of a force, or their rows, each with the names of its bodies; `rows`: of connections."""
     if name in rows:
-        return [(rows[name], *force.bodies)]
+        return [(rows[name], force.bodies[0], force.bodies[1])]
     return [(carried(load, places[a].offset, places[b].offset), a, b) for load, a, b in force.loads(bodies)]
 
 

@@ -248,8 +248,9 @@ class Model(eqx.Module):
                 known only where points are.
 
         The bodies are then "trailing_arm.0" … "trailing_arm.4". Preloads are as before, so that the scene is not at
-        rest: `static_preload` also of its beam elements, or `equilibrium`. `lgsens.accuracy.fidelity` with `lgsens.model.Rigid("trailing_arm")` says what it
-        changes. Raises `ValueError` for unknown names, links that other than two joints hold, and what `Beam` refuses.
+        rest: `static_preload` also of its beam elements, or `equilibrium`. `lgsens.accuracy.fidelity` with
+        `lgsens.model.Rigid("trailing_arm")` says what bending changes. Raises `ValueError` for unknown names, links
+        that other than two joints hold, and what `Beam` refuses.
         """
         return self._of(flexible(self._scene, links, elements, up, nodes or {}))
 

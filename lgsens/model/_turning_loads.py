@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from lgsens.liegroups import SO3, cross, skew, turn, turn_back
 from lgsens.model._constraints import total
 from lgsens.model._elements import body_fixed
-from lgsens.model._frames import BODY_B, ROTATION, ROTATION_B, TRANSLATION_B, TURNING_A, TURNING_B, embedded
+from lgsens.model._frames import BODY_B, ROTATION, ROTATION_A, ROTATION_B, TRANSLATION_B, TURNING_A, TURNING_B, embedded
 from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, BushingLoad, LoadTangents
 from lgsens.model._signals import AbstractSignal, Prescribed, at_time, constant_of
 from lgsens.model._stack import load_tangents
@@ -117,13 +117,19 @@ class TorsionLoad(AbstractLoad):
         return self._moment(twist, jnp.sum(row * jnp.concatenate([va, vb])), t) * row
 
 
-class RotationLoad(AbstractLoad):
+class RotationLoad(AbstractClosedFormLoad):
     """Springs and dampers against the rotation φ of b in a, by its vector: m = m₀ + K φ + C φ̇, E = ½ φᵀKφ + m₀ᵀφ;
     and f_i(φ_i), g_i(φ̇_i) more where there are curves.
 
     The columns of `triad_a` and `triad_b`, in the frames of the bodies, are three axes that coincide in the reference
-    configuration; φ = log S with S = (R_a T_a)ᵀ R_b T_b, whose angular velocity in `triad_b` is ω = T(φ) φ̇. So on b
-    acts −T(φ)⁻ᵀ m, in that triad, and its opposite on a. K and C are diagonal.
+    configuration; φ = log S with S = (R_a T_a)ᵀ R_b T_b, whose angular velocity in `triad_b` is
+
+        ω = T(φ) φ̇ = E [Ω_a, Ω_b],     E = [−SᵀT_aᵀ, T_bᵀ],     so that Q = −Eᵀλ,     λ = T(φ)⁻ᵀ m = T(−φ)⁻¹ m.
+
+    K and C are diagonal; the slopes of curves add to them. With δSᵀy = (Sᵀy)~ E δθ, and of the moment T_a S λ on a,
+
+        ∂ω/∂θ = −(SᵀT_aᵀΩ_a)~ E,     −∂(Eᵀλ)/∂θ|_λ = [−T_a S λ̃ E, 0],
+        ∂λ/∂θ = (∂(T(−φ)⁻¹m)/∂φ + T⁻ᵀ (K + C ∂(T⁻¹ω)/∂φ)) T⁻¹E + T⁻ᵀC T⁻¹ ∂ω/∂θ,     ∂λ/∂Ω = T⁻ᵀC T⁻¹E.
     """
 
     triad_a: Float[Array, "3 3"]
@@ -141,18 +147,44 @@ class RotationLoad(AbstractLoad):
     def acts_on(self):
         return TURNING_A + TURNING_B
 
-    def force(self, a, b, va, vb, t):
+    def _turned(self, a, b, va, vb):
+        """Sᵀ, φ, SᵀT_aᵀΩ_a, ω and φ̇."""
         group = SO3()
         to_b = group.compose(self.triad_b.T, group.compose(b.orientation.T, group.compose(a.orientation, self.triad_a)))
         phi = group.log(to_b.T)
-        spin = turn_back(self.triad_b, vb[ROTATION]) - turn(to_b, turn_back(self.triad_a, va[ROTATION]))
-        rate = group.tangent_inv_mv(phi, spin)
-        m = self.preload + self.stiffness * phi + self.damping * rate
-        m += osculating(self.springs, phi)[0] + osculating(self.dampers, rate)[0]
-        on_a = group.tangent_inv_mv(-phi, m)  # T(φ)ᵀ = T(−φ)
+        spin_a = turn(to_b, turn_back(self.triad_a, va[ROTATION]))
+        spin = turn_back(self.triad_b, vb[ROTATION]) - spin_a
+        return to_b, phi, spin_a, spin, group.tangent_inv_mv(phi, spin)
+
+    def _moment(self, phi, rate):
+        """m, and K and C with the slopes of the curves."""
+        push, stiffness = osculating(self.springs, phi)
+        drag, damping = osculating(self.dampers, rate)
+        m = self.preload + self.stiffness * phi + self.damping * rate + push + drag
+        return m, self.stiffness + stiffness, self.damping + damping
+
+    def force(self, a, b, va, vb, t):
+        to_b, phi, _, _, rate = self._turned(a, b, va, vb)
+        m, _, _ = self._moment(phi, rate)
+        on_a = SO3().tangent_inv_mv(-phi, m)  # T(φ)ᵀ = T(−φ)
         zero = jnp.zeros_like(m)
         moment_a = turn(self.triad_a, turn_back(to_b, on_a))
         return jnp.concatenate([zero, moment_a, zero, -turn(self.triad_b, on_a)])
+
+    def tangents(self, a, b, va, vb, t):
+        group = SO3()
+        to_b, phi, spin_a, spin, rate = self._turned(a, b, va, vb)
+        m, stiffness, damping = self._moment(phi, rate)
+        to_a = self.triad_a @ to_b.T
+        gradient = embedded(self.triad_b.T, None, ROTATION_B) - embedded(to_a.T, None, ROTATION_A)  # E
+        slope = group.tangent_inv(phi)
+        by_turns, by_rate = slope @ gradient, slope.T * damping[None, :]
+        softness = slope.T * stiffness[None, :] - group.tangent_inv_gradient(-phi, m)
+        softness += by_rate @ group.tangent_inv_gradient(phi, spin)
+        position = softness @ by_turns - by_rate @ slope @ skew(spin_a) @ gradient
+        moment = to_a @ skew(group.tangent_inv_mv(-phi, m)) @ gradient
+        geometric = embedded(moment, ROTATION_A, None)
+        return LoadTangents(-gradient.T @ position - geometric, -gradient.T @ by_rate @ by_turns)
 
 
 class LoadSum(AbstractClosedFormLoad):
