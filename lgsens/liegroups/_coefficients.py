@@ -17,12 +17,11 @@ For `T^{-1}`, with the partial fractions of the cotangent,
 
 of which all derivatives are sums of positive terms below the pole at `θ = 2π`: nothing cancels, and there is no switch.
 The terms n = 1, 2 as they are, the others as a power series, Σ_j s^j Σ_{n ≥ 3} 2 / p_n^(j+1): at 2π each of its terms
-is 9 times smaller than the one before. The first one left out of the second derivative there is 2e-15 of the whole.
+is 9 times smaller than the one before. The first one left out of the second derivative there is 7e-16 of their sum.
 """
 
 import math
 from fractions import Fraction
-from math import factorial
 
 import jax.numpy as jnp
 
@@ -31,7 +30,7 @@ _TERMS = 14
 
 
 def _stumpff(k):
-    return tuple(float(Fraction((-1) ** j, factorial(k + 2 * j))) for j in range(_TERMS))
+    return tuple(float(Fraction((-1) ** j, math.factorial(k + 2 * j))) for j in range(_TERMS))
 
 
 _C1, _C2, _C3 = _stumpff(1), _stumpff(2), _stumpff(3)

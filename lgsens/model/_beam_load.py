@@ -151,9 +151,9 @@ class BeamLoad(AbstractClosedFormLoad):
             at_a(skew(cross(spin, arm))) - skew(spin) @ by_arm
         )
         by_rotation = at_a(to_axes @ skew(spin)) - at_b(self.triad_b.T @ skew(turned))
-        stress = _GROUP.tangent_inv_rmv_gradient(d, motion.stress) + softness
-        stress += by_rate @ _GROUP.tangent_inv_gradient(d, motion.twist)
-        position = stress @ by_screw + by_rate @ slope @ jnp.concatenate([by_translation, by_rotation])
+        turning = _GROUP.tangent_inv_rmv_gradient(d, motion.stress) + softness  # ∂λ/∂d
+        turning += by_rate @ _GROUP.tangent_inv_gradient(d, motion.twist)
+        position = turning @ by_screw + by_rate @ slope @ jnp.concatenate([by_translation, by_rotation])
 
         moved = at_b(b.orientation @ skew(force))
         on_a = at_a(skew(turn(b_in_a, moment)) + skew(arm) @ skew(in_a)) - skew(in_a) @ by_arm

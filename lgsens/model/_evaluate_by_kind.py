@@ -33,9 +33,12 @@ def stacked(leaves: Sequence[Any]):
 
 def joined(members: Sequence[Any]) -> Any:
     """Pytrees, or rows of such, along a new leading axis: of one structure but for names, of which the first counts."""
-    if not isinstance(members[0], StackRow):
+    rows = [isinstance(member, StackRow) for member in members]
+    if not any(rows):
         leaves = zip(*map(jax.tree.leaves, members))
         return jax.tree.unflatten(jax.tree.structure(members[0]), map(stacked, leaves))
+    alone = lambda member: StackRow(jax.tree.map(lambda leaf: stacked([leaf]), member), 0)
+    members = [member if row else alone(member) for member, row in zip(members, rows)]
     sources = list({id(row.of): row.of for row in members}.values())
     lengths = [next(iter(leaf.shape[0] for leaf in jax.tree.leaves(source)), 0) for source in sources]
     starts = dict(zip(map(id, sources), np.cumsum([0, *lengths])))

@@ -13,10 +13,7 @@ from lgsens.liegroups import cross
 from lgsens.model._beam_sections import BeamSection
 from lgsens.model._beams import Beam
 from lgsens.model._body import RigidBody
-from lgsens.model._forces import AbstractForce
-from lgsens.model._joints import AbstractJoint
-from lgsens.model._reductions import AbstractReduction, Scene
-from lgsens.model._scaled import ScaledForce
+from lgsens.model._reductions import AbstractReduction, Joint, Scene, reduced
 
 
 class Rigid(AbstractReduction):
@@ -33,31 +30,28 @@ class Rigid(AbstractReduction):
 
     holds = False
 
-    def _rigid(self, scene: Scene) -> dict[str, tuple[AbstractJoint, AbstractForce, Any]]:
-        """Of each element the joint that it becomes, and what it does as it yields."""
-        beams: dict[str, list[str]] = {}
+    def _joints(self, scene: Scene) -> list[Joint]:
+        """The reductions of its elements."""
+        beams: dict[str, list[Joint]] = {}
         for name in scene.forces:
-            beams.setdefault(name.rpartition(".")[0], []).append(name)
+            beams.setdefault(name.rpartition(".")[0], []).append(Joint(name, "fixed"))
         if self.beam not in beams:
             raise ValueError(f"{self!r}: `beam`: {suggestion(self.beam, {*beams} - {''})}.")
-        return {name: scene.forces[name].as_joint("fixed", repr(self)) for name in beams[self.beam]}
+        return beams[self.beam]
 
     def applied(self, scene):
-        fixed = {name: joint for name, (joint, _, _) in self._rigid(scene).items()}
-        if taken := sorted({*fixed} & {*scene.joints}):
-            raise ValueError(f"{self!r}: a joint is called {taken[0]!r} already; give the beam another name.")
-        return scene.replaced(forces=dict.fromkeys(fixed), joints=fixed)._replace(merge_fixed=True)
+        return reduced(scene, self._joints(scene))._replace(merge_fixed=True)
 
     def toward(self, scene, before, s, rate):
-        yielding = {name: blocked for name, (_, blocked, _) in self._rigid(before).items()}
-        more = {f"{name}: stiffer": ScaledForce(of, factor=s / (1.0 - s)) for name, of in yielding.items()}
-        return scene.replaced(forces=more)
+        for joint in self._joints(before):
+            scene = joint.toward(scene, before, s, rate)
+        return scene
 
 
 def flexible(scene: Scene, links: Mapping[str, BeamSection], elements: int, up, nodes: Mapping[str, int]) -> Scene:
     """See `Model.flexible`."""
-    if unknown := sorted({*nodes} - {*scene.joints, *scene.forces}):
-        known = {*scene.joints, *scene.forces}
+    known = {*scene.joints, *scene.forces}
+    if unknown := sorted({*nodes} - known):
         raise ValueError(f"Model.flexible: `nodes`: {suggestion(unknown[0], known)}.")
     for link, section in links.items():
         if link not in scene.bodies:

@@ -104,11 +104,9 @@ class AbstractConnection(AbstractForce):
         """The load, given the frames of its bodies in their reference configuration."""
 
     def loads(self, bodies):
-        """As in `AbstractForce`, of one alone; those of a model are made together, one program for each kind."""
-        known = [bodies[name].frame for name in (self.a, self.b) if name is not None]
-        ground = ground_frame(known[0].position.dtype)
-        ends = (ground if name is None else bodies[name].frame for name in (self.a, self.b))
-        return (Attached(self.load(*ends), self.a, self.b),)
+        """As in `AbstractForce`, of one alone; many that are alike are made by one program (`_assemble`)."""
+        dtype = next(bodies[name].mass.dtype for name in self.bodies if name is not None)
+        return (Attached(self.load(*(_frame(bodies, name, dtype) for name in self.bodies)), self.a, self.b),)
 
 
 def _distance(a, b):

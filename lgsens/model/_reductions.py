@@ -167,13 +167,13 @@ class Without(AbstractReduction):
 
 
 class Joint(AbstractReduction):
-    """A `Bushing` becomes the joint that it is nearly, of its name.
+    """A `Bushing`, or an element of a `Beam`, becomes the joint that it is nearly, of its name.
 
     Arguments:
         bushing: name of the force element.
         kind: "spherical", "revolute" (about the axis of least rate) or "fixed"; None: by its rates, spherical if it
             resists no rotation, or one about less than two axes, revolute if one rate is below a hundredth of the
-            largest, else fixed.
+            largest, else fixed. An element of a beam becomes a fixed joint (`Rigid`: all of them).
 
     What it resists in directions that the joint leaves free is left out. Raises `ValueError`, when it is applied, for
     elements that are no bushings, and for rates that are not known (traced) and would choose: give `kind`.

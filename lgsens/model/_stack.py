@@ -194,8 +194,7 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
     for item in placed:
         of, axes = (item.element.of, 1) if isinstance(item.element, StackRow) else (item.element, 0)
         leaves, structure = jax.tree.flatten(of)
-        shapes = tuple((leaf.shape[axes:], leaf.dtype) for leaf in leaves)
-        key = (structure, shapes, item.a is None, item.b is None, axes)
+        key = (structure, tuple((leaf.shape[axes:], leaf.dtype) for leaf in leaves), item.a is None, item.b is None)
         groups.setdefault(key, []).append(item)
     stacks = []
     for members in groups.values():

@@ -37,13 +37,13 @@ def _inverse_series(s, order):
 
 # Errors in units of eps, for the value and two derivatives, relative to the larger of the derivative at s and
 # at 0. c_k: about one eps for the value; in each derivative of the closed form above the switch, terms larger
-# than the result cancel (measured: 0.7, 2.3, 8.8). The quotient rule of the inverse adds terms 20 times its
-# second derivative, and its value is amplified by the pole at 2π (measured: 4.4, 20, 42).
+# than the result cancel (measured: 0.7, 2.3, 8.8). The inverse, a sum of positive terms, is amplified by its pole at
+# 2π alone (measured: 3.3, 6.3, 9.4).
 COEFFICIENTS = {
     "c1": (_coefficients.c1, lambda s, order: _series(1, s, order), (2, 5, 20)),
     "c2": (_coefficients.c2, lambda s, order: _series(2, s, order), (2, 5, 20)),
     "c3": (_coefficients.c3, lambda s, order: _series(3, s, order), (2, 5, 20)),
-    "inverse": (_coefficients.inverse_tangent_coefficient, _inverse_series, (10, 50, 100)),
+    "inverse": (_coefficients.inverse_tangent_coefficient, _inverse_series, (10, 15, 20)),
 }
 
 

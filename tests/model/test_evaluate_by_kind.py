@@ -106,3 +106,19 @@ def test_poses_are_taken_once_for_each_side_of_all_elements(scene):
         each.primitive.name == "gather" and each.invars[0].aval.shape == orientations for each in equations(program)
     ]
     assert sum(taken) == 2
+
+
+def test_springs_of_two_kinds_are_one_stack():
+    """Four that are alike are made together and one by itself: what the equations see of them is the same."""
+    springs = {f"long{i}": {"free_length": 1.0} for i in range(4)} | {"short": {"preload": 7.0}}
+    forces = {
+        name: lg.SpringDamper(None, "mass", at_a=(0, 0, 0), at_b=(0, 0, 1.5), stiffness=100.0, **given)
+        for name, given in springs.items()
+    }
+    model = lg.Model({"mass": lg.RigidBody(2.0, (1.0, 1.0, 1.0), position=(0, 0, 1.5))}, {}, forces)
+    (stack,) = model.system().loads
+    assert stack.owners == tuple(sorted(springs))
+    # 50 N from each of those that are 0.5 m too long, on 2 kg.
+    np.testing.assert_allclose(lg.initial_state(model).vdot[2], -(4 * 50.0 + 7.0) / 2.0, rtol=1e-14)
+    slope = jax.grad(lambda k: lg.initial_state(eqx.tree_at(lambda m: m.forces["long2"].stiffness, model, k)).vdot[2])
+    np.testing.assert_allclose(slope(jnp.asarray(100.0)), -0.25, rtol=1e-14)

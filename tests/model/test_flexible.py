@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lgsens as lg
-from lgsens.model import Rigid
+from lgsens.model import Joint, Rigid
 
 TUBE = lg.BeamSection.tube(0.04, 0.004, young=2.1e11, poisson=0.3, density=7850.0)
 
@@ -150,6 +150,11 @@ def test_fidelity_predicts_what_bending_does():
         (lambda: four_bar().flexible({"coupler": TUBE}, nodes={"spring": 5}), "'spring' must be at 0 to 4, got 5"),
         (lambda: four_bar().flexible({"coupler": TUBE}, nodes={"b": 0}), r"two joints; 'coupler' has \['b', 'c'\]"),
         (lambda: four_bar().flexible({"rocker": TUBE}, up=(0, 1, 0)), "`up` .* lies along the beam"),
+        (
+            lambda: bent().reduced(Joint("coupler.0", "revolute")),
+            "'fixed' or None for an element of a beam, got 'revolute'",
+        ),
+        (lambda: dataclasses.replace(bent().forces["coupler.0"], preload=[1.0]), "`preload` must have shape"),
         (lambda: four_bar().reduced(Rigid("coupler")), r"Rigid\(beam='coupler'\): `beam`"),
         (lambda: with_torsion().flexible({"coupler": TUBE}), "'twist', a TorsionSpringDamper, holds on to 'coupler'"),
     ],
@@ -157,6 +162,10 @@ def test_fidelity_predicts_what_bending_does():
 def test_bad_input(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def bent():
+    return four_bar().flexible({"coupler": TUBE})
 
 
 def with_torsion():
