@@ -19,7 +19,7 @@ from lgsens._validate import as_count
 from lgsens.dynamics import (
     AbstractSystem,
     State,
-    acceleration_and_jerk,
+    accelerations,
     consistent_velocity,
     initial_state,
     split_velocity,
@@ -97,8 +97,8 @@ def _growth_jit(system: AbstractSystem, t0, t1, num_steps: int, integrator: Abst
     def motion(x, y):
         q = group.retract(q0, x)
         v = consistent_velocity(system, q, v0 + y, t0)
-        vdot, lam, jerk = acceleration_and_jerk(system, q, v, t0)
-        moved = initial._replace(state=State(q=q, v=v, vdot=vdot, lam=lam, a=vdot), jerk=jerk)
+        vdot, lam = accelerations(system, q, v, t0)
+        moved = initial._replace(state=State(q=q, v=v, vdot=vdot, lam=lam, a=vdot))
         start = begin(integrator.scheme, system, t0, None, moved)
         trajectory, details = run(system, start, t0, t1, num_steps, integrator, DirectDifferentiation())
         return trajectory.states.q, (trajectory.t, trajectory.result, details)

@@ -249,7 +249,7 @@ def _on_the_fly(task: _Task, p) -> _Found:
 
     def start(p):
         system, begun = task.begin(p)
-        laid = integrator.lay(system, begun.start, begun.jerk, task.t0, task.t1, task.num_steps)
+        laid = integrator.lay(system, begun.start, task.t0, task.t1, task.num_steps)
         state0 = begun.start.at(system, laid.grid.first_size)
         return (state0, Parameters(system, laid.grid)), (begun, laid._replace(found=None, stats=None))
 

@@ -23,6 +23,7 @@ from lgsens.dynamics._initial import (
     given_way as given_way,
     initial_state as initial_state,
     is_redundant as is_redundant,
+    normal_jerk as normal_jerk,
     split_velocity as split_velocity,
 )
 from lgsens.dynamics._kinematics import (

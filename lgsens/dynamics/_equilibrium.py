@@ -112,4 +112,4 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
             redundant = (result == RESULTS.successful) & is_redundant(system, constraint_jacobian(system, q, t))
             result = jnp.where(redundant, RESULTS.redundant_constraints, result).astype(jnp.int32)
     result = jnp.where(system.is_valid(), result, RESULTS.invalid_numbers).astype(jnp.int32)
-    return Initial(State(q=q, v=v, vdot=vdot, lam=lam, a=vdot), zero, result, system.constraint(q, t))
+    return Initial(State(q=q, v=v, vdot=vdot, lam=lam, a=vdot), result, system.constraint(q, t))

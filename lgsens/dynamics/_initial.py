@@ -9,7 +9,12 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._xla import while_loop
-from lgsens.dynamics._constraints import fixed_velocity_rate, full_jacobian, prescribed_velocity
+from lgsens.dynamics._constraints import (
+    constraint_acceleration,
+    fixed_velocity_rate,
+    full_jacobian,
+    prescribed_velocity,
+)
 from lgsens.dynamics._matrices import ConstrainedMass, constraint_jacobian, factorized, for_once, mass_scale
 from lgsens.dynamics._redundant import softness
 from lgsens.dynamics._results import RESULTS
@@ -23,7 +28,6 @@ class Initial(NamedTuple):
     """An initial state and how its computation ended."""
 
     state: State
-    jerk: Float[Array, " k"]  # v̈ at the initial time
     result: Int[Array, ""]  # a value of RESULTS
     violation: Float[Array, " m_p"]  # Φ after assembly
     factors: Factors | None = None  # of `ConstrainedMass` there
@@ -47,6 +51,12 @@ def consistent_velocity(system: AbstractSystem, q, v, t, factors: Factors | None
     return kkt.solve(kkt.mass @ v, -prescribed_velocity(system, q, t))[0]
 
 
+def least_velocity(system: AbstractSystem, q, rows, t, factors: Factors | None = None) -> Float[Array, " k"]:
+    """The x of least kinetic energy with J x = `rows`, shape (m,)."""
+    zero = jnp.zeros(system.group.dim, rows.dtype)
+    return ConstrainedMass.of(system, q, t, factors).solve(zero, rows)[0]
+
+
 def given_way(system: AbstractSystem, q, lam, t) -> Float[Array, " k"] | None:
     """The least displacement, in the metric of M, with Φ = c λ: what joints of a `softness` c give way under λ."""
     soft = softness(system)
@@ -55,7 +65,7 @@ def given_way(system: AbstractSystem, q, lam, t) -> Float[Array, " k"] | None:
     gap = soft * lam
     if system.num_velocity_rows:  # which say nothing of positions
         gap = gap.at[-system.num_velocity_rows :].set(0.0)
-    return ConstrainedMass.of(system, q, t).solve(jnp.zeros(system.group.dim, lam.dtype), gap)[0]
+    return least_velocity(system, q, gap, t)
 
 
 def accelerations(system: AbstractSystem, q, v, t, factors: Factors | None = None):
@@ -97,6 +107,13 @@ def _implicit_accelerations(system: AbstractSystem, q, v, t):
     start = jnp.zeros(k + jacobian.shape[0], v.dtype)
     y = lax.custom_root(equation, start, newton, tangent_solve)
     return y[:k], scale * y[k:]
+
+
+def normal_jerk(system: AbstractSystem, q, v, vdot, t, factors: Factors | None = None) -> Float[Array, " k"]:
+    """N v̈: the part of v̈ that the constraints ask for, the least with J v̈ + d(J v̇ + γ)/dt = 0 at fixed v̈ = 0."""
+    motion = system.group.to_ambient(q, v), vdot, jnp.ones_like(t)
+    rate = lambda q, v, t: constraint_acceleration(system, q, v, vdot, t)
+    return least_velocity(system, q, -jax.jvp(rate, (q, v, t), motion)[1], t, factors)
 
 
 def acceleration_and_jerk(system: AbstractSystem, q, v, t, factors: Factors | None = None):
@@ -194,7 +211,7 @@ def initial_state(system: AbstractSystem, t) -> Initial:
     _, v_ref = system.reference()
     factors = ConstrainedMass.of(system, q, t).factors
     v = system.settled(q, consistent_velocity(system, q, v_ref, t, factors), t)
-    vdot, lam, vddot = acceleration_and_jerk(system, q, v, t, factors)
+    vdot, lam = accelerations(system, q, v, t, factors)
     state = State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
     dtype = v.dtype
     redundant = softness(system) is None and is_redundant(system, constraint_jacobian(system, q, t))
@@ -205,4 +222,4 @@ def initial_state(system: AbstractSystem, t) -> Initial:
     result = jnp.where(redundant, RESULTS.redundant_constraints, result)
     result = jnp.where(assembled, result, RESULTS.assembly_failed)
     result = jnp.where(system.is_valid(), result, RESULTS.invalid_numbers).astype(jnp.int32)
-    return Initial(state, vddot, result, violation, factors)
+    return Initial(state, result, violation, factors)

@@ -22,10 +22,11 @@ h → 0, L e = b is the linear differential equation for (η, ν, ω, μ) h² = 
 
 With η = 0 at t0 the third line and the derivatives of the last, B (ν − c) = 0 and B (ω − l − ċ) = −Ḃ (ν − c), give
 
-    ν_0 = c − P c,     [[M, Bᵀ], [B, 0]] [ω_0; μ_0] = [−C_t ν_0;  B (l + ċ) − Ḃ (ν_0 − c)],
+    ν_0 = c − P c − Δ (½ − α_f) P v̈,     [[M, Bᵀ], [B, 0]] [ω_0; μ_0] = [−C_t ν_0;  B (l + ċ) − Ḃ (ν_0 − c)],
 
-P the M-orthogonal projection on what the joints allow; e.a_0 = e.v̇_0 + O(h³). The first state of the run itself has
-e.v̇ = 0: the transients in which it goes from there to here are not estimated.
+P the M-orthogonal projection on what the joints allow; e.a_0 = e.v̇_0 + O(h³). The last term of ν_0 is what is left by
+the part of v̈ that a_0 lacks (`AbstractGeneralizedAlpha.start`). The first state of the run itself has e.v̇ = 0: the
+transients in which it goes from there to here are not estimated.
 
 v̈ and v⃛ are differences of v̇, at the middle of each step. That of v⃛, on equal steps
 (v̇_{n+2} − v̇_{n+1} − v̇_n + v̇_{n−1})/(2h²), does not see the part (−1)ⁿ in which transients of v̇ remain
@@ -67,8 +68,10 @@ def alpha_defects(scheme: AbstractAlpha, system: AbstractSystem, grid: AbstractG
     missed_x = jax.vmap(lambda *at: scheme.missed_increment(system, *at))(v, vdot, jerk)  # c
     missed_v = (scheme.delta**2 - kappa - 1.0 / 12.0) * _second_differences(t, states.vdot)  # l
     first = jax.tree.map(lambda leaf: leaf[0], states)
-    slope = (missed_x[1] - missed_x[0]) / (middle(t)[1] - middle(t)[0])
-    nu, omega = _start(system, first, t[0], missed_x[0] - 0.5 * h[0] * slope, slope + missed_v[0])
+    slope = lambda f: (f[1] - f[0]) / (middle(t)[1] - middle(t)[0])
+    at_start = lambda f: f[0] - 0.5 * h[0] * slope(f)
+    lacking = -scheme.delta * (0.5 - scheme.alpha_f) * at_start(jerk)
+    nu, omega = _start(system, first, t[0], at_start(missed_x), slope(missed_x) + missed_v[0], lacking)
     rows = lambda start, steps: jnp.concatenate([(h[0] ** 2 * start)[None], steps])
     none = jnp.zeros_like(states.v)
     return Variation(
@@ -80,13 +83,13 @@ def alpha_defects(scheme: AbstractAlpha, system: AbstractSystem, grid: AbstractG
     )
 
 
-def _start(system: AbstractSystem, first: State, t0, c, rate):
-    """ν_0 and ω_0 for c and l + ċ at t0."""
+def _start(system: AbstractSystem, first: State, t0, c, rate, lacking):
+    """ν_0 and ω_0 for c, l + ċ and −Δ (½ − α_f) v̈ at t0."""
     q = first.q
-    allowed, nu = split_velocity(system, q, c, t0)
+    nu = c + split_velocity(system, q, lacking - c, t0)[0]
     jacobian = full_jacobian(system, q, t0)
     motion = system.group.to_ambient(q, first.v), jnp.ones_like(t0)
-    _, change = jax.jvp(lambda q, t: full_jacobian(system, q, t) @ allowed, (q, t0), motion)
+    _, change = jax.jvp(lambda q, t: full_jacobian(system, q, t) @ (c - nu), (q, t0), motion)
     damping = system.tangents(q, first.v, first.vdot, first.lam, t0).damping
     omega, _ = kkt_solve(system.mass_matrix(), jacobian, -damping @ nu, jacobian @ rate + change)
     return nu, omega

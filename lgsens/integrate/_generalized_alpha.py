@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from lgsens._validate import require_setting
-from lgsens.dynamics import given_way, split_velocity
+from lgsens.dynamics import given_way, normal_jerk, split_velocity
 from lgsens.integrate._alpha import AbstractAlpha, AbstractEquations, Matrix, Wear
 from lgsens.integrate._alpha_defects import alpha_defects
 from lgsens.integrate._guess import Guess
@@ -58,22 +58,31 @@ class AbstractGeneralizedAlpha(AbstractAlpha):
     def start(self, system, initial, t0):
         """The starting values of the scheme; see `second_order_start`.
 
-        With exact values, and a_n = v̇(t_n + Δ h), Δ = α_m − α_f, the increment (27) misses the true one by h³ c
-        (`missed_increment`). The constraint at t_{n+1} takes B c h³ out again, through the velocity once the scheme is
-        under way: B v_n = −h² B c there. Started with B v_0 = 0 it must do so through the first accelerations, and λ
-        is off by O(h) for some steps. So v_0 receives h² P c, P the M-orthogonal projection on the constraint
-        directions. Stabilized index 2 keeps B v = 0, and takes B c h³ out by its correction. Where constraints may be
-        redundant, the joints start with what they give way in a step, Φ = βh² c λ.
+        A smooth motion has a_n = v̇(t_n + Δ h), Δ = α_m − α_f, and with exact values the increment (27) misses the true
+        one by h³ c (`missed_increment`). The constraint at t_{n+1} takes B c h³ out again, through the velocity once
+        the scheme is under way: B v_n = −h² B c there. Started with B v_0 = 0 it must do so through the first
+        accelerations, and λ is off by O(h) for some steps. So v_0 receives h² N c, N the M-orthogonal projection on the
+        constraint directions, and a_0 = v̇_0 + Δ h N v̈_0. Stabilized index 2 keeps B v = 0, and takes B c h³ out by its
+        correction. Where constraints may be redundant, the joints start with what they give way in a step, Φ = βh² c λ.
+
+        The rest of v̈_0 is left out of a_0. By eq. (29) what a_0 lacks, δ = −Δ h (v̈_0 − N v̈_0), is gone after some
+        steps like (−α_m/(1 − α_m))ⁿ, and what it leaves is an offset of v of Σ h ((1 − γ) δ_n + γ δ_{n+1}), which is
+        −Δ (½ − α_f) h² (v̈_0 − N v̈_0): of the order of the scheme. In it stands what forces make of v̈: a damper d on a
+        mass m has v̈ = −(d/m) v̇, and d h/m ≫ 1 would make of a_0 a multiple of v̇_0 that no step survives, where the
+        scheme itself is stable.
         """
         state = self.complete(system, initial.state)
-        if not self.second_order_start:
+        rows = len(system.constraint_names)
+        if not (self.second_order_start and rows):
             return Start(state)
-        a_1 = self.delta * initial.jerk
+        q, v, vdot = state.q, state.v, state.vdot
+        jerk = normal_jerk(system, q, v, vdot, t0, initial.factors)
+        a_1 = self.delta * jerk
         if self.stabilized:
             return Start(state, a_1=a_1)
-        missed = self.missed_increment(system, state.v, state.vdot, initial.jerk)
-        _, normal = split_velocity(system, state.q, missed, t0, initial.factors)
-        return Start(state, q_2=given_way(system, state.q, self.beta * state.lam, t0), v_2=normal, a_1=a_1)
+        missed = self.missed_increment(system, v, vdot, jerk)
+        _, normal = split_velocity(system, q, missed, t0, initial.factors)
+        return Start(state, q_2=given_way(system, q, self.beta * state.lam, t0), v_2=normal, a_1=a_1)
 
     def complete(self, system, state):
         if not self.stabilized:
@@ -190,7 +199,7 @@ class GeneralizedAlpha(AbstractGeneralizedAlpha):
             on until the error left is what full Newton would leave; a step that they do not bring there is finished by
             full Newton. 0: full Newton always. The sensitivities do not depend on it: theirs is always the exact
             matrix of the converged step.
-        second_order_start: start with a₀ = v̇₀ + (α_m − α_f) h v̈₀, because a_n stands for the acceleration at
+        second_order_start: start with what the constraints ask of v̈ in a₀, because a_n stands for the acceleration at
             t_n + (α_m − α_f) h, and with v₀ moved by O(h²) along the constraint directions, where the scheme keeps
             it anyway: positions, velocities and multipliers are then second order from the first step.
             False: a₀ = v̇₀ and v₀ as it is; multipliers are first order in the first steps (Arnold,

@@ -125,7 +125,7 @@ class AbstractIntegrator(eqx.Module):
         """Raise `ValueError` for a number of steps that these are not."""
         return
 
-    def lay(self, system: AbstractSystem, start: Start, jerk: Float[Array, " k"], t0, t1, num_steps) -> Laid:
+    def lay(self, system: AbstractSystem, start: Start, t0, t1, num_steps) -> Laid:
         """The grid of a run from t0 to t1: here equal steps. `num_steps`: an int, or `Steps` where steps are equal."""
         return Laid(EqualGrid.between(t0, t1, num_steps))
 

@@ -34,7 +34,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._validate import as_float, is_concrete, require, require_setting
 from lgsens._xla import scan, while_loop
-from lgsens.dynamics import AbstractSystem, State
+from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
 from lgsens.integrate._grid import UnevenGrid, with_first
 from lgsens.integrate._lanes import in_any_lane
@@ -106,7 +106,7 @@ class GivenSteps(AbstractIntegrator):
                 f"`num_steps` = {num_steps}, but GivenSteps has {self.num_steps}; give `integrator.num_steps`."
             )
 
-    def lay(self, system, start, jerk, t0, t1, num_steps):
+    def lay(self, system, start, t0, t1, num_steps):
         return Laid(UnevenGrid.first(t0, (t1 - t0) * (self.fractions / jnp.sum(self.fractions))))
 
 
@@ -157,13 +157,13 @@ class AdaptiveSteps(AbstractIntegrator):
     def equal_steps(self):
         return False
 
-    def lay(self, system, start, jerk, t0, t1, num_steps):
+    def lay(self, system, start, t0, t1, num_steps):
         mean = (t1 - t0) / num_steps
         # What error control decides has no derivative: its sizes, as parts of the interval, are constants of the run.
-        frozen = lax.stop_gradient((system, start, jerk, t0, mean))
+        frozen = lax.stop_gradient((system, start, t0, mean))
         found = lax.stop_gradient(_controlled_steps(self, num_steps, *frozen))
         sizes, states, stats, reached = found
-        grid = UnevenGrid.first(t0, sizes / frozen[4] * mean)
+        grid = UnevenGrid.first(t0, sizes / frozen[-1] * mean)
         return Laid(grid, (states, Stats(*stats[: len(Stats._fields)])), stats, reached)
 
     def frozen(self, trajectory):
@@ -203,11 +203,11 @@ class _Trial(NamedTuple):
 
 
 def _controlled_steps(
-    settings: AdaptiveSteps, num_steps: int, system: AbstractSystem, first: Start, jerk, t0, h
+    settings: AdaptiveSteps, num_steps: int, system: AbstractSystem, first: Start, t0, h
 ) -> tuple[Float[Array, " n"], State, ControlledStats, Bool[Array, ""]]:
     """Sizes, states and statistics of at most `num_steps` steps from t0 on, and whether they reach t0 + num_steps h.
 
-    Those not needed have size 0 and repeat the last state. `jerk`: v̈ at t0, from which the first size is taken.
+    Those not needed have size 0 and repeat the last state. The first size is taken from v̈ at t0.
     """
     scheme, total = settings.integrator, num_steps * h
     walk, scale = Walk.of(scheme, system), system.coordinate_scale()
@@ -270,7 +270,8 @@ def _controlled_steps(
         carry = (progress, jnp.where(active, trial.h, size), grown, error, elapsed)
         return carry, (h_taken, progress.state, trial.stats, trial.error * tolerance, trial.rejected)
 
-    expected = relative(first.state.v, first.state.vdot, jerk, h)
+    q, v = first.state.q, first.state.v
+    expected = relative(v, first.state.vdot, acceleration_and_jerk(system, q, v, t0)[2], h)
     guess = h * jnp.minimum(1.0, (_AIM / jnp.maximum(expected, _LEAST)) ** (1.0 / 3.0))
     begun = first.at(system, guess)
     memory = scheme.memory(walk.shared, begun, Node(t0, t0 + guess, guess), uneven=True)

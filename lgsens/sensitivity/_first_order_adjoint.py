@@ -26,11 +26,13 @@ and η₂ follows from the derivative of B μ = −F_λᵀ, the one place where 
 initial state are −η_q and −η_v at t_0.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
 from lgsens._xla import scan
-from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk, mass_scale
+from lgsens.dynamics import AbstractSystem, State, accelerations, mass_scale
 from lgsens.integrate import with_last
 from lgsens.linear import Factors
 from lgsens.sensitivity._continuous_adjoint import (
@@ -101,11 +103,8 @@ def _final_conditions(functional: Functional, p, system: AbstractSystem, point: 
 
     # d/dt (M μ + F_v̇) = F_v − η_q + C_tᵀμ and d/dt (B μ + F_λ) = 0 give μ̇ and η₂; the motion's own v̈ and λ̇
     # are those of eq. (41).
-    def motion(q, v, t):
-        return acceleration_and_jerk(system, q, v, t)[:2]
-
     direction = (group.to_ambient(state.q, state.v), state.vdot, jnp.ones_like(t))
-    _, (vddot, lam_rate) = jax.jvp(motion, (state.q, state.v, t), direction)
+    _, (vddot, lam_rate) = jax.jvp(partial(accelerations, system), (state.q, state.v, t), direction)
 
     def partials(q, v, vdot, lam, t):
         rate = lambda vdot, lam: functional.rate(p, system, State(q, v, vdot, lam, vdot), t)

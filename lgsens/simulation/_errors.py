@@ -55,13 +55,6 @@ def left_null_space(jacobian: np.ndarray) -> tuple[np.ndarray, int]:
     return left[:, rank:], rank
 
 
-# The start of second order takes a₀ from v̈₀ = −M⁻¹C v̇₀ + …, large for a light body on a damper that h does not resolve.
-_AT_THE_START = (
-    "A light body on a stiff damper, of a bushing or a beam, that is not in equilibrium at the start asks for the "
-    "integrator's `second_order_start=False`, or for `state0=equilibrium(model)`. "
-)
-
-
 def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> str:
     """The message of a failure; `details` are those of `outcome`, or what else the code wants to know."""
     code = RESULTS(result)
@@ -85,7 +78,7 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
             more = (
                 f"It failed at {place}{_RUNS[int(details.get('run', 0))]}, {time}, after {int(details['iterations'])} "
                 f"iterations: last increment {details['increment']:.3g}{asked}, residual {details['residual']:.3g}. "
-                f"{_AT_THE_START if step <= 2 else ''}`throw=False` returns the data up to the step before."
+                f"`throw=False` returns the data up to the step before."
             )
         case RESULTS.singular_configuration:
             more = f"It does so about {place}, {time}. `throw=False` returns the data, which follow one branch."

@@ -287,7 +287,7 @@ def _single_run(
     system, begun: Begin, t0, t1, num_steps: int | Steps, integrator: AbstractIntegrator, sensitivity, save
 ):
     scheme: Any = integrator.scheme
-    laid = integrator.lay(system, begun.start, begun.jerk, t0, t1, num_steps)
+    laid = integrator.lay(system, begun.start, t0, t1, num_steps)
     grid: Any = laid.grid
     t = grid.times()
     state0, parameters = begun.start.at(system, grid.first_size), Parameters(system, grid)

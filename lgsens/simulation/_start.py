@@ -94,7 +94,6 @@ class Begin(NamedTuple):
     """The initial state as the scheme starts from it, and how its computation ended."""
 
     start: Start
-    jerk: Float[Array, " k"]  # v̈ there; zero where it is not known
     consistent_v: Float[Array, " k"]  # v_0 without the scheme's O(h²)
     result: Int[Array, ""]
     violation: Float[Array, " m"]
@@ -109,9 +108,9 @@ def begin(
         jacobian, start = constraint_jacobian(system, state0.q, t0), Start(scheme.resumed(system, state0, t0))
         valid = system.is_valid() & finite(state0)
         result = jnp.where(valid, RESULTS.successful, RESULTS.invalid_numbers).astype(jnp.int32)
-        return Begin(start, jnp.zeros_like(state0.v), state0.v, result, system.constraint(state0.q, t0), jacobian)
+        return Begin(start, state0.v, result, system.constraint(state0.q, t0), jacobian)
     initial = _initial(system, t0) if initial is None else initial
     usable = initial.result == RESULTS.successful
     start = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), scheme.start(system, initial, t0))
     jacobian = constraint_jacobian(system, initial.state.q, t0)
-    return Begin(start, initial.jerk, initial.state.v, initial.result, initial.violation, jacobian)
+    return Begin(start, initial.state.v, initial.result, initial.violation, jacobian)

@@ -62,6 +62,19 @@ def test_orders_on_the_heavy_top(heavy_reference, second_order_start, order_of_f
     np.testing.assert_allclose(rates[-1, 1:], 2.0, atol=0.05)
 
 
+def test_starts_on_a_damper_that_no_step_resolves():
+    """10 g on 1e5 N s/m, d h/m = 1e4, let go: v̈_0 is 1e7 times v̇_0/s. Beside a run in steps 20 times shorter."""
+    arm = lg.RigidBody(0.01, (1e-5, 1e-5, 1e-5), position=(0.1, 0.0, 0.0))
+    damper = lg.SpringDamper(None, "arm", at_a=(0.1, 0.02, 0.3), at_b=(0.1, 0, 0), stiffness=1e6, damping=1e5)
+    forces = {"gravity": lg.Gravity((0, 0, -9.81)), "damper": damper}
+    model = lg.Model({"arm": arm}, {"pivot": lg.SphericalJoint(None, "arm", at=(0, 0, 0))}, forces)
+    run, fine = (lg.simulate(model, t1=0.1, num_steps=n) for n in (100, 2000))
+    coarse, exact = (np.asarray(run.body("arm").position) for run in (run, fine))
+    moved = np.abs(exact - exact[0]).max()
+    assert moved > 2e-3  # it swings on the damper
+    assert np.abs(coarse - exact[::20]).max() < 2e-5 * moved  # (h w)²/12, w = 14 rad/s, and the h³ of the first step
+
+
 def test_heavy_top_reaches_the_reference():
     """Position at 0.1 s by the index-reduced reference; Richardson's extrapolation of two runs."""
     runs = [lg.simulate(heavy_top(), t1=0.1, num_steps=n).body("top").position[-1] for n in (400, 800)]

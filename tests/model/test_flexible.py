@@ -1,7 +1,6 @@
 """Links that bend in place of rigid ones, rigid ones in place of beams, and beams that bear their load at the start."""
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -130,10 +129,7 @@ def test_fidelity_predicts_what_bending_does():
         return lg.Model(bodies, joints, forces, merge_fixed=True)
 
     criterion = lambda run: lg.time_integral(run.t, run.body("end").velocity[:, 1] ** 2)
-    settings: Any = {"t1": 0.3, "num_steps": 100, "integrator": lg.GeneralizedAlpha(second_order_start=False)}
-    with pytest.raises(lg.SimulationError, match="light body on a stiff damper, of a bushing or a beam"):
-        lg.simulate(build(jnp.asarray(80.0)), t1=0.3, num_steps=100)
-    found = lg.accuracy.fidelity(criterion, build, jnp.asarray(4.0), [Rigid("b")], **settings)
+    found = lg.accuracy.fidelity(criterion, build, jnp.asarray(4.0), [Rigid("b")], t1=0.3, num_steps=100)
     (row,) = found.rows
     verified = found.verified(row)
     # It yields 1/(3 EI) = 1 % of the spring's 1/k; what the midpoint rule leaves is of third order in that.
