@@ -113,6 +113,7 @@ from lgsens.simulation import (
     Instant as Instant,
     JointMotion as JointMotion,
     PointMotion as PointMotion,
+    Reached as Reached,
     Richardson as Richardson,
     Saved as Saved,
     SimulationError as SimulationError,

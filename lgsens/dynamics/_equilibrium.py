@@ -11,12 +11,21 @@ alternates from step to step.
 
 States z of elements do not vanish at rest, their rates do: of their coordinates the velocity is unknown and not the
 place, and C_t has the columns of their derivatives.
+
+Far from equilibrium Newton's iteration may lead nowhere (a chain that is to hang and starts level has no stiffness at
+all), or far away to a rest that no one meant. Then the mechanism sinks through a viscous medium, M ẋ = −(f + Bᵀλ), by
+implicit Euler steps: K_t + μ M stands for K_t, μ = 1/Δτ. Steps move a tenth of a radian or of the scene; where they
+move less, near equilibrium, μ falls by half each, and the iteration becomes Newton's again (pseudo-transient
+continuation: Kelley & Keyes, SIAM J. Numer. Anal. 35 (1998) 508). What it finds is stable.
 """
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._xla import while_loop
 from lgsens.dynamics._constraints import depends_on_time
@@ -27,6 +36,19 @@ from lgsens.dynamics._results import RESULTS
 from lgsens.dynamics._system import AbstractSystem, State
 
 _MAX_ITERATIONS = 60
+_MAX_SINKING = 400
+_STRIDE = 0.1  # of a step that sinks, rad or lengths of the scene
+_FAR = 1.5  # the path of Newton's iteration, likewise
+
+
+class _Search(NamedTuple):
+    """How far an iteration has come."""
+
+    z: Float[Array, " k+m"]
+    mu: Float[Array, ""]  # μ, 0 as long as it is Newton's
+    path: Float[Array, ""]  # the sum of the largest motions of all steps
+    iteration: Int[Array, ""]
+    done: Bool[Array, ""]
 
 
 def equilibrium(system: AbstractSystem, t) -> Initial:
@@ -73,24 +95,39 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
         lower = jnp.concatenate([positions, jnp.zeros((m, m), dtype)], axis=1)
         return jnp.concatenate([upper * (scale / weight)[:, None], lower], axis=0)
 
+    nothing, largest = jnp.zeros(k + m, dtype), lambda z: jnp.max(jnp.abs(z[k:]), initial=0.0)
+
+    def balanced(z, left):
+        """To √eps of the largest joint force or moment, taken as mass scale × 1 m/s² at least."""
+        return jnp.max(jnp.abs(left)) <= jnp.sqrt(eps) * (1.0 + largest(z))
+
+    inertia = system.mass_matrix() * scale[:, None] * scale[None, :] / weight
+    viscous = jnp.zeros((k + m, k + m), dtype).at[:k, :k].set(lax.stop_gradient(inertia))
+
     def newton(equation, z):
-        def body(carry):
-            z, _, iteration = carry
-            step = jnp.linalg.lstsq(matrix(z), equation(z), rcond=1e3 * eps)[0]
+        def body(carry: _Search) -> _Search:
+            z, mu = carry.z, carry.mu
+            step = jnp.linalg.lstsq(matrix(z) + mu * viscous, equation(z), rcond=1e3 * eps)[0]
             # Multipliers too: where joint forces alone are stiff, as in a pendulum, the first step moves nothing.
-            size = jnp.max(
-                jnp.abs(step) / jnp.where(np.arange(k + m) < k, 1.0, 1.0 + jnp.max(jnp.abs(z[k:]), initial=0.0))
-            )
+            size = jnp.max(jnp.abs(step) / jnp.where(np.arange(k + m) < k, 1.0, 1.0 + largest(z)))
             moved = jnp.max(jnp.abs(step[: k - system.num_states]))
             # At most 0.2 rad or a fifth of the scene at a time.
-            return z - step * jnp.minimum(1.0, 0.2 / jnp.maximum(moved, 0.2)), size, iteration + 1
+            z = z - step * jnp.minimum(1.0, 0.2 / jnp.maximum(moved, 0.2))
+            left, count = equation(z), carry.iteration + 1
+            done = (size <= jnp.sqrt(eps)) & balanced(z, left)
+            path = carry.path + jnp.minimum(moved, 0.2)
+            stuck = (size <= jnp.sqrt(eps)) | (path > _FAR) | (count >= _MAX_ITERATIONS)
+            lost = (mu == 0.0) & ~done & stuck
+            first = jnp.max(jnp.abs(equation(nothing))) / _STRIDE
+            mu = jnp.where(lost, first, mu * jnp.clip(moved / _STRIDE, 0.5, 4.0))
+            return _Search(jnp.where(lost, nothing, z), mu, path, count, done)
 
-        def unfinished(carry):
-            _, size, iteration = carry
-            return (size > jnp.sqrt(eps)) & (iteration < _MAX_ITERATIONS)
+        def unfinished(carry: _Search):
+            return ~carry.done & (carry.iteration < _MAX_ITERATIONS + _MAX_SINKING)
 
-        start = (z, jnp.full((), jnp.inf, dtype), jnp.zeros((), jnp.int32))
-        z, _, _ = while_loop(unfinished, body, start)
+        begin = jnp.zeros((), dtype)
+        start = _Search(z, begin, begin, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
+        z = while_loop(unfinished, body, start).z
         # Newton is quadratic: one step from √eps is at round-off.
         return z - jnp.linalg.lstsq(matrix(z), equation(z), rcond=1e3 * eps)[0]
 
@@ -98,13 +135,11 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
         slope = jax.jacfwd(linear)(jnp.zeros_like(rhs))
         return jnp.linalg.pinv(slope, rtol=1e3 * eps) @ rhs
 
-    z = lax.custom_root(equation, jnp.zeros(k + m, dtype), newton, tangent_solve)
+    z = lax.custom_root(equation, nothing, newton, tangent_solve)
     x, v, lam = split(z)
     q, vdot = group.retract(q_ref, x), zero
-    # Forces balance to √eps of the largest joint force or moment, taken as mass scale × 1 m/s² at least.
-    left = jnp.max(jnp.abs(jnp.concatenate([equation(z), system.velocity_constraint(q, v, t)])))
-    balanced = left <= jnp.sqrt(eps) * (1.0 + jnp.max(jnp.abs(z[k:]), initial=0.0))
-    result = jnp.where(balanced, RESULTS.successful, RESULTS.equilibrium_failed).astype(jnp.int32)
+    rests = balanced(z, jnp.concatenate([equation(z), system.velocity_constraint(q, v, t)]))
+    result = jnp.where(rests, RESULTS.successful, RESULTS.equilibrium_failed).astype(jnp.int32)
     if depends_on_time(system, q, v, t):
         v = consistent_velocity(system, q, v, t)
         vdot, lam = accelerations(system, q, v, t)

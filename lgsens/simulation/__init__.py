@@ -9,17 +9,21 @@ from lgsens.simulation._errors import (
     throw_if_failed as throw_if_failed,
 )
 from lgsens.simulation._joint_motion import JointMotion as JointMotion
+from lgsens.simulation._reached import Reached as Reached
 from lgsens.simulation._richardson import (
     Extrapolated as Extrapolated,
     Richardson as Richardson,
     richardson as richardson,
 )
-from lgsens.simulation._simulate import (
+from lgsens.simulation._settings import (
+    check_accuracy as check_accuracy,
     check_integrator as check_integrator,
     check_sensitivity as check_sensitivity,
+    interval as interval,
+)
+from lgsens.simulation._simulate import (
     cut as cut,
     for_any_number as for_any_number,
-    interval as interval,
     outcome as outcome,
     run as run,
     simulate as simulate,
@@ -31,6 +35,7 @@ from lgsens.simulation._start import (
     equilibrium as equilibrium,
     initial_state as initial_state,
 )
+from lgsens.simulation._to_accuracy import to_accuracy as to_accuracy
 from lgsens.simulation._trajectory import (
     AbstractMotion as AbstractMotion,
     AbstractRun as AbstractRun,

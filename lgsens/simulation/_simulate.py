@@ -11,14 +11,13 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
-from lgsens._validate import as_count, as_float, require
+from lgsens._validate import as_count
 from lgsens._xla import alike, tracing
 from lgsens.dynamics import RESULTS, AbstractSystem, State, unsteady_rate
 from lgsens.integrate import (
     AbstractIntegrator,
     AbstractScheme,
     GeneralizedAlpha,
-    IndexReducedODE,
     Laid,
     Stats,
     Steps,
@@ -35,7 +34,9 @@ from lgsens.sensitivity import (
 from lgsens.simulation._errors import primal_value, throw_if_failed
 from lgsens.simulation._index_reduced_ode import integrate_ode
 from lgsens.simulation._richardson import extrapolate_runs
+from lgsens.simulation._settings import by_diffrax, check_integrator, check_sensitivity, interval
 from lgsens.simulation._start import Begin, as_system, begin
+from lgsens.simulation._to_accuracy import simulate_to
 from lgsens.simulation._trajectory import Instant, Saved, Trajectory
 
 Save = Callable[[Instant], Any]
@@ -47,11 +48,12 @@ def simulate(
     *,
     t0: Any = ...,
     t1: Any,
-    num_steps: int,
+    num_steps: int | None = ...,
     integrator: AbstractIntegrator = ...,
     sensitivity: AbstractSensitivity = ...,
     state0: State | None = ...,
     save: None = ...,
+    accuracy: float | None = ...,
     throw: bool = ...,
 ) -> Trajectory: ...
 
@@ -76,11 +78,12 @@ def simulate(
     *,
     t0=0.0,
     t1,
-    num_steps: int,
+    num_steps: int | None = None,
     integrator: AbstractIntegrator = GeneralizedAlpha(),
     sensitivity: AbstractSensitivity = DirectDifferentiation(),
     state0: State | None = None,
     save: Save | None = None,
+    accuracy: float | None = None,
     throw: bool = True,
 ):
     """Integrate the motion of a model from t0 to t1, by default with the Lie-group generalized-α scheme (paper §4).
@@ -101,6 +104,11 @@ def simulate(
             result is a `Saved`. Without derivatives no state is stored, so that a batch of
             designs takes the memory of what it asks for. Define it once: a new lambda in each call compiles anew.
             Numbers that it depends on come through the model, or are constants.
+        accuracy: take as many steps as the motion takes to have this error, outside of `jit`, and extrapolate two runs
+            where that is less work: the largest error of a configuration, relative to 1 rad or the length of the scene,
+            and of a velocity, relative to the largest, as far as runs in n, 2n, 4n, … steps tell. `Trajectory.reached`
+            says what was reached and how. `num_steps` is then the first number of steps, 64 by default: enough of them
+            to see the shortest event (the bump of a road). Derivatives go through the last run.
         throw: raise if the simulation fails; inside `jit` and `vmap`, where nothing can be raised, all data are NaN and
             `Trajectory.result` says why (`raise_if_failed`). With False it says so, and the data are finite up to the
             failure and NaN from there on.
@@ -120,12 +128,15 @@ def simulate(
             'jax.config.update("jax_enable_x64", True) before the model is built.',
             stacklevel=2,
         )
-    num_steps = as_count(num_steps, "num_steps", " (it is static)")
-    by_diffrax = _by_diffrax(integrator)
-    if not by_diffrax:
+    if accuracy is not None:
+        settings = {"t0": t0, "t1": t1, "integrator": integrator, "sensitivity": sensitivity, "state0": state0}
+        return simulate_to(simulate, accuracy, model, num_steps, settings | {"save": save, "throw": throw})
+    num_steps = as_count(num_steps, "num_steps", " (it is static; or ask for an `accuracy`)")
+    diffrax = by_diffrax(integrator)
+    if not diffrax:
         check_integrator(integrator, num_steps)
     check_sensitivity(sensitivity)
-    if by_diffrax and (sensitivity != DirectDifferentiation() or save is not None):
+    if diffrax and (sensitivity != DirectDifferentiation() or save is not None):
         raise ValueError(
             f"`sensitivity` = {sensitivity!r} and `save` need steps of the scheme. With `rtol` diffrax takes its own, "
             "and differentiates them in one direction only (`mode`): leave them out, or leave `rtol` out."
@@ -153,41 +164,13 @@ def simulate(
     return found
 
 
-def check_integrator(integrator: Any, num_steps: int) -> None:
-    """Raise `ValueError` for what is no integrator of a scheme, or none of so many steps."""
-    if not isinstance(integrator, AbstractIntegrator):
-        raise ValueError(f"`integrator` must be a GeneralizedAlpha or another integrator, got {integrator!r}.")
-    integrator.scheme.require_steps()
-    integrator.check(num_steps)
-
-
-def check_sensitivity(sensitivity: Any) -> None:
-    """Raise `ValueError` for what is no method to differentiate a trajectory."""
-    if not isinstance(sensitivity, AbstractSensitivity):
-        raise ValueError(
-            "`sensitivity` must be DirectDifferentiation(), AdjointVariable(), ContinuousDirect() or Autodiff(), got "
-            f"{sensitivity!r}; ContinuousAdjoint() needs a Criterion, see `differentiate`."
-        )
-
-
-def _by_diffrax(integrator: Any) -> bool:
-    return isinstance(integrator, IndexReducedODE) and integrator.rtol is not None
-
-
-def interval(t0, t1):
-    """The initial and the final time as arrays."""
-    t0, t1 = as_float(t0, (), "`t0`"), as_float(t1, (), "`t1`")
-    require(lambda t0, t1: t1 > t0, f"`t1` must be later than `t0`, got t0 = {t0} s and t1 = {t1} s.", t0, t1)
-    return t0, t1
-
-
 def for_any_number(
     num_steps: int, integrator: AbstractIntegrator, sensitivity: AbstractSensitivity, save: Save | None, arrays: Any
 ) -> tuple[int | Steps, AbstractIntegrator]:
     """Steps and integrator with their numbers as data, where a program of its own serves them: outside of `jit`, where
     all `arrays` have values (and derivatives at most); else as they are."""
     equal = type(integrator).lay is AbstractIntegrator.lay
-    if not equal or integrator.extrapolated or _by_diffrax(integrator):
+    if not equal or integrator.extrapolated or by_diffrax(integrator):
         return num_steps, integrator
     leaves = jax.tree.leaves(arrays)
     traced = any(isinstance(primal_value(leaf), Tracer) for leaf in leaves)
@@ -292,7 +275,7 @@ def _single_run(
     t = grid.times()
     state0, parameters = begun.start.at(system, grid.first_size), Parameters(system, grid)
     if save is None:
-        if _by_diffrax(scheme):
+        if by_diffrax(scheme):
             states, newton = integrate_ode(scheme, system, grid, scheme.physical(system, state0))
         else:
             states, newton = sensitivity.trajectory(scheme, state0, parameters, laid.found)

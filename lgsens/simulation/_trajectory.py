@@ -18,6 +18,7 @@ from lgsens.dynamics import RESULTS, AbstractSystem, State
 from lgsens.integrate import Stages
 from lgsens.model import AbstractJoint, Frame, MultibodySystem, joint_wrenches, measured, motion_at
 from lgsens.simulation._joint_motion import JointMotion, joint_motion
+from lgsens.simulation._reached import Reached
 from lgsens.simulation._tables import to_csv, to_pandas, to_xarray
 
 
@@ -283,6 +284,7 @@ class Trajectory(AbstractRun):
         error: an estimate of the errors of the states, from integrators that have one (`Richardson`); else None.
         order: 2, or 4 where the states deserve a rule of fourth order: what to give `time_integral`, static.
         stages: those of `IndexReducedODE` without `rtol`, by which a `Criterion` integrates; else None.
+        reached: what `simulate` with `accuracy` says of it; else None.
     """
 
     t: Float[Array, " n+1"]
@@ -294,6 +296,7 @@ class Trajectory(AbstractRun):
     order: int = eqx.field(static=True, default=2)
     stages: Stages | None = None
     joints: dict[str, AbstractJoint] | None = None
+    reached: Reached | None = eqx.field(static=True, default=None)
 
     def _kinematics(self):
         return self.states, self.t

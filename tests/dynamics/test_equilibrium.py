@@ -246,3 +246,22 @@ def test_pendulum_comes_to_hang(aside):
     hinge = lg.RevoluteJoint(None, "bob", at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
     state = lg.equilibrium(lg.Model({"bob": body}, {"hinge": hinge}, {"gravity": lg.Gravity(GRAVITY)}))
     close(state.q.position[0], [0.0, 0.0, -np.hypot(1.0, aside)], 32, scale=np.hypot(1.0, aside))
+
+
+@pytest.mark.parametrize("links", [3, pytest.param(8, marks=pytest.mark.slow)])
+def test_a_level_chain_hangs(links):
+    """Links of 1 m on hinges, held at one end and level to begin with: nothing is stiff, and folded chains rest as well.
+    It hangs along gravity, so its end turns with it, d x/dg_x = −(n − ½)/g_z."""
+
+    def end(sideways):
+        bodies, joints = {}, {}
+        for i in range(links):
+            bodies[f"{i}"] = lg.RigidBody(1.0, (0.01, 0.1, 0.1), position=(i + 0.5, 0.0, 0.0))
+            joints[f"{i}"] = lg.RevoluteJoint(f"{i - 1}" if i else None, f"{i}", at=(i, 0.0, 0.0), axis=(0, 1.0, 0))
+        gravity = lg.Gravity(jnp.array([1.0, 0.0, 0.0]) * sideways - jnp.array([0.0, 0.0, G]))
+        return lg.equilibrium(lg.Model(bodies, joints, {"gravity": gravity})).q.position[-1]
+
+    place, turn = jax.jvp(end, (0.0,), (1.0,))
+    # Newton ends at round-off of the joints' forces, a chain of n amplifies that by n²
+    np.testing.assert_allclose(place, [0.0, 0.0, 0.5 - links], atol=1e-12)
+    np.testing.assert_allclose(turn, [(links - 0.5) / G, 0.0, 0.0], atol=1e-10)

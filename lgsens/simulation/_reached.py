@@ -1,0 +1,31 @@
+"""What accuracy a result has, and how it was reached."""
+
+from typing import NamedTuple
+
+
+class Reached(NamedTuple):
+    """The accuracy of a result; `print` it.
+
+    Attributes:
+        asked: the accuracy that was asked for.
+        error: the estimated error, in the same measure.
+        num_steps: the number of steps, of the finer run where two are extrapolated.
+        extrapolated: whether two runs are, of num_steps/2 and num_steps steps.
+        tried: the numbers of steps of all runs and the distances of each from the one before.
+    """
+
+    asked: float
+    error: float
+    num_steps: int
+    extrapolated: bool
+    tried: tuple[tuple[int, float], ...]
+
+    def __str__(self) -> str:
+        how = f"{self.num_steps // 2} and {self.num_steps} steps, extrapolated" if self.extrapolated else ""
+        runs = ", ".join(f"{n}: {distance:.1e}" if distance < float("inf") else f"{n}" for n, distance in self.tried)
+        return (
+            f"error {self.error:.1e}, asked {self.asked:g}, in {how or f'{self.num_steps} steps'}; "
+            f"steps and change from the run before: {runs}"
+        )
+
+    __repr__ = __str__

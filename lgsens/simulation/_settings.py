@@ -1,0 +1,59 @@
+"""The arguments of `simulate`, checked."""
+
+from typing import Any
+
+import jax
+
+from lgsens._validate import as_count, as_float, is_concrete, require
+from lgsens.integrate import AbstractIntegrator, IndexReducedODE
+from lgsens.sensitivity import AbstractSensitivity
+from lgsens.simulation._errors import primal_value
+
+
+def check_integrator(integrator: Any, num_steps: int) -> None:
+    """Raise `ValueError` for what is no integrator of a scheme, or none of so many steps."""
+    if not isinstance(integrator, AbstractIntegrator):
+        raise ValueError(f"`integrator` must be a GeneralizedAlpha or another integrator, got {integrator!r}.")
+    integrator.scheme.require_steps()
+    integrator.check(num_steps)
+
+
+def check_sensitivity(sensitivity: Any) -> None:
+    """Raise `ValueError` for what is no method to differentiate a trajectory."""
+    if not isinstance(sensitivity, AbstractSensitivity):
+        raise ValueError(
+            "`sensitivity` must be DirectDifferentiation(), AdjointVariable(), ContinuousDirect() or Autodiff(), got "
+            f"{sensitivity!r}; ContinuousAdjoint() needs a Criterion, see `differentiate`."
+        )
+
+
+def by_diffrax(integrator: Any) -> bool:
+    return isinstance(integrator, IndexReducedODE) and integrator.rtol is not None
+
+
+def interval(t0, t1):
+    """The initial and the final time as arrays."""
+    t0, t1 = as_float(t0, (), "`t0`"), as_float(t1, (), "`t1`")
+    require(lambda t0, t1: t1 > t0, f"`t1` must be later than `t0`, got t0 = {t0} s and t1 = {t1} s.", t0, t1)
+    return t0, t1
+
+
+def check_accuracy(accuracy: Any, num_steps: int | None, integrator: Any, arrays: Any) -> int:
+    """The order of a scheme that is to reach an accuracy; `ValueError` for what cannot."""
+    if not (isinstance(accuracy, float | int) and 0.0 < accuracy < 1.0):
+        raise ValueError(f"`accuracy` must be a number between 0 and 1, got {accuracy!r}; 1e-4 is four digits.")
+    first = 1 if num_steps is None else as_count(num_steps, "num_steps", " (the first one that is tried)")
+    if not by_diffrax(integrator):
+        check_integrator(integrator, first)
+    order = None if by_diffrax(integrator) or integrator.extrapolated else integrator.scheme.convergence_order
+    if order is None or not integrator.equal_steps:
+        raise ValueError(
+            f"`accuracy` needs a scheme in equal steps that says its order, as GeneralizedAlpha or RadauIIA; got "
+            f"{integrator!r}, which chooses its steps or extrapolates itself."
+        )
+    if not is_concrete(jax.tree.map(primal_value, arrays)):
+        raise ValueError(
+            "`accuracy` needs numbers, and chooses steps outside of `jit` and `vmap`. Call it once before, and give "
+            "`found.reached.num_steps`, with `Richardson()` and half as many where `found.reached.extrapolated`."
+        )
+    return order
