@@ -19,11 +19,14 @@ def blocks(text, language="python"):
 
 
 PAGES = [path for path in sorted((ROOT / "notebooks").rglob("*.md")) if blocks(path.read_text(encoding="utf-8"))]
+LONG = {"flexible": 1, "fidelity": 0}  # how many blocks the quick run takes; `tests/accuracy/test_fidelity.py` is small
+WHOLE = [pytest.param(path, None, marks=[pytest.mark.slow] * (path.stem in LONG), id=path.stem) for path in PAGES]
+BEGUN = [pytest.param(path, LONG[path.stem], id=f"begun-{path.stem}") for path in PAGES if LONG.get(path.stem)]
 
 
-def run(text, filename, names):
-    """The blocks of a page, one after the other; returns `names` with theirs."""
-    exec(compile("\n".join(blocks(text)), filename, "exec"), names)
+def run(text, filename, names, count=None):
+    """The blocks of a page, one after the other, or the first of them; returns `names` with theirs."""
+    exec(compile("\n".join(blocks(text)[:count]), filename, "exec"), names)
     return names
 
 
@@ -48,12 +51,12 @@ def test_length_and_citation():
     assert f"\nversion: {version}\n" in README
 
 
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
-def test_page(path, readme, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(("path", "count"), WHOLE + BEGUN)
+def test_page(path, count, readme, tmp_path, monkeypatch, capsys):
     """And prints what stands below the block, numbers of one or two digits aside: those are round-off."""
     monkeypatch.chdir(tmp_path)  # where a sweep keeps its results
     text = path.read_text(encoding="utf-8")
-    names = run(text, path.name, dict(readme))
+    names = run(text, path.name, dict(readme), count)
     out = re.sub(r"\S*\de[+-]\d\d", "…", capsys.readouterr().out)
     for shown in re.findall(r"\nprints\n\n```\n(.*?)```", text, re.DOTALL):
         assert [line.split() for line in re.sub(r"\S*\de[+-]\d\d", "…", shown).splitlines()] == [

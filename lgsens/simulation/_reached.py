@@ -20,12 +20,14 @@ class Reached(NamedTuple):
     extrapolated: bool
     tried: tuple[tuple[int, float], ...]
 
-    def __str__(self) -> str:
+    @property
+    def brief(self) -> str:
+        """In a line."""
         how = f"{self.num_steps // 2} and {self.num_steps} steps, extrapolated" if self.extrapolated else ""
+        return f"error {self.error:.1e}, asked {self.asked:g}, in {how or f'{self.num_steps} steps'}"
+
+    def __str__(self) -> str:
         runs = ", ".join(f"{n}: {distance:.1e}" if distance < float("inf") else f"{n}" for n, distance in self.tried)
-        return (
-            f"error {self.error:.1e}, asked {self.asked:g}, in {how or f'{self.num_steps} steps'}; "
-            f"steps and change from the run before: {runs}"
-        )
+        return f"{self.brief}; steps and change from the run before: {runs}"
 
     __repr__ = __str__

@@ -115,6 +115,9 @@ class AbstractMotion(eqx.Module):
             fields = {"steps": str(t.shape[-1] - 1)} | fields
         if result is not None:
             fields["result"] = _ending(result)
+        reached = getattr(self, "reached", None)
+        if reached is not None:
+            fields["reached"] = reached.brief
         if isinstance(system, MultibodySystem):
             whole = system if system.parts is None else system.parts.system
             own = dict.fromkeys(whole.constraint_names) if joints is None else joints

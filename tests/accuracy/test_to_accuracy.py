@@ -62,7 +62,7 @@ def test_coarse_runs_that_fail_are_no_answer():
     _, reached = to_accuracy(failing, *rest, 1e-4, 2)
     assert asked[:4] == [(64, False), (128, False), (256, False), (512, False)]
     assert [n for n, _ in reached.tried] == [512, 1024, 2048]
-    assert str(reached).startswith("error ")
+    assert str(reached).startswith(f"error {reached.error:.1e}, asked 0.0001, in 2048 steps; steps and change from")
 
 
 @functools.partial(jax.jit, static_argnums=1)
@@ -88,6 +88,7 @@ def test_motions_have_it_and_their_derivatives_follow():
     length = float(jnp.max(run.system.coordinate_scale()))
     assert np.abs(np.asarray(run.body("mass").position) - fine).max() < 1.0001e-5 * length  # of the fine run: 1/4096
     assert run.reached.error <= 1e-5
+    assert run.reached.brief in repr(run)
     assert run.order == (4 if run.reached.extrapolated else 2)
     last = lambda k: lg.simulate(build(P | {"k": k}), t1=T1, accuracy=1e-5).body("mass").position[-1, 2]
     slope = (last(P["k"] + 1e-3) - last(P["k"] - 1e-3)) / 2e-3  # the same steps three times

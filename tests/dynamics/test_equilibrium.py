@@ -250,8 +250,8 @@ def test_pendulum_comes_to_hang(aside):
 
 @pytest.mark.parametrize("links", [3, pytest.param(8, marks=pytest.mark.slow)])
 def test_a_level_chain_hangs(links):
-    """Links of 1 m on hinges, held at one end and level to begin with: nothing is stiff, and folded chains rest as well.
-    It hangs along gravity, so its end turns with it, d x/dg_x = −(n − ½)/g_z."""
+    """Links of 1 m on hinges, held at one end and level at first: nothing is stiff, and folded chains rest as well. It
+    hangs along gravity, so its end turns with it, d x/dg_x = −(n − ½)/g_z."""
 
     def end(sideways):
         bodies, joints = {}, {}
