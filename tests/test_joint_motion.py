@@ -49,6 +49,7 @@ def newton_euler(body, motion, gravity=G):
     return float(body.mass) * (acceleration - gravity), np.einsum("nij,nj->ni", orientation, moment), x
 
 
+@pytest.mark.slow  # a joint of each type; others look at single ones
 def test_force_and_moment_are_what_the_motion_needs():
     """m ẍ = m g + F, J Ω̇ + Ω × J Ω = Rᵀ(M + (p − x) × F) for each type of joint."""
     model = each_joint()

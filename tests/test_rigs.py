@@ -260,6 +260,7 @@ CASES = (
 )
 
 
+@pytest.mark.slow  # the rig's closed forms are in the quick run
 def test_an_independent_static_solver_agrees():
     model, centres = small_axle()
     rig = on_rig(model, centres)

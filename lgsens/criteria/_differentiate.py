@@ -129,7 +129,7 @@ def differentiate(
         settings = {"t0": t0, "t1": t1, "integrator": integrator, "method": method, "state0": state0}
         run = lambda n, throw: differentiate(criteria, build, p, num_steps=n, throw=throw, **settings)
         return differentiate_to(run, float(accuracy), order, num_steps)
-    num_steps = as_count(num_steps, "num_steps", " (it is static; or ask for an `accuracy`)")
+    num_steps = as_count(num_steps, "num_steps", " (it is static), unless `accuracy` is given")
     check_integrator(integrator, num_steps)
     t0, t1 = interval(t0, t1)
     p = jax.tree_util.tree_map_with_path(lambda path, leaf: as_float(leaf, None, f"`p`{jax.tree_util.keystr(path)}"), p)

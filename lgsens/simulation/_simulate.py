@@ -131,7 +131,7 @@ def simulate(
     if accuracy is not None:
         settings = {"t0": t0, "t1": t1, "integrator": integrator, "sensitivity": sensitivity, "state0": state0}
         return simulate_to(simulate, accuracy, model, num_steps, settings | {"save": save, "throw": throw})
-    num_steps = as_count(num_steps, "num_steps", " (it is static; or ask for an `accuracy`)")
+    num_steps = as_count(num_steps, "num_steps", " (it is static), unless `accuracy` is given")
     diffrax = by_diffrax(integrator)
     if not diffrax:
         check_integrator(integrator, num_steps)

@@ -33,6 +33,7 @@ def pendulum(*, mass=1.0, inertia=(0.1, 0.1, 0.1), gravity=9.81, stiffness=None)
     return lg.Model({"bob": body}, joints, forces)
 
 
+@pytest.mark.slow  # three scenes
 def test_a_stiff_spring_and_a_spin_are_told_by_their_numbers():
     """ω = √(k/(J + m l²)) at the hinge, of a pendulum that starts level and at rest, where gravity has no stiffness.
 

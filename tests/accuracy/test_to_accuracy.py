@@ -100,13 +100,13 @@ def test_bad_requests_are_refused():
     of = lambda **given: lg.differentiate(CRITERION, build, P, t1=T1, **given)
     requests = {
         "between 0 and 1, got 2": lambda: simulate(accuracy=2),
-        "or ask for an `accuracy`": simulate,
+        "unless `accuracy` is given, got None": simulate,
         "chooses its steps": lambda: simulate(accuracy=1e-3, integrator=lg.AdaptiveSteps()),
         "extrapolates itself": lambda: simulate(accuracy=1e-3, integrator=lg.Richardson()),
         "leave `save`, `throw` out": lambda: simulate(accuracy=1e-3, throw=False),
         "outside of `jit`": lambda: jax.jit(lambda t0: simulate(accuracy=1e-3, t0=t0))(0.0),
         "leave `throw` out": lambda: of(accuracy=1e-3, throw=False),
-        "(it is static; or ask": of,
+        "(it is static), unless": of,
     }
     for message, request in requests.items():
         with pytest.raises(ValueError, match=says(message)):

@@ -103,6 +103,7 @@ def test_every_method(method):
     np.testing.assert_allclose(found.gradient, reverse[:2], rtol=1e-9)  # other order of round-off
 
 
+@pytest.mark.slow  # as the combinations
 def test_given_steps():
     """An empty step has no stages to integrate over, and the sizes of the others count."""
     f = lambda p: psi(p, GIVEN)

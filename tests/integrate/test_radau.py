@@ -86,6 +86,7 @@ def psi(p):
     return 1e3 * SQUARE(run) + run.multiplier("pivot")[-1, 2] * 1e-3
 
 
+@pytest.mark.slow  # by its equations alone, as the scheme of `test_own_scheme`
 def test_both_modes_are_differences():
     """Of sixth order with a step of 1e-3: 1e-18 × derivatives of size 1e2, round-off 1e-15/1e-3 of Ψ."""
     compiled = jax.jit(psi)

@@ -207,6 +207,7 @@ def test_steps_with_a_rounded_inverse_are_those_of_full_newton():
     assert int(rounded.stats.iterations.max()) <= 8  # as many as in double precision: it contracts
 
 
+@pytest.mark.slow  # programs of a batch
 def test_inverses_of_many_runs_are_rounded_earlier():
     """Those of a batch share the caches; the motion is that of one run."""
 

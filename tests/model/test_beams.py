@@ -238,6 +238,7 @@ def test_free_flight_keeps_momenta():
     np.testing.assert_allclose(momentum, np.broadcast_to(momentum[0], momentum.shape), rtol=0, atol=1e-9)  # of Newton
 
 
+@pytest.mark.slow  # a long run
 def test_beam_that_spins_is_stretched():
     """tan(αL)/α − L, α = Ω √(ρA/EA), at a constant speed (Simo & Vu-Quoc 1988); damped, so that it comes to rest."""
     section = lg.BeamSection([2.8e7, 1e7, 1e7, 4e6, 4e6, 4e6], 1.2, [1.2e-3, 6e-4, 6e-4], damping=0.02)

@@ -102,6 +102,7 @@ def test_every_way_to_solve_has_the_same_states(how):
         np.testing.assert_allclose(found, jax.jit(lambda p: controlled(p, 100))(GAINS), rtol=1e-8)
 
 
+@pytest.mark.slow  # three programs; the pendulum's is in the quick run
 def test_integral_holds_what_rests():
     """At rest there is no error, the integral carries the weight, and the motion from there stays."""
     hold = 0.3

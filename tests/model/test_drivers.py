@@ -116,6 +116,7 @@ def test_kinematics_by_signals_and_by_their_values():
     assert not np.any(held.states.v)
 
 
+@pytest.mark.slow  # as `test_driven_motion`
 def test_gradients_of_a_driven_motion_by_the_numbers_of_the_signal():
     """Position, velocity and motor moment at a time, by frequency, amplitude and the crank, in both modes."""
 
