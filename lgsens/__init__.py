@@ -11,6 +11,7 @@ import importlib
 from lgsens._xla import compilation_cache as compilation_cache, set_options
 from lgsens.analysis import (
     ConstraintRank as ConstraintRank,
+    FrequencyWeighting as FrequencyWeighting,
     Growth as Growth,
     Kinematics as Kinematics,
     Linearization as Linearization,

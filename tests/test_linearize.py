@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import jax
@@ -441,6 +442,24 @@ def test_a_wheel_that_turns_freely_is_a_repeated_zero():
     assert np.abs(linear.eigenvalues[:2]).max() < 1e-7 * np.abs(linear.eigenvalues).max()  # √ε of the largest
 
 
+def test_a_mode_as_a_motion(car):
+    """One period, both masses in the ratio and phase of the shape, velocities the rates of positions."""
+    run, masses = car.mode_motion(0, amplitude=0.02, num_steps=96), ("sprung", "unsprung")
+    omega = 2.0 * np.pi * float(car.frequencies[0])
+    np.testing.assert_allclose(run.t[-1], 2.0 * np.pi / omega, rtol=1e-12)
+    turn = np.exp(1j * omega * np.asarray(run.t))
+    heights = [np.asarray(run.body(name).position[:, 2]) for name in masses]
+    found = np.array([2.0 / 96 * np.conj(turn[:-1]) @ height[:-1] for height in heights])
+    shape = np.array([car.mode_shape(name).translation[0, 2] for name in masses])
+    np.testing.assert_allclose(found[0] / found[1], shape[0] / shape[1], rtol=1e-10)
+    np.testing.assert_allclose(np.abs(found).max(), 0.02 * np.max(run.system.coordinate_scale()), rtol=1e-10)
+    for name, part in zip(masses, found):
+        velocity = np.real(1j * omega * part * turn)
+        np.testing.assert_allclose(run.body(name).velocity[:, 2], velocity, atol=1e-10 * np.abs(velocity).max())
+    with pytest.raises(ValueError, match=says("`index` must be a Python int, the place of one of 4", "got 4")):
+        car.mode_motion(4)
+
+
 # Random road.
 
 
@@ -459,6 +478,29 @@ def test_random_road_in_closed_form(car):
     ]
     np.testing.assert_allclose(found["tyre"] ** 2, sum(parts), rtol=1e-9)
     assert found["height"] == np.inf
+
+
+def test_random_road_weighted_by_frequency(car):
+    """By quadrature of the closed transfer function and of the weighting; the gradient by differences of that."""
+    weighting = lg.FrequencyWeighting("Wk")
+    found = lg.random_road(car, **ROAD, weighting={"acceleration": weighting})
+    a, b, c, d = two_masses(**CAR)
+    matrices = [np.asarray(of) for of in weighting.matrices()]
+
+    def density(omega):
+        s = 1j * omega
+        response = c[0] @ np.linalg.solve(s * np.eye(4) - a, b) + d[0]
+        weight = matrices[2] @ np.linalg.solve(s * np.eye(8) - matrices[0], matrices[1])
+        return np.abs(weight * response / omega) ** 2 * INTENSITY / np.pi
+
+    ends = (1e-9, 3, 20, 60, 200, 2000, np.inf)
+    square = sum(quad(density, *pair, limit=200, epsabs=0, epsrel=1e-11)[0] for pair in pairwise(ends))
+    np.testing.assert_allclose(found["acceleration"] ** 2, square, rtol=1e-8)
+    plain = lg.random_road(car, **ROAD)
+    assert found["acceleration"] < plain["acceleration"]
+    np.testing.assert_allclose(found["stroke"], plain["stroke"], rtol=1e-12)
+    with pytest.raises(ValueError, match=says("`weighting` must give outputs of `linear`", "'noise'")):
+        lg.random_road(car, **ROAD, weighting={"noise": weighting})
 
 
 def test_what_is_refused(car):

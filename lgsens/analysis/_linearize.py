@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from lgsens._validate import as_float
+from lgsens._validate import as_count, as_float
 from lgsens.analysis._eigen import eigen, near, scaled
 from lgsens.analysis._inputs import check_inputs, with_inputs
 from lgsens.analysis._second_order import StateSpace, null_space, state_space
@@ -28,7 +28,7 @@ from lgsens.dynamics import (
 )
 from lgsens.liegroups import unskew
 from lgsens.model import Model
-from lgsens.simulation import Instant, as_system, throw_if_failed
+from lgsens.simulation import Instant, Trajectory, as_system, throw_if_failed
 
 Output = Callable[[Instant], Float[Array, ""]]
 
@@ -116,6 +116,43 @@ class Linearization(eqx.Module):
         turned = jax.vmap(lambda change: unskew(change @ orientation.T))(turns)
         x = self.vectors[: self.basis.shape[1]].T
         return ModeShape(x @ moves.astype(x.dtype), x @ turned.astype(x.dtype))
+
+    def mode_motion(self, index: int, *, amplitude=0.1, num_steps: int = 48) -> Trajectory:
+        """One period of a mode as a motion, to be animated (`plotting.animate`) or looked at.
+
+            q exp(w̃),   w = Re(`basis` x e^{iωt}) s,   ω = |Im λ|, or |λ| of a mode that does not oscillate
+
+        Arguments:
+            index: the place of the eigenvalue, a Python int.
+            amplitude: the largest displacement, in rad or lengths of the scene, shape (); it sets s.
+            num_steps: of the period, a Python int.
+
+        Returns a `Trajectory` about `state`, undamped, from t = 0 to 2π/ω [s] (1 s where λ = 0), velocities and
+        accelerations those of w, multipliers those of `state`. To first order: joints give way by the square of the
+        amplitude. Raises `ValueError` for another index.
+        """
+        count = self.eigenvalues.shape[0]
+        if isinstance(index, bool) or not isinstance(index, int) or not -count <= index < count:
+            raise ValueError(f"`index` must be a Python int, the place of one of {count} eigenvalues, got {index!r}.")
+        num_steps = as_count(num_steps, "num_steps")
+        system, state, lam = self.system, self.state, self.eigenvalues[index]
+        oscillates = jnp.abs(jnp.imag(lam)) > 1e-6 * jnp.abs(lam)
+        size = jnp.where(oscillates, jnp.abs(jnp.imag(lam)), jnp.abs(lam))
+        omega = jnp.where(size > 0.0, size, 2.0 * jnp.pi)
+        shape = self.basis.astype(lam.dtype) @ self.vectors[: self.basis.shape[1], index]
+        largest = jnp.max(jnp.abs(shape) / system.coordinate_scale())
+        factor = as_float(amplitude, (), "`amplitude`") / jnp.where(largest > 0.0, largest, 1.0)
+        along, across = factor * jnp.real(shape), factor * jnp.imag(shape)
+
+        def at(phase):
+            w = jnp.cos(phase) * along - jnp.sin(phase) * across
+            rate = -omega * (jnp.sin(phase) * along + jnp.cos(phase) * across)
+            vdot = -(omega**2) * w
+            return State(system.group.retract(state.q, w), rate, vdot, state.lam, vdot)
+
+        phases = jnp.linspace(0.0, 2.0 * jnp.pi, num_steps + 1, dtype=omega.dtype)
+        states = jax.vmap(at)(phases)
+        return Trajectory(t=phases / omega, states=states, result=self.result, stats=None, system=system)
 
     def frequency_response(self, frequency) -> Complex[Array, "*n o p"]:
         """H(iω) = C (iω − A)⁻¹ B + D + iω D_1 − ω² D_2 at ω = 2π `frequency` [Hz], shape (…) → (…, o, p)."""

@@ -11,14 +11,19 @@ z itself has no variance. With the static response y_s, A y_s + B = 0, and y = �
 
 for outputs f = C y + D z that do not follow the road, C y_s + D = 0: accelerations, travel, the load of a tyre.
 
+A weighted output is that of more equations, x' = A_w x + B_w f (`FrequencyWeighting`): with f = C ỹ the same equation
+for [ỹ; x], whose matrix is [[A, 0], [B_w C, A_w]] and whose y_s is [y_s; 0].
+
 The gradient. P depends on its right-hand side linearly, and with the adjoint Lyapunov equation Aᵀ Λ + Λ A + P̄ = 0 of
 what a criterion asks, P̄ = ∂Ψ/∂P, it is Ψ' = Λ : (2 A' P + (S y_s y_sᵀ)'): one equation for all parameters, the
 transpose of the solution of the first one, as which it is written.
 
-Sources: ISO 8608:2016; Gobbi & Mastinu, J. Sound Vib. 245 (2001) 457.
+Sources: ISO 8608:2016; ISO 2631-1:1997; Gobbi & Mastinu, J. Sound Vib. 245 (2001) 457.
 """
 
-import jax
+from collections.abc import Mapping
+
+import equinox as eqx
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 import numpy as np
@@ -26,6 +31,7 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, require
 from lgsens.analysis._linearize import Linearization
+from lgsens.analysis._weighting import FrequencyWeighting
 from lgsens.linear import LinearEquations, linear_solve
 
 _LYAPUNOV = LinearEquations(
@@ -40,12 +46,24 @@ def lyapunov(a: Float[Array, "n n"], load: Float[Array, "n n"]) -> Float[Array, 
     return linear_solve(_LYAPUNOV, a, -load)
 
 
-@jax.jit
-def _deviations(linear: Linearization, intensity):
+def _weighted(a, rest, row, intensity, weighting: FrequencyWeighting) -> Float[Array, ""]:
+    """The variance of the output C ỹ, C one row, as it is weighted."""
+    own, entry, shown = weighting.matrices(a.dtype)
+    a = jnp.block([[a, jnp.zeros((a.shape[0], own.shape[0]), a.dtype)], [jnp.outer(entry, row), own]])
+    load = jnp.zeros(a.shape[0], a.dtype).at[: rest.shape[0]].set(rest)
+    covariance = lyapunov(a, intensity * jnp.outer(load, load))[rest.shape[0] :, rest.shape[0] :]
+    return shown @ covariance @ shown
+
+
+@eqx.filter_jit
+def _deviations(linear: Linearization, intensity, weightings: tuple[FrequencyWeighting | None, ...]):
     a, b, c = linear.A, linear.B, linear.C
     rest = -jnp.linalg.solve(a, b)[:, 0]  # y_s
     covariance = lyapunov(a, intensity * jnp.outer(rest, rest))
     square = jnp.sum((c @ covariance) * c, axis=1)
+    for i, weighting in enumerate(weightings):
+        if weighting is not None:
+            square = square.at[i].set(_weighted(a, rest, c[i], intensity, weighting))
     follows, size = (c @ rest + linear.D[:, 0]), jnp.abs(c) @ jnp.abs(rest) + jnp.abs(linear.D[:, 0])
     eps = jnp.finfo(a.dtype).eps
     infinite = (jnp.abs(follows) > jnp.sqrt(eps) * size) | (linear.D1[:, 0] != 0.0) | (linear.D2[:, 0] != 0.0)
@@ -55,7 +73,14 @@ def _deviations(linear: Linearization, intensity):
     return jnp.where(settles, jnp.where(infinite, jnp.inf, deviation), jnp.nan)
 
 
-def random_road(linear: Linearization, *, roughness, speed, wave_number=0.1) -> dict[str, Float[Array, ""]]:
+def random_road(
+    linear: Linearization,
+    *,
+    roughness,
+    speed,
+    wave_number=0.1,
+    weighting: Mapping[str, FrequencyWeighting] | None = None,
+) -> dict[str, Float[Array, ""]]:
     """The standard deviation of each output of a car on a random road, ISO 8608, at constant speed.
 
         A P + P Aᵀ + S y_s y_sᵀ = 0,     σ² = C P Cᵀ,     S = (2π n_0)² G_d(n_0) V/2,     y_s = −A⁻¹B
@@ -65,6 +90,7 @@ def random_road(linear: Linearization, *, roughness, speed, wave_number=0.1) -> 
         roughness: G_d(n_0) [m³], shape (): 16e-6, 64e-6, 256e-6 for roads of class A, B, C.
         speed: V [m/s], shape ().
         wave_number: n_0 [cycles/m], shape ().
+        weighting: how outputs are weighted by frequency, by their names: `{"acceleration": FrequencyWeighting("Wk")}`.
 
     Returns by the name of the output its standard deviation (RMS about the equilibrium), shape (), in its unit; inf for
     one that follows the road, as a height does, or sees its rate. Differentiable, by the adjoint Lyapunov equation.
@@ -73,6 +99,13 @@ def random_road(linear: Linearization, *, roughness, speed, wave_number=0.1) -> 
     """
     if len(linear.inputs) != 1:
         raise ValueError(f"`linear` must have one input, the road, got {linear.inputs}.")
+    weighting = weighting or {}
+    for name, own in weighting.items():
+        if name not in linear.outputs or not isinstance(own, FrequencyWeighting):
+            raise ValueError(
+                f"`weighting` must give outputs of `linear`, {', '.join(linear.outputs)}, a FrequencyWeighting each; "
+                f"got {name!r}: {own!r}."
+            )
     numbers = {"roughness": roughness, "speed": speed, "wave_number": wave_number}
     roughness, speed, wave_number = (as_float(value, (), f"`{name}`") for name, value in numbers.items())
     require(
@@ -82,4 +115,5 @@ def random_road(linear: Linearization, *, roughness, speed, wave_number=0.1) -> 
         linear.eigenvalues,
     )
     intensity = (2.0 * jnp.pi * wave_number) ** 2 * roughness * speed / 2.0
-    return dict(zip(linear.outputs, _deviations(linear, intensity)))
+    weightings = tuple(weighting.get(name) for name in linear.outputs)
+    return dict(zip(linear.outputs, _deviations(linear, intensity, weightings)))
