@@ -51,10 +51,10 @@ def consistent_velocity(system: AbstractSystem, q, v, t, factors: Factors | None
     return kkt.solve(kkt.mass @ v, -prescribed_velocity(system, q, t))[0]
 
 
-def least_velocity(system: AbstractSystem, q, rows, t, factors: Factors | None = None) -> Float[Array, " k"]:
+def least_velocity(system: AbstractSystem, q, rows, t) -> Float[Array, " k"]:
     """The x of least kinetic energy with J x = `rows`, shape (m,)."""
     zero = jnp.zeros(system.group.dim, rows.dtype)
-    return ConstrainedMass.of(system, q, t, factors).solve(zero, rows)[0]
+    return ConstrainedMass.of(system, q, t).solve(zero, rows)[0]
 
 
 def given_way(system: AbstractSystem, q, lam, t) -> Float[Array, " k"] | None:
@@ -109,11 +109,19 @@ def _implicit_accelerations(system: AbstractSystem, q, v, t):
     return y[:k], scale * y[k:]
 
 
-def normal_jerk(system: AbstractSystem, q, v, vdot, t, factors: Factors | None = None) -> Float[Array, " k"]:
-    """N v̈: the part of v̈ that the constraints ask for, the least with J v̈ + d(J v̇ + γ)/dt = 0 at fixed v̈ = 0."""
+def normal_jerk(
+    system: AbstractSystem, q, v, vdot, t, other, factors: Factors | None = None
+) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+    """N v̈ and N x of a velocity x, N the M-orthogonal projection on the constraint directions.
+
+    N v̈ is what the constraints ask for: the least with J v̈ + d(J v̇ + γ)/dt = 0, the latter at fixed v̈ = 0.
+    """
     motion = system.group.to_ambient(q, v), vdot, jnp.ones_like(t)
     rate = lambda q, v, t: constraint_acceleration(system, q, v, vdot, t)
-    return least_velocity(system, q, -jax.jvp(rate, (q, v, t), motion)[1], t, factors)
+    kkt = ConstrainedMass.of(system, q, t, factors)
+    rows = jnp.stack([-jax.jvp(rate, (q, v, t), motion)[1], kkt.jacobian @ other])
+    jerk, normal = jax.vmap(lambda row: kkt.solve(jnp.zeros_like(v), row)[0])(rows)
+    return jerk, normal
 
 
 def acceleration_and_jerk(system: AbstractSystem, q, v, t, factors: Factors | None = None):

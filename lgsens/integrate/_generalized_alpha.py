@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from lgsens._validate import require_setting
-from lgsens.dynamics import given_way, normal_jerk, split_velocity
+from lgsens.dynamics import given_way, normal_jerk
 from lgsens.integrate._alpha import AbstractAlpha, AbstractEquations, Matrix, Wear
 from lgsens.integrate._alpha_defects import alpha_defects
 from lgsens.integrate._guess import Guess
@@ -76,13 +76,13 @@ class AbstractGeneralizedAlpha(AbstractAlpha):
         if not (self.second_order_start and rows):
             return Start(state)
         q, v, vdot = state.q, state.v, state.vdot
-        jerk = normal_jerk(system, q, v, vdot, t0, initial.factors)
+        turning = self.missed_increment(system, v, vdot, jnp.zeros_like(v))
+        jerk, normal = normal_jerk(system, q, v, vdot, t0, turning, initial.factors)
         a_1 = self.delta * jerk
         if self.stabilized:
             return Start(state, a_1=a_1)
-        missed = self.missed_increment(system, v, vdot, jerk)
-        _, normal = split_velocity(system, q, missed, t0, initial.factors)
-        return Start(state, q_2=given_way(system, q, self.beta * state.lam, t0), v_2=normal, a_1=a_1)
+        v_2 = self.missed_increment(system, v, vdot, jerk) - turning + normal  # N c, linear in v̈
+        return Start(state, q_2=given_way(system, q, self.beta * state.lam, t0), v_2=v_2, a_1=a_1)
 
     def complete(self, system, state):
         if not self.stabilized:
