@@ -97,9 +97,11 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
 
     nothing, largest = jnp.zeros(k + m, dtype), lambda z: jnp.max(jnp.abs(z[k:]), initial=0.0)
 
-    def balanced(z, left):
-        """To √eps of the largest joint force or moment, taken as mass scale × 1 m/s² at least."""
-        return jnp.max(jnp.abs(left)) <= jnp.sqrt(eps) * (1.0 + largest(z))
+    def balanced(z, left, slope):
+        """To √eps of the largest joint force or moment, taken as mass scale × 1 m/s² at least; and to what stiff forces
+        make of round-off of a place, 16 eps of 1 rad or the length of the scene: EA eps of a beam is more."""
+        stiffest = jnp.max(jnp.sum(jnp.abs(slope[:k, :k]), axis=1))
+        return jnp.max(jnp.abs(left)) <= jnp.sqrt(eps) * (1.0 + largest(z)) + 16.0 * eps * stiffest
 
     inertia = system.mass_matrix() * scale[:, None] * scale[None, :] / weight
     viscous = jnp.zeros((k + m, k + m), dtype).at[:k, :k].set(lax.stop_gradient(inertia))
@@ -107,14 +109,15 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
     def newton(equation, z):
         def body(carry: _Search) -> _Search:
             z, mu = carry.z, carry.mu
-            step = jnp.linalg.lstsq(matrix(z) + mu * viscous, equation(z), rcond=1e3 * eps)[0]
+            slope = matrix(z)
+            step = jnp.linalg.lstsq(slope + mu * viscous, equation(z), rcond=1e3 * eps)[0]
             # Multipliers too: where joint forces alone are stiff, as in a pendulum, the first step moves nothing.
             size = jnp.max(jnp.abs(step) / jnp.where(np.arange(k + m) < k, 1.0, 1.0 + largest(z)))
             moved = jnp.max(jnp.abs(step[: k - system.num_states]))
             # At most 0.2 rad or a fifth of the scene at a time.
             z = z - step * jnp.minimum(1.0, 0.2 / jnp.maximum(moved, 0.2))
             left, count = equation(z), carry.iteration + 1
-            done = (size <= jnp.sqrt(eps)) & balanced(z, left)
+            done = (size <= jnp.sqrt(eps)) & balanced(z, left, slope)
             path = carry.path + jnp.minimum(moved, 0.2)
             stuck = (size <= jnp.sqrt(eps)) | (path > _FAR) | (count >= _MAX_ITERATIONS)
             lost = (mu == 0.0) & ~done & stuck
@@ -138,7 +141,7 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
     z = lax.custom_root(equation, nothing, newton, tangent_solve)
     x, v, lam = split(z)
     q, vdot = group.retract(q_ref, x), zero
-    rests = balanced(z, jnp.concatenate([equation(z), system.velocity_constraint(q, v, t)]))
+    rests = balanced(z, jnp.concatenate([equation(z), system.velocity_constraint(q, v, t)]), matrix(z))
     result = jnp.where(rests, RESULTS.successful, RESULTS.equilibrium_failed).astype(jnp.int32)
     if depends_on_time(system, q, v, t):
         v = consistent_velocity(system, q, v, t)

@@ -265,3 +265,29 @@ def test_a_level_chain_hangs(links):
     # Newton ends at round-off of the joints' forces, a chain of n amplifies that by n²
     np.testing.assert_allclose(place, [0.0, 0.0, 0.5 - links], atol=1e-12)
     np.testing.assert_allclose(turn, [(links - 0.5) / G, 0.0, 0.0], atol=1e-10)
+
+
+def cantilever(load, elements):
+    """EA = 5e7 N against bending of 1/2000 of it: forces balance to the round-off of places only."""
+    section = lg.BeamSection.tube(0.03, 0.003, young=2.1e11, poisson=0.3, density=7850.0)
+    beam = lg.Beam("arm", section, [[0, 0, 0], [1.0, 0, 0]], elements=elements)
+    push, clamp = lg.AppliedForce(f"arm.{elements}", force=[0, 0, load]), lg.FixedJoint(None, "arm.0", at=[0, 0, 0])
+    return section, lg.Model(beam.bodies, {"clamp": clamp}, beam.forces | {"push": push}, merge_fixed=True)
+
+
+def test_a_stiff_element_bends():
+    """The moment in the middle is F L/2: z = F L³/(4 EI) + F L/GA; the rest is of third order, 1e-9."""
+    section, model = cantilever(1.0, 1)
+    _, _, shear, _, bending, _ = section.stiffness
+    found = lg.equilibrium(model).q.position[-1, 2]
+    np.testing.assert_allclose(found, 1.0 / (4.0 * bending) + 1.0 / shear, rtol=1e-7)
+
+
+@pytest.mark.slow  # a program of statics
+def test_a_stiff_beam_bends_far():
+    """Newton's first step takes the turn of the end for a stretch. By the path of `statics`, in small loads."""
+    _, model = cantilever(1e4, 2)
+    path = lg.statics(model, loads={"push": np.linspace(0.0, 1.0, 21)})
+    found = lg.equilibrium(model).q.position[-1]
+    assert found[2] > 0.4
+    np.testing.assert_allclose(found, path.body("arm.2").position[-1], atol=1e-9)  # EA eps of 1e4 N on 1e5 N/m
