@@ -27,6 +27,8 @@ from jaxtyping import Array, Float
 
 from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem
 
+_CALLS = ("jit", "pjit")  # operations of JAX with the program of a function in `jaxpr`
+
 
 def full_jacobian(system: AbstractSystem, q, t) -> Float[Array, "m k"]:
     """J = [B; A]."""
@@ -68,8 +70,17 @@ def fixed_velocity_rate(system: AbstractSystem, q, v, t) -> Float[Array, " m"]:
 def depends_on_time(system: AbstractSystem, q, v, t) -> bool:
     """Whether a row depends on t, as far as its program says (an operation that t enters)."""
     rows = jax.make_jaxpr(lambda q, v, t: _with_level(system, q, v, t, system.constraint(q, t)))(q, v, t).jaxpr
-    reached = {id(rows.invars[-1])}
-    for operation in rows.eqns:
-        if any(id(entry) in reached for entry in operation.invars):
-            reached.update(map(id, operation.outvars))
-    return any(id(row) in reached for row in rows.outvars)
+    return any(_reached(rows, [entry is rows.invars[-1] for entry in rows.invars]))
+
+
+def _reached(program, given: list[bool]) -> list[bool]:
+    """Which results of a program some of its arguments enter; calls of others are looked into."""
+    reached = {id(entry) for entry, is_given in zip(program.invars, given) if is_given}
+    for operation in program.eqns:
+        entered = [id(entry) in reached for entry in operation.invars]
+        if not any(entered):
+            continue
+        inner = getattr(operation.params.get("jaxpr"), "jaxpr", None) if operation.primitive.name in _CALLS else None
+        results = _reached(inner, entered) if inner is not None else [True] * len(operation.outvars)
+        reached.update(id(entry) for entry, is_reached in zip(operation.outvars, results) if is_reached)
+    return [id(result) in reached for result in program.outvars]
