@@ -19,11 +19,8 @@ def blocks(text, language="python"):
 
 
 PAGES = [path for path in sorted((ROOT / "notebooks").rglob("*.md")) if blocks(path.read_text(encoding="utf-8"))]
-LONG = {
-    "flexible": 1,
-    "fidelity": 0,
-    "suspension": 1,
-}  # how many blocks the quick run takes; `tests/accuracy/test_fidelity.py` is small
+# How many blocks the quick run takes; `tests/accuracy/test_fidelity.py` is a small version of its page.
+LONG = {"flexible": 1, "fidelity": 0, "suspension": 1}
 WHOLE = [pytest.param(path, None, marks=[pytest.mark.slow] * (path.stem in LONG), id=path.stem) for path in PAGES]
 BEGUN = [pytest.param(path, LONG[path.stem], id=f"begun-{path.stem}") for path in PAGES if LONG.get(path.stem)]
 

@@ -73,7 +73,7 @@ def _sections(name: str) -> _Linear:
 
 
 class FrequencyWeighting(eqx.Module):
-    """A frequency weighting of ISO 2631 and ISO 8041, as linear equations of an acceleration f.
+    """A frequency weighting of ISO 2631 and ISO 8041, as linear equations of an acceleration f [m/s² or rad/s²].
 
         x' = A x + B f,     weighted f = C x
 
@@ -82,7 +82,7 @@ class FrequencyWeighting(eqx.Module):
             "Wf" (motion sickness), "Wj" (head).
 
     For `random_road(…, weighting={"acceleration": FrequencyWeighting("Wk")})`, and for samples, `apply`. Static. Raises
-    `ValueError` for another name.
+    `ValueError` for another name. Source: ISO 2631-1:1997, annex A; ISO 8041-1:2017, table 3.
     """
 
     name: str = eqx.field(static=True)
@@ -98,7 +98,7 @@ class FrequencyWeighting(eqx.Module):
         return a, b, c
 
     def frequency_response(self, frequency) -> Complex[Array, "*n"]:
-        """H(iω) at ω = 2π `frequency` [Hz], shape (…) → (…)."""
+        """H(iω) [–] at ω = 2π `frequency` [Hz], shape (…) → (…)."""
         frequency = as_float(frequency, None, "`frequency`")
         whole = lax.complex(jnp.zeros_like(frequency), 2.0 * jnp.pi * frequency)  # s
         a, b, c = (of.astype(whole.dtype) for of in self.matrices(frequency.dtype))
@@ -112,7 +112,8 @@ class FrequencyWeighting(eqx.Module):
             t: times [s], shape (n,), `Trajectory.t`.
             f: an acceleration there, shape (n,).
 
-        √(mean of its square) is the weighted RMS. Raises `ValueError` for shapes that differ.
+        Returns it in its unit, shape (n,); √(mean of its square) is the weighted RMS. Raises `ValueError` for shapes
+        that differ.
         """
         t, f = as_float(t, None, "`t`"), as_float(f, None, "`f`")
         if t.ndim != 1 or f.shape != t.shape or t.shape[0] < 2:

@@ -45,6 +45,7 @@ class _Search(NamedTuple):
     """How far an iteration has come."""
 
     z: Float[Array, " k+m"]
+    left: Float[Array, " k+m"]  # of the equations there
     mu: Float[Array, ""]  # μ, 0 as long as it is Newton's
     path: Float[Array, ""]  # the sum of the largest motions of all steps
     iteration: Int[Array, ""]
@@ -95,7 +96,7 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
         lower = jnp.concatenate([positions, jnp.zeros((m, m), dtype)], axis=1)
         return jnp.concatenate([upper * (scale / weight)[:, None], lower], axis=0)
 
-    nothing, largest = jnp.zeros(k + m, dtype), lambda z: jnp.max(jnp.abs(z[k:]), initial=0.0)
+    largest = lambda z: jnp.max(jnp.abs(z[k:]), initial=0.0)
 
     def balanced(z, left, slope):
         """To √eps of the largest joint force or moment, taken as mass scale × 1 m/s² at least; and to what stiff forces
@@ -106,11 +107,13 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
     inertia = system.mass_matrix() * scale[:, None] * scale[None, :] / weight
     viscous = jnp.zeros((k + m, k + m), dtype).at[:k, :k].set(lax.stop_gradient(inertia))
 
-    def newton(equation, z):
+    def newton(equation, begin):
+        left_first = equation(begin)
+
         def body(carry: _Search) -> _Search:
             z, mu = carry.z, carry.mu
             slope = matrix(z)
-            step = jnp.linalg.lstsq(slope + mu * viscous, equation(z), rcond=1e3 * eps)[0]
+            step = jnp.linalg.lstsq(slope + mu * viscous, carry.left, rcond=1e3 * eps)[0]
             # Multipliers too: where joint forces alone are stiff, as in a pendulum, the first step moves nothing.
             size = jnp.max(jnp.abs(step) / jnp.where(np.arange(k + m) < k, 1.0, 1.0 + largest(z)))
             moved = jnp.max(jnp.abs(step[: k - system.num_states]))
@@ -121,24 +124,24 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
             path = carry.path + jnp.minimum(moved, 0.2)
             stuck = (size <= jnp.sqrt(eps)) | (path > _FAR) | (count >= _MAX_ITERATIONS)
             lost = (mu == 0.0) & ~done & stuck
-            first = jnp.max(jnp.abs(equation(nothing))) / _STRIDE
-            mu = jnp.where(lost, first, mu * jnp.clip(moved / _STRIDE, 0.5, 4.0))
-            return _Search(jnp.where(lost, nothing, z), mu, path, count, done)
+            again = lambda first, new: jnp.where(lost, first, new)
+            mu = again(jnp.max(jnp.abs(left_first)) / _STRIDE, mu * jnp.clip(moved / _STRIDE, 0.5, 4.0))
+            return _Search(again(begin, z), again(left_first, left), mu, path, count, done)
 
         def unfinished(carry: _Search):
             return ~carry.done & (carry.iteration < _MAX_ITERATIONS + _MAX_SINKING)
 
-        begin = jnp.zeros((), dtype)
-        start = _Search(z, begin, begin, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
-        z = while_loop(unfinished, body, start).z
+        none = jnp.zeros((), dtype)
+        start = _Search(begin, left_first, none, none, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
+        found = while_loop(unfinished, body, start)
         # Newton is quadratic: one step from √eps is at round-off.
-        return z - jnp.linalg.lstsq(matrix(z), equation(z), rcond=1e3 * eps)[0]
+        return found.z - jnp.linalg.lstsq(matrix(found.z), found.left, rcond=1e3 * eps)[0]
 
     def tangent_solve(linear, rhs):
         slope = jax.jacfwd(linear)(jnp.zeros_like(rhs))
         return jnp.linalg.pinv(slope, rtol=1e3 * eps) @ rhs
 
-    z = lax.custom_root(equation, nothing, newton, tangent_solve)
+    z = lax.custom_root(equation, jnp.zeros(k + m, dtype), newton, tangent_solve)
     x, v, lam = split(z)
     q, vdot = group.retract(q_ref, x), zero
     rests = balanced(z, jnp.concatenate([equation(z), system.velocity_constraint(q, v, t)]), matrix(z))

@@ -51,12 +51,6 @@ def consistent_velocity(system: AbstractSystem, q, v, t, factors: Factors | None
     return kkt.solve(kkt.mass @ v, -prescribed_velocity(system, q, t))[0]
 
 
-def least_velocity(system: AbstractSystem, q, rows, t) -> Float[Array, " k"]:
-    """The x of least kinetic energy with J x = `rows`, shape (m,)."""
-    zero = jnp.zeros(system.group.dim, rows.dtype)
-    return ConstrainedMass.of(system, q, t).solve(zero, rows)[0]
-
-
 def given_way(system: AbstractSystem, q, lam, t) -> Float[Array, " k"] | None:
     """The least displacement, in the metric of M, with Φ = c λ: what joints of a `softness` c give way under λ."""
     soft = softness(system)
@@ -65,7 +59,7 @@ def given_way(system: AbstractSystem, q, lam, t) -> Float[Array, " k"] | None:
     gap = soft * lam
     if system.num_velocity_rows:  # which say nothing of positions
         gap = gap.at[-system.num_velocity_rows :].set(0.0)
-    return least_velocity(system, q, gap, t)
+    return ConstrainedMass.of(system, q, t).solve(jnp.zeros(system.group.dim, lam.dtype), gap)[0]
 
 
 def accelerations(system: AbstractSystem, q, v, t, factors: Factors | None = None):

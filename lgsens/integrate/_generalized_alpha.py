@@ -72,8 +72,7 @@ class AbstractGeneralizedAlpha(AbstractAlpha):
         scheme itself is stable.
         """
         state = self.complete(system, initial.state)
-        rows = len(system.constraint_names)
-        if not (self.second_order_start and rows):
+        if not (self.second_order_start and system.constraint_names):
             return Start(state)
         q, v, vdot = state.q, state.v, state.vdot
         turning = self.missed_increment(system, v, vdot, jnp.zeros_like(v))

@@ -78,7 +78,7 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
             more = (
                 f"It failed at {place}{_RUNS[int(details.get('run', 0))]}, {time}, after {int(details['iterations'])} "
                 f"iterations: last increment {details['increment']:.3g}{asked}, residual {details['residual']:.3g}. "
-                f"`throw=False` returns the data up to the step before."
+                "`throw=False` returns the data up to the step before."
             )
         case RESULTS.singular_configuration:
             more = f"It does so about {place}, {time}. `throw=False` returns the data, which follow one branch."

@@ -129,8 +129,12 @@ def simulate(
             stacklevel=2,
         )
     if accuracy is not None:
+        if save is not None or not throw:
+            raise ValueError(
+                "`accuracy` compares trajectories and raises if it is not reached: leave `save`, `throw` out."
+            )
         settings = {"t0": t0, "t1": t1, "integrator": integrator, "sensitivity": sensitivity, "state0": state0}
-        return simulate_to(simulate, accuracy, model, num_steps, settings | {"save": save, "throw": throw})
+        return simulate_to(simulate, accuracy, model, num_steps, settings)
     num_steps = as_count(num_steps, "num_steps", " (it is static), unless `accuracy` is given")
     diffrax = by_diffrax(integrator)
     if not diffrax:

@@ -115,10 +115,7 @@ def _reached(results, tried, distance, extrapolated, accuracy: float, order: int
 
 def simulate_to(simulate: Callable[..., Any], accuracy, model, num_steps: int | None, settings: dict) -> Trajectory:
     """`simulate` with `accuracy`: the numbers without derivatives decide, and the run with them follows."""
-    save, throw = settings.pop("save"), settings.pop("throw")
     order = check_accuracy(accuracy, num_steps, settings["integrator"], (model, settings))
-    if save is not None or not throw:
-        raise ValueError("`accuracy` compares trajectories and raises if it is not reached: leave `save`, `throw` out.")
     fixed, at = jax.tree.map(primal_value, (model, settings))
 
     def distance(coarse: Trajectory, fine: Trajectory) -> float:
