@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float, number_field, point_field, require, suggestion
+from lgsens._validate import as_count, as_float, number_field, point_field, require, suggestion
 from lgsens.liegroups import SO3, skew, turn_back
 from lgsens.model._constraints import AbstractClosedFormConstraint
 from lgsens.model._forces import AbstractConnection, AbstractForce, Attached, _frame
@@ -128,7 +128,8 @@ class CoordinateForce(AbstractForce):
         motor: M(t) [N or N m], a number, shape (), or a signal; None: no motor.
 
     `Trajectory.force` gives the coordinate, its rate, and f. Raises `ValueError` for a joint without the coordinate,
-    and for wrong shapes.
+    and for wrong shapes. Source: in minimal coordinates the spring, damper and motor of MuJoCo's joints (its
+    documentation, "Computation": passive forces, actuation model).
     """
 
     joint: AbstractJoint
@@ -192,7 +193,8 @@ class RotationalSpringDamper(AbstractConnection):
         damping: c [N m s/rad], shape ().
         turned: φ in the reference configuration [rad], inertial frame, shape (3,).
 
-    Raises `ValueError` for wrong shapes.
+    Raises `ValueError` for wrong shapes. Source: that of a ball joint in MuJoCo ("Computation": passive forces); φ and
+    its energy: Géradin & Cardona, Flexible Multibody Dynamics (2001), ch. 4.
     """
 
     a: str | None = eqx.field(static=True)
@@ -207,13 +209,17 @@ class RotationalSpringDamper(AbstractConnection):
 
 
 class Coupled(AbstractClosedFormConstraint):
-    """Φ = s₁ − Σ c_i s₂ⁱ of two coordinates; `roles`: which of the frames (a, b, *others) their four ends are."""
+    """Φ = s₁ − Σ c_i s₂ⁱ of two coordinates; `roles`: which of the frames (a, b, *others) their four ends are.
+
+    Where s₁ is an angle Φ is that but for turns divided by `teeth`.
+    """
 
     first: tuple[Frame, Frame]
     second: tuple[Frame, Frame]
     coefficients: Float[Array, " n"]
     coordinates: tuple[Coordinate, ...] = eqx.field(static=True)  # two
     roles: tuple[int, ...] = eqx.field(static=True)  # four
+    teeth: int = eqx.field(static=True)
 
     drawn = None
 
@@ -230,7 +236,8 @@ class Coupled(AbstractClosedFormConstraint):
             total = (total + self.coefficients[i]) * x
         missing = first(_seen(ends[0], ends[1], *self.first)) - total
         if self.coordinates[0].periodic:
-            missing = jnp.arctan2(jnp.sin(missing), jnp.cos(missing))
+            turn = 2.0 * jnp.pi / self.teeth
+            missing -= turn * jnp.round(missing / turn)
         return missing[None]
 
     def jacobian(self, a, b, t, *others):
@@ -252,7 +259,8 @@ class Coupled(AbstractClosedFormConstraint):
 class CoordinateCoupling(AbstractJoint):
     """The coordinates of two joints move together: s₁ = c₁ s₂ + c₂ s₂² + …; 1 equation between up to four bodies.
 
-    Two fingers of a gripper, a cam, a belt between two joints of an arm. With a *rotor* as one of them, a body that
+    Two fingers of a gripper, a cam, a belt between two joints of an arm, sun and ring of a planetary gear by their
+    hinges on a carrier that turns, too. With a *rotor* as one of them, a body that
     only turns about an axis of the ground, it is the inertia of a drive in joint coordinates: the rotor of inertia J
     turns by s₁ = s₂, and adds the kinetic energy ½ J ṡ₂² and nothing else (MuJoCo's `armature`, the motor's inertia
     times the square of its gear ratio).
@@ -262,21 +270,33 @@ class CoordinateCoupling(AbstractJoint):
             the bodies.
         coefficients: c₁, c₂, …, shape (n,), n ≥ 1. Both coordinates vanish together: in the reference configuration.
         names: the names of the coordinates of both, static; None: the only one.
+        teeth: a count for which c₁ · teeth is an integer: those of the first of two gears, as in `GearJoint`. Where c₁
+            is the only coefficient angles then turn any number of times; else, and for the derivative by c₁, `second`
+            stays within half a turn.
 
-    Angles may turn by any number of turns where c₁ is an integer and the only coefficient; else `second` stays within
-    half a turn. The multiplier is the generalized force that the coupling takes from s₁ [N or N m]. Raises `ValueError`
-    for joints without the coordinate, coefficients of a wrong shape, or fewer than two bodies.
+    The multiplier is the generalized force that the coupling takes from s₁ [N or N m]. Raises `ValueError` for joints
+    without the coordinate, coefficients of a wrong shape, a count below 1, or fewer than two bodies. Source: of gears
+    on a carrier, Willis's equation: Uicker, Pennock & Shigley, Theory of Machines and Mechanisms (5th ed. 2017), ch. 9.
     """
 
     first: AbstractJoint
     second: AbstractJoint
     coefficients: Float[Array, " n"]
     names: tuple[str | None, str | None] = eqx.field(static=True)
+    teeth: int = eqx.field(static=True)
 
     assembled = True
 
-    def __init__(self, first: AbstractJoint, second: AbstractJoint, coefficients: Any = (1.0,), names=(None, None)):
-        self.first, self.second, self.names = first, second, names
+    def __init__(
+        self,
+        first: AbstractJoint,
+        second: AbstractJoint,
+        coefficients: Any = (1.0,),
+        names: tuple[str | None, str | None] = (None, None),
+        *,
+        teeth: int = 1,
+    ):
+        self.first, self.second, self.names, self.teeth = first, second, names, as_count(teeth, "teeth")
         self.coefficients = as_float(coefficients, None, "CoordinateCoupling: `coefficients`")
 
     def __check_init__(self):
@@ -319,4 +339,4 @@ class CoordinateCoupling(AbstractJoint):
             _coordinate("CoordinateCoupling", joint, name) for joint, name in zip((self.first, self.second), self.names)
         )
         both = _attached(self.first, *ends[:2]), _attached(self.second, *ends[2:])
-        return (Coupled(*both, self.coefficients, coordinates, roles),)
+        return (Coupled(*both, self.coefficients, coordinates, roles, self.teeth),)

@@ -9,6 +9,7 @@ a moment loads it like a force at the arm ℓ, half the distance of two ends of 
 (ε/L)²/2 of it less than N₀ + L. With [ẋ, ω] the velocity of that frame in the one on a, surfaces slip by
 
     w = (ẋ_i, r ω_j):     r ω of a hinge, ẋ of a slider, both of a sleeve, the three r ω_j of a ball,
+                          r ω about both arms of a cross, each in the body that it is fixed in,
 
 and a force s(w, N) against w acts on b, along ẋ_i and at the radius r about ω_j. Its power is s·w.
 
@@ -47,6 +48,7 @@ class Surface(eqx.Module):
 
     constraints: tuple[AbstractRows, ...]  # of the joint; none: N = N₀
     axes: Float[Array, "3 3"]  # C, in the frame of a
+    axes_b: Float[Array, "3 3"] | None  # those of the frame on b, in that of b; None: no slip is about one of them
     point: Float[Array, "3"]  # X_b
     radius: Float[Array, ""] | None
     arm: Float[Array, ""] | None
@@ -71,25 +73,27 @@ class Surface(eqx.Module):
             square += jnp.sum(moment * moment)
         return self.preload + square / jnp.sqrt(square + self.load_rounding**2)
 
-    def _along(self, a: Frame):
-        """The axes of the frame on a, inertial frame, and ∂w/∂[ẋ, ω], which is constant."""
+    def _along(self, a: Frame, b: Frame):
+        """The axes of ẋ, ω and of ω once more, those of b, inertial frame, and ∂w/∂[ẋ, ω, ω], which is constant."""
         one = jnp.ones_like(self.preload)
         scale = jnp.stack([one if i < ROTATION.start or self.radius is None else self.radius for i in self.slips])
-        return a.orientation @ self.axes, scale[:, None] * np.eye(BODY_DIM, dtype=one.dtype)[list(self.slips)]
+        axes = a.orientation @ self.axes
+        triads = [axes, axes] if self.axes_b is None else [axes, axes, b.orientation @ self.axes_b]
+        return triads, scale[:, None] * np.eye(3 * len(triads), dtype=one.dtype)[list(self.slips)]
 
     def slip(self, a: Frame, b: Frame, va, vb) -> Float[Array, " w"]:
-        axes, rows = self._along(a)
+        (axes, *turning), rows = self._along(a, b)
         at = b.point(self.point)
         speed = lambda frame, v, local: v[: ROTATION.start] + frame.axis(cross(v[ROTATION], local))
         linear = speed(b, vb, self.point) - speed(a, va, a.local_point(at))
         angular = b.axis(vb[ROTATION]) - a.axis(va[ROTATION])
-        return rows @ jnp.concatenate([linear @ axes, angular @ axes])
+        return rows @ jnp.concatenate([linear @ axes, *(angular @ triad for triad in turning)])
 
     def force(self, a: Frame, b: Frame, s) -> Float[Array, "12"]:
         """Q of the force s on b along w."""
-        axes, rows = self._along(a)
-        every = s @ rows
-        force, moment = axes @ every[: ROTATION.start], axes @ every[ROTATION]
+        triads, rows = self._along(a, b)
+        force, *moments = map(jnp.matmul, triads, jnp.split(s @ rows, len(triads)))
+        moment = total(moments)
         local = a.local_point(b.point(self.point))
         on_a = a.local_axis(moment) + cross(local, a.local_axis(force))
         on_b = b.local_axis(moment) + cross(self.point, b.local_axis(force))
@@ -144,7 +148,7 @@ class LuGreLoad(AbstractDynamicLoad):
 
     @property
     def states(self):
-        names = "x", "y", "z", "turn_x", "turn_y", "turn_z"
+        names = "x", "y", "z", "turn_x", "turn_y", "turn_z", "turn_x_b", "turn_y_b", "turn_z_b"
         return tuple(f"bristle_{names[i]}" for i in self.surface.slips)
 
     @property
@@ -203,7 +207,7 @@ class _AbstractJointFriction(AbstractForce):
         if not joint.slips:
             raise ValueError(
                 f"{what}: `joint` {self.joint!r} is a {type(joint).__name__}, of which no friction is known; it must "
-                "be a revolute, prismatic, cylindrical, spherical, planar or screw joint."
+                "be a revolute, prismatic, cylindrical, spherical, universal, planar or screw joint."
             )
         if self.radius is None and any(i >= ROTATION.start for i in joint.slips):
             raise ValueError(f"{what}: `radius` is missing; joint {self.joint!r} turns, give where it rubs [m].")
@@ -231,11 +235,12 @@ class _InJoint(AbstractForce):
         of, joint = self.friction, self.joint
         a, b = (_frame(bodies, name, of.preload.dtype) for name in self.bodies)
         assert joint.frames is not None  # a joint that slips has frames
-        (_, axes), (point, _) = joint.frames
+        (_, axes), (point, axes_b) = joint.frames
         constraints = joint.constraints(a, b) if of.own_forces else ()
         surface = Surface(
             constraints=constraints,
             axes=a.orientation.T @ axes,
+            axes_b=b.orientation.T @ axes_b if max(joint.slips) >= BODY_DIM else None,
             point=b.local_point(point),
             radius=of.radius,
             arm=of.arm,
@@ -252,11 +257,12 @@ class JointFriction(_AbstractJointFriction):
         s = −(μ N/√(w² + w₀²) + c) w,     N = N₀ + L²/√(L² + ε²),     L² = |f|² + |m|²/ℓ²
 
     w is the velocity with which the surfaces slip: that of a slider, r times the angular velocity of a hinge or of a
-    ball, both together of a sleeve; f and m are the force and the moment that the joint carries at its point, λ, in the
-    same instant. All derivatives are continuous. Below w₀ the friction is viscous: what it holds creeps.
+    ball, both together of a sleeve, both rates of a cross; f and m are the force and the moment that the joint carries
+    at its point, λ, in the same instant. All derivatives are continuous. Below w₀ the friction is viscous: what it
+    holds creeps.
 
     Arguments:
-        joint: name of the joint: revolute, prismatic, cylindrical, spherical, planar or screw.
+        joint: name of the joint: revolute, prismatic, cylindrical, spherical, universal, planar or screw.
         coefficient: μ [–], shape ().
         slip_speed: w₀ [m/s], shape (), > 0: μ N is reached to 1 % at 7 w₀.
         radius: r [m], shape (), > 0, at which a joint that turns rubs.
@@ -269,7 +275,8 @@ class JointFriction(_AbstractJointFriction):
 
     Equations that freed bodies cannot violate carry nothing here (`Trajectory.joint`). `Trajectory.force` gives a
     `SlidingFriction`. Raises `ValueError` for an unknown joint or another one, a missing radius, numbers ≤ 0, and with
-    `Model(redundant="minimum_norm")`.
+    `Model(redundant="minimum_norm")`. Sources: Haug, Wu & Yang, Mechanism and Machine Theory 21 (1986) 401; Pennestrì,
+    Rossi, Salvini & Valentini, Nonlinear Dynamics 83 (2016), doi:10.1007/s11071-015-2485-3.
     """
 
     joint: str = eqx.field(static=True)

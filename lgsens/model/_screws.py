@@ -4,12 +4,15 @@ Poses tell an angle but for whole turns. Where a body has advanced by s it shoul
 from there to where it is needs to be known: it is small, whatever the number of turns (`Angle`).
 """
 
+import math
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._validate import axis_field, number_field, point_field, require_nonzero
+from lgsens._validate import axis_field, point_field
 from lgsens.model._constraints import AbstractClosedFormConstraint, InPlane
 from lgsens.model._drivers import Angle
 from lgsens.model._elements import body_fixed
@@ -41,8 +44,9 @@ class Advance(AbstractClosedFormConstraint):
     first_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
     second_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
     first_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
-    per_radian: Prescribed  # ρ [m/rad]
+    ratio: Prescribed  # ρ [m], for each `per` radians
     travel: AbstractSignal | None  # f [m] over θ [rad]
+    per: float = eqx.field(static=True)
 
     drawn = None
 
@@ -60,9 +64,12 @@ class Advance(AbstractClosedFormConstraint):
     def _angle(self, from_angle: Array | float = 0.0) -> Angle:
         return Angle(self.first_a, self.second_a, self.first_b, jnp.asarray(from_angle, self.first_a.dtype))
 
+    def _per_radian(self, t):
+        return at_time(self.ratio, t) / self.per
+
     def _state(self, a, b, t):
         """ρ, s and θ − s/ρ."""
-        per_radian, s = at_time(self.per_radian, t), self._line().value(a, b, t)[0]
+        per_radian, s = self._per_radian(t), self._line().value(a, b, t)[0]
         return per_radian, s, self._angle(s / per_radian).value(a, b, t)[0]
 
     def value(self, a, b, t):
@@ -72,7 +79,7 @@ class Advance(AbstractClosedFormConstraint):
     def _slopes(self, a, b, t):
         """f′ and f″, or ρ and None."""
         if self.travel is None:
-            return at_time(self.per_radian, t), None
+            return self._per_radian(t), None
         per_radian, s, rest = self._state(a, b, t)
         return jax.jvp(jax.grad(self.travel), (s / per_radian + rest,), (jnp.ones_like(s),))
 
@@ -93,37 +100,57 @@ class Advance(AbstractClosedFormConstraint):
         return stiffness - lam[0] * bend * jnp.outer(row, row)
 
 
-def _advance(a: Frame, b: Frame, at, along, axis, per_radian, travel=None) -> Advance:
-    _, first, second = normals(axis)
-    points = a.local_point(at), b.local_point(at)
+def _advance(joint: "ScrewJoint | RackAndPinionJoint", a: Frame, b: Frame, along, ratio, per: float) -> Advance:
+    _, first, second = normals(joint.axis)
+    points = a.local_point(joint.at), b.local_point(joint.at)
     axes = a.local_axis(along / jnp.linalg.norm(along)), a.local_axis(first), a.local_axis(second)
-    return Advance(*points, *axes, b.local_axis(first), prepared(per_radian), prepared(travel))
+    return Advance(*points, *axes, b.local_axis(first), prepared(ratio), prepared(joint.travel), per)
+
+
+def _travel_field() -> Any:
+    return eqx.field(default=None, kw_only=True, metadata={"over": "angle"})
+
+
+def _check_travel(joint: "ScrewJoint | RackAndPinionJoint", ratio: str) -> None:
+    if not isinstance(joint.travel, AbstractSignal | None):
+        raise ValueError(
+            f"{type(joint).__name__}: `travel` must be a signal of the angle, got {joint.travel!r}; "
+            f"a constant ratio is `{ratio}`."
+        )
 
 
 class ScrewJoint(AbstractJoint):
-    """`b` turns about an axis of `a` and advances along it by a pitch in each turn, s = p θ/2π; 5 equations.
+    """`b` turns about an axis of `a` and advances along it by a pitch in each turn, s = p θ/2π or f(θ); 5 equations.
 
     Arguments:
         a, b: names of the two bodies; None is the ground.
         at: a point of the axis in the reference configuration [m], inertial frame, shape (3,).
         axis: direction of the axis, inertial frame, shape (3,), any length > 0.
-        pitch: p [m per turn], shape (), right-handed if positive, not zero; any number of turns.
+        pitch: p [m per turn], shape (), right-handed if positive, not zero; any number of turns. Or a signal of time:
+            s, not its rate, is p(t) θ/2π at every instant.
+        travel: f [m] over θ [rad] of a thread of variable pitch, or of a barrel cam: as in `RackAndPinionJoint`, with
+            `pitch` its mean, from which f departs by less than p/2.
 
     The multipliers are those of a `CylindricalJoint`, and the force of `b` on `a` along the axis [N]. Raises
-    `ValueError` for a wrong shape, a zero axis or a zero pitch, for which it is a RevoluteJoint. Source: Haug (1989),
-    §9.4.
+    `ValueError` for a wrong shape, a zero axis, a missing or zero pitch, for which it is a RevoluteJoint, or a travel
+    that is no signal. Source: Haug (1989), §9.4.
     """
 
     a: str | None = eqx.field(static=True)
     b: str | None = eqx.field(static=True)
     at: Float[Array, "3"] = point_field("at")
     axis: Float[Array, "3"] = axis_field("axis")
-    pitch: Float[Array, ""] = number_field("pitch")
+    pitch: Prescribed | None = prescribed_field("pitch", positional=True)
+    travel: AbstractSignal | None = _travel_field()
 
     def __check_init__(self):
-        require_nonzero("ScrewJoint", "pitch", self.pitch, " m; without advance it is a RevoluteJoint")
+        require_ratio("ScrewJoint", "pitch", self.pitch, " m; without advance it is a RevoluteJoint")
+        _check_travel(self, "pitch")
 
-    assembled = True
+    @property
+    def assembled(self):
+        return self.travel is None
+
     coordinates = (ANGLE, DISPLACEMENT)
     slips = (0, 3)
     frames = frames_at
@@ -139,7 +166,7 @@ class ScrewJoint(AbstractJoint):
 
     def constraints(self, a, b):
         sleeve = CylindricalJoint(self.a, self.b, at=self.at, axis=self.axis).constraints(a, b)
-        return (*sleeve, _advance(a, b, self.at, self.axis, self.axis, self.pitch / (2.0 * jnp.pi)))
+        return (*sleeve, _advance(self, a, b, self.axis, self.pitch, 2.0 * math.pi))
 
 
 class RackAndPinionJoint(AbstractJoint):
@@ -170,15 +197,11 @@ class RackAndPinionJoint(AbstractJoint):
     axis: Float[Array, "3"] = axis_field("axis")
     direction: Float[Array, "3"] = axis_field("direction")
     radius: Prescribed | None = prescribed_field("radius")
-    travel: AbstractSignal | None = eqx.field(default=None, kw_only=True, metadata={"over": "angle"})
+    travel: AbstractSignal | None = _travel_field()
 
     def __check_init__(self):
         require_ratio("RackAndPinionJoint", "radius", self.radius, " m; give the travel per radian")
-        if not isinstance(self.travel, AbstractSignal | None):
-            raise ValueError(
-                f"RackAndPinionJoint: `travel` must be a signal of the angle, got {self.travel!r}; a constant ratio is "
-                "`radius`."
-            )
+        _check_travel(self, "radius")
 
     @property
     def assembled(self):
@@ -188,4 +211,4 @@ class RackAndPinionJoint(AbstractJoint):
     frames = frames_at
 
     def constraints(self, a, b):
-        return (_advance(a, b, self.at, self.direction, self.axis, self.radius, self.travel),)
+        return (_advance(self, a, b, self.direction, self.radius, 1.0),)

@@ -310,12 +310,12 @@ def signal_field(name: str, **default: Any) -> Any:
     return eqx.field(converter=convert, kw_only=True, **default)
 
 
-def prescribed_field(name: str) -> Any:
-    """A keyword-only scalar leaf or signal of an element, None by default."""
+def prescribed_field(name: str, *, positional: bool = False) -> Any:
+    """A scalar leaf or signal of an element, None by default, keyword-only unless `positional`."""
 
     def convert(value: Any) -> Prescribed | None:
         if callable(value) and not isinstance(value, AbstractSignal):
             raise _no_signal(name, "a number or a signal", value)
         return value if value is None or isinstance(value, AbstractSignal) else as_float(value, (), f"`{name}`")
 
-    return eqx.field(converter=convert, kw_only=True, default=None, metadata={"prescribed": True})
+    return eqx.field(converter=convert, kw_only=not positional, default=None, metadata={"prescribed": True})

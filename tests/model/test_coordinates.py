@@ -95,6 +95,35 @@ def test_many_turns():
     assert rate > 6.0 * np.pi
 
 
+def test_planetary_gear_on_a_carrier():
+    """Sun and ring on one axis in a carrier that turns: ω_s − ω_c = −(z_r/z_s)(ω_r − ω_c) (Willis), their moments are
+    as 1 : z_r/z_s, and the carrier's is minus their sum; over eight turns of the sun."""
+    z_ring, z_sun, ring, carrier = 60, 24, 2.0, -5.0
+    turn = lambda a, b: lg.RevoluteJoint(a, b, at=ORIGIN, axis=Z)
+    bodies = {name: lg.RigidBody(1.0, (0.1, 0.1, 0.2)) for name in ("carrier", "sun", "ring")}
+    joints = {
+        "bearing": turn(None, "carrier"),
+        "sun": turn("carrier", "sun"),
+        "ring": turn("carrier", "ring"),
+        "mesh": lg.CoordinateCoupling(turn("carrier", "sun"), turn("carrier", "ring"), (-z_ring / z_sun,), teeth=z_sun),
+        "turns": lg.RotationDriver(None, "carrier", axis=Z),
+        "drives": lg.RotationDriver(None, "ring", axis=Z),
+    }
+    t = np.linspace(0.0, 2.5, 41)
+    model = lg.Model(bodies, joints, {"load": lg.AppliedForce("sun", moment=(0.0, 0.0, 1.7))})
+    motion = lg.kinematics(model, {"turns": carrier * t, "drives": ring * t}, rates={"turns": carrier, "drives": ring})
+    sun = carrier - z_ring / z_sun * (ring - carrier)
+    # round-off times the condition of the mechanism
+    np.testing.assert_allclose(motion.body("sun").angular_velocity[:, 2], sun, rtol=1e-10)
+    x = motion.body("sun").orientation[:, :2, 0]
+    np.testing.assert_allclose(x, np.stack([np.cos(sun * t), np.sin(sun * t)], axis=1), atol=1e-9)
+    moments = [motion.multiplier(name)[:, 0] for name in ("drives", "turns")]
+    # what drives a body does to it −λ
+    np.testing.assert_allclose(moments[0], 1.7 * -z_ring / z_sun, rtol=1e-9)
+    np.testing.assert_allclose(moments[1], 1.7 * (1.0 + z_ring / z_sun), rtol=1e-9)
+    assert abs(sun) * t[-1] > 8 * 2 * np.pi
+
+
 @pytest.mark.slow  # three programs, a minute of processor
 def test_every_number():
     """DDM, AVM and differences of random sums of the state, with a curved coupling of hinge and rotor."""

@@ -21,11 +21,13 @@ JOINTS = {
     "hinge": lg.RevoluteJoint("a", "b", at=AT, axis=AXIS),
     "sleeve": lg.CylindricalJoint("a", "b", at=AT, axis=AXIS),
     "ball": lg.SphericalJoint("a", "b", at=AT),
+    "cross": lg.UniversalJoint("a", "b", at=AT, axis_a=AXIS, axis_b=(0.5, 1.0, 2.0)),
 }
 SHAPE = {"radius": 0.2, "arm": 0.7, "viscous": 0.3, "preload": 0.2}
 FRICTIONS = {
     "Coulomb in a sleeve": lg.JointFriction("sleeve", **LAW, **SHAPE),
     "Coulomb with given load": lg.JointFriction("hinge", **LAW, **SHAPE, own_forces=False),
+    "Coulomb in a cross": lg.JointFriction("cross", **LAW, **SHAPE),
     "LuGre in a ball": lg.LuGreFriction("ball", **LAW, **BRISTLES, **SHAPE),
 }
 
@@ -42,6 +44,7 @@ MASS, SLOPE, RADIUS, ARM, VISCOUS = 2.0, 0.5, 0.1, 0.25, 0.4
 INERTIA = np.array([0.1, 0.1, 0.1])
 DOWN = (float(np.cos(SLOPE)), 0.0, -float(np.sin(SLOPE)))
 SPIN, SPEED, MOMENT = np.array([3.0, -2.0, 1.0]), 0.7, 1.3
+ARM_RATES = (3.0, -2.0)
 
 
 def rubbing(solver=None):
@@ -53,6 +56,7 @@ def rubbing(solver=None):
         "sleeve": body(2.0, velocity=(SPEED, 0.0, 0.0), **spinning(X)),
         "ball": body(3.0, angular_velocity=tuple(SPIN)),
         "puck": body(4.0, velocity=(SPEED, 0.0, 0.0), **spinning(Z)),
+        "cross": body(5.0, angular_velocity=(*ARM_RATES, 0.0)),
     }
     at = lambda y: (0.0, y, 0.0)
     joints = {
@@ -61,6 +65,7 @@ def rubbing(solver=None):
         "sleeve": lg.CylindricalJoint(None, "sleeve", at=at(2.0), axis=X),
         "ball": lg.SphericalJoint(None, "ball", at=at(3.0)),
         "puck": lg.PlanarJoint(None, "puck", at=at(4.0), axis=Z),
+        "cross": lg.UniversalJoint(None, "cross", at=at(5.0), axis_a=X, axis_b=Y),
     }
     options = {name: {"radius": RADIUS} for name in joints} | {"block": {"arm": ARM}}
     options["wheel"] |= {"viscous": VISCOUS, "preload": 3.0}
@@ -93,6 +98,12 @@ def test_accelerations_of_what_rubs():
     expected["sleeve"] = [along / MASS, 0.0, 0.0, RADIUS * about / INERTIA[0], 0.0, 0.0]
     expected["ball"] = [*free, *(RADIUS * rubbed(weight, RADIUS * SPIN) / INERTIA)]
     expected["puck"] = [along / MASS, *free, 0.0, RADIUS * about / INERTIA[2]]
+    # ω·(y × x) = 0 with y fixed in the cross, x in the ground: its derivative
+    expected["cross"] = [
+        *free,
+        *(RADIUS * rubbed(weight, RADIUS * np.array(ARM_RATES)) / INERTIA[:2]),
+        np.prod(ARM_RATES),
+    ]
     for name, rates in expected.items():
         np.testing.assert_allclose(found[name], rates, rtol=1e-10, atol=1e-10)  # condition of 1e5 round-offs
 
@@ -190,6 +201,27 @@ def test_bristles_slip_and_stick():
     travel = np.asarray(trajectory.joint("slope").displacement)
     assert bent < travel[-1] < 0.02 and abs(travel[-1] - travel[-20]) < 1e-3 * bent  # no bristle bends more than that
     np.testing.assert_allclose(trajectory.force("sticks").load[-1], load(MASS * G * np.cos(tilt)), rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_cross_slips_as_its_arms_turn():
+    """Between two bodies that tumble: w is r times the rates of both angles, and Σ s·w is the power of what acts."""
+    spins = {"a": (0.3, -0.5, 0.4), "b": (0.7, 0.2, 0.1)}
+    bodies = {name: lg.RigidBody(MASS, (0.1, 0.2, 0.25), angular_velocity=spin) for name, spin in spins.items()}
+    friction = {"rubs": lg.JointFriction("cross", **LAW, **SHAPE)}
+    model = lg.Model(bodies, {"cross": lg.UniversalJoint("a", "b", at=ORIGIN, axis_a=X, axis_b=Y)}, friction)
+
+    @eqx.filter_jit
+    def run(model):
+        trajectory = lg.simulate(model, t1=1.0, num_steps=100)
+        cross = trajectory.joint("cross")
+        rates = jnp.stack([cross.rates[name] for name in ("angle_a", "angle_b")], axis=1)
+        return rates, cross.coordinates["angle_a"], trajectory.force("rubs")
+
+    rates, angle, rubs = run(model)
+    assert np.ptp(angle) > 0.2
+    # ẋ, which w has none of, is O(h²) in velocities, and so are rates about the arms
+    np.testing.assert_allclose(rubs.slip, SHAPE["radius"] * rates, atol=1e-6)
 
 
 @pytest.mark.slow  # a program for each number of steps

@@ -1,4 +1,4 @@
-"""Transmissions of variable ratio: a rack by a curve over the angle, a rack and gears by a signal of time."""
+"""Transmissions of variable ratio: racks and screws by a curve over the angle, racks, screws and gears by time."""
 
 import equinox as eqx
 import jax
@@ -31,6 +31,12 @@ JOINTS = {
         "a", "b", at_a=AT, at_b=AT, axis_a=AXIS, axis_b=AXIS, ratio=3.0, teeth=1, line=AXIS_B
     ),
     "gears by time": lg.GearJoint("a", "b", **GEARS, ratio=RATIO),
+    "screw by a curve": lg.ScrewJoint(
+        "a", "b", at=AT, axis=AXIS, pitch=2.5, travel=lg.Polynomial((0.0, 0.3, 0.05, 0.1))
+    ),
+    "screw by time": lg.ScrewJoint(
+        "a", "b", at=AT, axis=AXIS, pitch=lg.Harmonic(amplitude=0.1, frequency=0.3, offset=2.5)
+    ),
 }
 
 
@@ -58,6 +64,17 @@ def test_values_over_many_turns():
     for angle in (-40.0, 0.3, 25.0):
         (element,) = lg.RackAndPinionJoint("a", "b", **rack, radius=radius).constraints(ground, ground)
         close(element.value(ground, placed(exact * angle + 1e-3, angle), time), [1e-3], 1e3, scale=2.0)
+    along = lambda s, angle: Frame(jnp.array([0.0, s, 0.0]), about_y(angle))
+    for angle in (-40.0, 0.3, 25.0):
+        thread = lg.ScrewJoint("a", "b", at=ORIGIN, axis=Y, pitch=radius)
+        *_, element = thread.constraints(ground, ground)
+        close(element.value(ground, along(exact * angle / (2 * np.pi) + 1e-3, angle), time), [1e-3], 1e3, scale=2.0)
+    for angle in (-5.0, 0.0, 4.9):
+        thread = lg.ScrewJoint("a", "b", at=ORIGIN, axis=Y, pitch=2 * np.pi * RADIUS, travel=TRAVEL)
+        *_, element = thread.constraints(ground, ground)
+        close(
+            element.value(ground, along(RADIUS * angle + SWELL * angle**3 + 1e-3, angle), time), [1e-3], 1e3, scale=0.1
+        )
     (element,) = lg.GearJoint("a", "b", at_a=ORIGIN, at_b=X, axis_a=Y, axis_b=Y, ratio=RATIO).constraints(
         ground, placed(1.0, 0.0)
     )
@@ -125,5 +142,12 @@ def test_bad_input():
     ):
         with pytest.raises(ValueError, match=says(message)):
             lg.RackAndPinionJoint("a", "b", at=AT, axis=AXIS, direction=X, **more)
+    for more, message in (
+        ({"pitch": 0.1, "travel": 0.3}, "ScrewJoint: `travel` must be a signal of the angle, got 0.3"),
+        ({}, "ScrewJoint: `pitch` is missing"),
+        ({"pitch": 0.0}, "ScrewJoint: `pitch` must not be zero"),
+    ):
+        with pytest.raises(ValueError, match=says(message)):
+            lg.ScrewJoint("a", "b", at=AT, axis=AXIS, **more)
     with pytest.raises(ValueError, match=says("GearJoint: `ratio` is missing")):
         lg.GearJoint("a", "b", **GEARS)
