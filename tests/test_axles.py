@@ -18,6 +18,7 @@ import lgsens as lg
 from lgsens.examples import Axle, QuarterCar, shipped
 from lgsens.examples._axle_parts import Mount
 from lgsens.examples._suspension_parts import Part, reflected
+from lgsens.model import Frame
 
 DATA = resources.files("lgsens.examples") / "data"
 FLIP = np.diag([1.0, -1.0, 1.0])
@@ -62,6 +63,34 @@ def test_mirror_image_of_masses_and_moments():
     mount = Mount(jnp.ones(3), preload=jnp.asarray(force), rotational_preload=jnp.asarray(moments[0]))
     np.testing.assert_array_equal(reflected(mount).rotational_preload, moments[1])
     np.testing.assert_array_equal(reflected(mount).preload, FLIP @ force)
+
+
+def test_mirror_image_of_curves(tmp_path):
+    """Forces and moments of bushings with all curves in a mirrored motion are mirrored: S f, −S m; on tilted axes."""
+    keys = [f"{kind}_{i}" for kind in ("spring", "damper", "rotational_spring", "rotational_damper") for i in (1, 2, 3)]
+    uneven = lambda i: [[-2.0, -9.0 - i], [-0.5, -1.0], [0.0, 0.0], [0.6, 1.5 + i], [2.0, 17.0]]
+    table: dict = {key: uneven(i) for i, key in enumerate(keys)}
+    table |= {"stiffness": [0.0, 2.0, 0.0], "rotational_stiffness": [0.0, 1.0, 3.0]}
+    rng = np.random.default_rng(0)
+    x, turns, v = rng.normal(size=(2, 3)), rng.normal(size=(2, 3)) / 2, rng.normal(size=(2, 6))
+    for axes in (None, [[1.0, 0.3, 0.2], [0.0, 1.0, 0.4]]):
+        given = {"axes": axes} if axes else {}
+        path = tmp_path / "mine.json"
+        path.write_text(json.dumps(changed(document("mcpherson"), {"bushings.control_arm_chassis": table | given})))
+        axle = Axle.load(path)
+        found = []
+        for car, s, handed in ((axle.left, np.eye(3), 1.0), (axle.right, FLIP, -1.0)):
+            at = car.links["control_arm"].ends["chassis"]
+            for _, bushing in car.mounts["control_arm_chassis"].elements("it", "chassis", "arm", at):
+                load = bushing.load(*(Frame(jnp.zeros(3), jnp.eye(3)),) * 2)
+                turned = [jnp.asarray(Rotation.from_rotvec(handed * s @ turn).as_matrix()) for turn in turns]
+                poses = [Frame(jnp.asarray(s @ place), turn) for place, turn in zip(0.1 * x, turned)]
+                rates = [jnp.asarray(np.concatenate([s @ one[:3], handed * s @ one[3:]])) for one in v]
+                f_a, m_a, f_b, m_b = jnp.split(load.force(*poses, *rates, jnp.zeros(())), 4)
+                found.append(np.stack([s @ f_a, handed * s @ m_a, s @ f_b, handed * s @ m_b]))
+        half = len(found) // 2
+        np.testing.assert_allclose(found[half:], found[:half], rtol=1e-12, atol=1e-12)  # round-off of forces up to 30
+        assert np.abs(found).max() > 1.0
 
 
 def test_names_of_an_axle():
@@ -358,6 +387,24 @@ MISTAKES = {
         "mcpherson",
         {"bushings.strut_chassis.rotational_stiffness": [1.0, 1.0, 0.0]},
         ("key 'bushings.strut_chassis.rotational_stiffness'", "positive, else a body can move freely", "0.0]"),
+    ),
+    "free beside a curve": (
+        "mcpherson",
+        {
+            "bushings.control_arm_chassis.stiffness": [0.0, 1e6, 0.0],
+            "bushings.control_arm_chassis.spring_1": [[-1.0, -1.0], [0.0, 0.0], [1.0, 1.0]],
+        },
+        ("key 'bushings.control_arm_chassis.stiffness'", "positive, else a body can move freely", "0.0]"),
+    ),
+    "curve beside zero": (
+        "mcpherson",
+        {"bushings.control_arm_chassis.spring_1": [[-1.0, -1.0], [0.0, 0.5], [1.0, 1.0]]},
+        ("key 'bushings.control_arm_chassis.spring_1'", "must have a point [0, 0], where it rises", "`preload`"),
+    ),
+    "curve that falls": (
+        "mcpherson",
+        {"bushings.control_arm_chassis.rotational_damper_2": [[-1.0, -1.0], [0.0, 0.0], [1.0, -1.0]]},
+        ("key 'bushings.control_arm_chassis.rotational_damper_2'", "x increasing and force never falling"),
     ),
     "rate below zero": (
         "mcpherson",

@@ -9,13 +9,14 @@ import numpy as np
 from jaxtyping import Array
 
 from lgsens._validate import as_float
-from lgsens.examples._axle_parts import ALONG_Y, RATES, Bar, Mount, Rack, Stop
+from lgsens.examples._axle_parts import ALONG_Y, CURVED, CURVES, RATES, Bar, Mount, Rack, Stop
 from lgsens.examples._corner_scene import connections
 from lgsens.examples._hardpoint_file import Reader
 from lgsens.examples._suspension_parts import Connection, Link, Part, Strut
 
 CARRIERS = ("subframe", "rack")
 OF_AXLE = (*CARRIERS, "anti_roll_bar", "bushings", "bump_stop", "rebound_stop")
+OF_MOUNT = (*RATES, *CURVES, "axes", "preload", "rotational_preload")
 OF_PART = ("centre_of_mass", "mass", "inertia")
 SECTION = ("stiffness", "diameter", "length", "bore", "shear_modulus", "damping")
 OF_STOP = ("gap", "stiffness", "rounding", "progression")
@@ -64,11 +65,11 @@ def mounts(
             raise root.table("bushings").fail(name, f"there is no such joint; those of the file are {sorted(known)}.")
         if known[name].kind in ("cylindrical", "prismatic"):
             raise table.fail("stiffness", f"joint {name!r} slides, and a bushing would hold it; leave it a joint.")
-        table.only((*RATES, "axes", "preload", "rotational_preload"))
+        table.only(OF_MOUNT)
         found[name] = _mount(table, len(np.atleast_2d(known[name].at)))
     if "subframe" in root:
         for name, table in root.table("subframe").tables("mounts").items():
-            table.only(("at", *RATES, "axes", "preload", "rotational_preload"))
+            table.only(("at", *OF_MOUNT))
             found[f"subframe_{name}"] = _mount(table, 1, table.point("at"))
     return found
 
@@ -76,15 +77,29 @@ def mounts(
 def _mount(table: Reader, count: int, at: Array | None = None) -> Mount:
     rates = {key: table.triples(key, count) for key in RATES[:2]}
     rates |= {key: table.triples(key, count) for key in RATES[2:] if key in table}
+    curves = {key: _centred(table, key) for key in CURVES if key in table}
     for key, values in rates.items():
         positive = key == "stiffness" or (key == "rotational_stiffness" and count == 1)  # two points hold a link
-        if not np.all(values > 0 if positive else values >= 0):
+        may_be_zero = [not positive or f"{CURVED[key]}_{i}" in curves for i in (1, 2, 3)]
+        given = np.atleast_2d(values)
+        if not np.all((given > 0) | ((given == 0) & np.array([may_be_zero]))):
             bound = "positive, else a body can move freely" if positive else "zero or positive"
             raise table.fail(key, f"must be {bound}, got {np.asarray(values).tolist()}; give small numbers for soft.")
-    axes = table.directions("axes") if "axes" in table else None
+    axes = table.directions("axes") if "axes" in table else jnp.eye(2, 3) if curves else None
     if "preload" in table or "rotational_preload" in table:
         rates |= {key: table.triples(key, count) for key in ("preload", "rotational_preload")}
-    return Mount(**rates, axes=axes, at=at)
+    return Mount(**rates, axes=axes, at=at, curves=curves)
+
+
+def _centred(table: Reader, key: str) -> Array:
+    """A curve through [0, 0], where it rises."""
+    curve = table.curve(key)
+    middle = np.flatnonzero((curve == 0).all(axis=0))
+    if not (len(middle) and 0 < middle[0] < curve.shape[1] - 1 and np.all(np.diff(curve[1])[middle[0] - 1 :][:2] > 0)):
+        raise table.fail(
+            key, "must have a point [0, 0], where it rises, and some on both sides; preloads are `preload`."
+        )
+    return as_float(curve, None, key)
 
 
 def axle_members(root: Reader, kilogram: float, links: Collection[str]) -> dict[str, Any]:

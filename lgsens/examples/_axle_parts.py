@@ -15,11 +15,14 @@ from lgsens.model import (
     Bushing,
     DistanceJoint,
     RevoluteJoint,
+    Sampled,
     TorsionSpringDamper,
 )
 
 ALONG_Y: Any = (0.0, 1.0, 0.0)
 RATES = ("stiffness", "rotational_stiffness", "damping", "rotational_damping")
+CURVED = dict(zip(RATES, ("spring", "rotational_spring", "damper", "rotational_damper")))
+CURVES = {f"{kind}_{i + 1}": (f"{kind}s", i) for kind in CURVED.values() for i in range(3)}  # of a `Bushing`, its axes
 
 
 class Mount(eqx.Module):
@@ -33,6 +36,9 @@ class Mount(eqx.Module):
             position, and the moment [N m] that turns it back, in x, y and z, shape (3,) or (2, 3); None: those with
             which the axle rests there.
         at: its place [m], shape (3,); None: that of the joint.
+        curves: by a key of the file, spring_1, rotational_damper_3, …, what comes to the rate along that axis: force
+            [N] or moment [N m] over displacement or speed of the joint's second body [m], [rad], [m/s], [rad/s], shape
+            (2, n), monotone cubics (`Sampled`). With one of them there are `axes`.
     """
 
     stiffness: Float[Array, "*two 3"]
@@ -43,15 +49,22 @@ class Mount(eqx.Module):
     preload: Float[Array, "*two 3"] | None = None
     rotational_preload: Float[Array, "*two 3"] | None = None
     at: Float[Array, "3"] | None = None
+    curves: dict[str, Float[Array, "2 n"]] = eqx.field(default_factory=dict)
 
     def elements(self, name: str, a: str, b: str, at: Array) -> Iterator[tuple[str, Bushing]]:
         """The force elements by name, NAME, or NAME_1 and NAME_2 for two points."""
         points = jnp.atleast_2d(at)
         of = lambda key, i: jnp.broadcast_to(getattr(self, key), points.shape)[i]
         given = [key for key in RATES if getattr(self, key) is not None]
+        curves: dict[str, Any] = {}
+        for key, points_of in self.curves.items():
+            name, axis = CURVES[key]
+            three = list(curves.get(name, (None, None, None)))
+            three[axis] = Sampled(*points_of, "monotone")
+            curves[name] = tuple(three)
         for i, point in enumerate(points):
             rates: dict[str, Any] = {key: of(key, i) for key in given}
-            bushing = Bushing(a, b, at=point, axes=self.axes, **rates)
+            bushing = Bushing(a, b, at=point, axes=self.axes, **rates, **curves)
             if self.preload is not None:
                 along = [of(key, i) @ bushing.triad for key in ("preload", "rotational_preload")]
                 bushing = bushing.with_preload(jnp.concatenate(along))

@@ -37,7 +37,9 @@ Of an axle, in SI units; points are those of the side of the file:
                    damping, rotational_damping (left out: none), three numbers, or two times three of the two
                    bushings of a hinge; axes: [[x, y, z], [x, y, z]], the first and the plane of the second (left out:
                    those of the file); preload, rotational_preload [N], [N m] along the axes of the file, see `Mount`
-                   (left out: those with which the axle rests in the design position)
+                   (left out: those with which the axle rests in the design position); spring_1 … rotational_damper_3:
+                   curves that come to the rates along or about an axis, [[displacement or speed, force or moment], …]
+                   of the second of the joint's bodies (a link) against the first, with [0, 0]; see `Mount`
     [bump_stop], [rebound_stop]  BODY = [x, y, z] twice (left out: the points of the damper), gap [m], stiffness [N/m],
                    rounding [m], progression [m]; see `BumpStop`
 

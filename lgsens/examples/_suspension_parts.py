@@ -34,6 +34,8 @@ ALONG_A_LINE: dict[str, Any] = {
 }
 VECTORS = {"at", "arms", "axes", "ends", "centre", "arm", "link_arm", "bearing", "lever", "preload"}
 AXIAL = "rotational_preload"
+# Curves of a bushing along its axes e₁, e₂, e₃ = e₁ × e₂: these become S e₁, S e₂, −S e₃, and turns change their sign.
+TURNED_ROUND = {"spring_3", "damper_3", *(f"rotational_{kind}_{i}" for kind in ("spring", "damper") for i in (1, 2))}
 Tree = TypeVar("Tree")
 
 
@@ -42,12 +44,14 @@ def reflected(tree: Tree) -> Tree:
 
     Points and directions become S x, tensors S J S: products of inertia with y change their sign, principal moments
     about the axes of the file stay. Moments and angles are of screws, so a moment becomes −S m: what was right-handed
-    is left-handed. Rates, masses and lengths stay.
+    is left-handed. Rates, masses and lengths stay; of a curve that changes its sign places and forces do.
     """
 
     def leaf(path, value):
         names = {entry.name for entry in path if isinstance(entry, jax.tree_util.GetAttrKey)}
         flip = jnp.asarray([1.0, -1.0, 1.0], value.dtype)
+        if getattr(path[-1], "key", None) in TURNED_ROUND:
+            return -value[:, ::-1]
         if "inertia" in names:
             return value if value.ndim == 1 else value * jnp.outer(flip, flip)
         sign = -flip if AXIAL in names else flip if names & VECTORS else None

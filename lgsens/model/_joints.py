@@ -54,10 +54,9 @@ class AbstractJoint(eqx.Module):
     """A joint between bodies `a` and `b`; None is the ground.
 
     A joint of one's own has these two names, leaves for its numbers, and `constraints`. It is `assembled` if the
-    reference configuration satisfies it by construction; others are assembled before the motion. It is `rigid` if its
-    bodies move as one, for `Model(merge_fixed=True)`. `coordinates` are those that it leaves its bodies, functions of the
-    pose of its frame on b in that on a (`lgsens.model.Coordinate`), for `Trajectory.joint`; `slips` the velocities [ẋ, ω]
-    of that pose, 0 … 5, with which its surfaces slip, for friction, and 6 … 8 those of ω about the axes of b's frame.
+    reference configuration satisfies it by construction, and `rigid` if its bodies move as one. `coordinates` are those
+    that it leaves its bodies, functions of the pose of its frame on b in that on a (`lgsens.model.Coordinate`); `slips`
+    the velocities [ẋ, ω] of that pose that rub, 0 … 5, and 6 … 8 those of ω about the axes of b's frame.
     """
 
     a: eqx.AbstractVar[str | None]
@@ -189,7 +188,7 @@ class UniversalJoint(AbstractJoint):
 
     assembled = True
     coordinates = ARM_ANGLES
-    slips = (3, 7)  # about the arm in a, and about that in b
+    slips = (3, 7)
 
     def _arms(self):
         arm_a = self.axis_a / jnp.linalg.norm(self.axis_a)
