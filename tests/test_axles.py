@@ -81,7 +81,8 @@ def test_mirror_image_of_curves(tmp_path):
         found = []
         for car, s, handed in ((axle.left, np.eye(3), 1.0), (axle.right, FLIP, -1.0)):
             at = car.links["control_arm"].ends["chassis"]
-            for _, bushing in car.mounts["control_arm_chassis"].elements("it", "chassis", "arm", at):
+            for i, (name, bushing) in enumerate(car.mounts["control_arm_chassis"].elements("it", "chassis", "arm", at)):
+                assert name == f"it_{i + 1}"
                 load = bushing.load(*(Frame(jnp.zeros(3), jnp.eye(3)),) * 2)
                 turned = [jnp.asarray(Rotation.from_rotvec(handed * s @ turn).as_matrix()) for turn in turns]
                 poses = [Frame(jnp.asarray(s @ place), turn) for place, turn in zip(0.1 * x, turned)]

@@ -21,7 +21,7 @@ from lgsens.model import (
 
 ALONG_Y: Any = (0.0, 1.0, 0.0)
 RATES = ("stiffness", "rotational_stiffness", "damping", "rotational_damping")
-CURVED = dict(zip(RATES, ("spring", "rotational_spring", "damper", "rotational_damper")))
+CURVED: dict[str, str] = dict(zip(RATES, ("spring", "rotational_spring", "damper", "rotational_damper")))
 CURVES = {f"{kind}_{i + 1}": (f"{kind}s", i) for kind in CURVED.values() for i in range(3)}  # of a `Bushing`, its axes
 
 
@@ -57,11 +57,11 @@ class Mount(eqx.Module):
         of = lambda key, i: jnp.broadcast_to(getattr(self, key), points.shape)[i]
         given = [key for key in RATES if getattr(self, key) is not None]
         curves: dict[str, Any] = {}
-        for key, points_of in self.curves.items():
-            name, axis = CURVES[key]
-            three = list(curves.get(name, (None, None, None)))
-            three[axis] = Sampled(*points_of, "monotone")
-            curves[name] = tuple(three)
+        for key, curve in self.curves.items():
+            kind, axis = CURVES[key]
+            three = list(curves.get(kind, (None, None, None)))
+            three[axis] = Sampled(curve[0], curve[1], "monotone")
+            curves[kind] = tuple(three)
         for i, point in enumerate(points):
             rates: dict[str, Any] = {key: of(key, i) for key in given}
             bushing = Bushing(a, b, at=point, axes=self.axes, **rates, **curves)

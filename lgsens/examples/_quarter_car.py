@@ -197,8 +197,8 @@ class QuarterCar(eqx.Module):
                 raise ValueError(
                     f"`bushings`: {suggestion(name, jointed)}, the links with a ball joint at the knuckle."
                 )
-        rates = {"stiffness": bushing_stiffness, "damping": bushing_damping}
-        mount = Mount(**{rate: jnp.full(3, value, self.bearing.dtype) for rate, value in rates.items()})
+        along = lambda rate: jnp.full(3, rate, self.bearing.dtype)
+        mount = Mount(along(bushing_stiffness), along(bushing_damping))
         scene = corner_scene(self, wheel=wheel, links=links, mounts={f"{name}_knuckle": mount for name in bushings})
         free = "z" if chassis == "heave" else ALL_FREE
         bodies = scene.bodies | {"chassis": self.chassis.body(scene.ends.get("chassis", ()), free)}
