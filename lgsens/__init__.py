@@ -10,18 +10,21 @@ import importlib
 
 from lgsens._xla import compilation_cache as compilation_cache, set_options
 from lgsens.analysis import (
+    Chart as Chart,
     ConstraintRank as ConstraintRank,
     FrequencyWeighting as FrequencyWeighting,
     Growth as Growth,
     Kinematics as Kinematics,
     Linearization as Linearization,
     Statics as Statics,
+    StepJacobians as StepJacobians,
     constraint_rank as constraint_rank,
     kinematics as kinematics,
     linearize as linearize,
     random_road as random_road,
     sensitivity_growth as sensitivity_growth,
     statics as statics,
+    step_jacobians as step_jacobians,
 )
 from lgsens.criteria import (
     Advice as Advice,

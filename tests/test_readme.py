@@ -19,8 +19,8 @@ def blocks(text, language="python"):
 
 
 PAGES = [path for path in sorted((ROOT / "notebooks").rglob("*.md")) if blocks(path.read_text(encoding="utf-8"))]
-# How many blocks the quick run takes; `tests/accuracy/test_fidelity.py` is a small version of its page.
-LONG = {"flexible": 1, "fidelity": 0, "suspension": 1}
+# How many blocks the quick run takes; where it is 0 `test_fidelity.py` and `test_step_jacobians.py` are small versions.
+LONG = {"control": 0, "flexible": 1, "fidelity": 0, "suspension": 1}
 WHOLE = [pytest.param(path, None, marks=[pytest.mark.slow] * (path.stem in LONG), id=path.stem) for path in PAGES]
 BEGUN = [pytest.param(path, LONG[path.stem], id=f"begun-{path.stem}") for path in PAGES if LONG.get(path.stem)]
 
@@ -78,7 +78,14 @@ def _sweeps(names):
     assert names["values"].shape == names["gradient"]["mass"].shape == (500,)
 
 
-CHECKS = {"choosing": _choosing, "sweeps": _sweeps}
+def _control(names):
+    """Misses are squares: their exponents double, to round-off; those of differences of 1e-4 lose at most 1e-8 each."""
+    exact, rough = (np.log10(names[of]) for of in ("misses", "by_differences"))
+    assert exact[-1] < -20 and exact[-1] < 1.8 * exact[-2] < 1.8**2 * exact[-3]
+    assert np.all(np.diff(rough)[-3:] > -9.0)
+
+
+CHECKS = {"choosing": _choosing, "control": _control, "sweeps": _sweeps}
 
 
 def test_commands():

@@ -137,6 +137,7 @@ class IndexReducedODE(AbstractScheme):
     order = 4
     failure = RESULTS.integration_failed
     has_stages = True
+    state_is_motion = True
 
     def require_steps(self):
         if self.rtol is not None:

@@ -94,6 +94,7 @@ class RadauIIA(AbstractScheme):
     max_iterations: int = eqx.field(static=True, default=20)
     order: ClassVar[int] = 4
     has_stages: ClassVar[bool] = True
+    state_is_motion: ClassVar[bool] = True
 
     def __check_init__(self):
         valid = isinstance(self.tolerance, int | float) and 0.0 < self.tolerance < 1e-2

@@ -155,6 +155,7 @@ class AbstractScheme(AbstractIntegrator):
         order: 2, or 4 where the states deserve a rule of fourth order (`Trajectory.order`).
         failure: what a step that failed is called.
         has_stages: whether criteria are integrated over `stages`.
+        state_is_motion: whether the steps that follow a state depend on nothing of it but q and v.
     """
 
     tolerance: eqx.AbstractVar[float]
@@ -162,6 +163,7 @@ class AbstractScheme(AbstractIntegrator):
     order: ClassVar[int] = 2
     failure: ClassVar[RESULTS] = RESULTS.newton_failed
     has_stages: ClassVar[bool] = False
+    state_is_motion: ClassVar[bool] = False
 
     @property
     def scheme(self):
