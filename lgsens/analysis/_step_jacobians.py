@@ -21,6 +21,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from lgsens._validate import as_float
@@ -141,7 +142,7 @@ def step_jacobians(
     if not throw:
         return found
     failed = found.result != RESULTS.successful
-    if isinstance(failed, jax.core.Tracer):
+    if isinstance(failed, Tracer):
         unless_failed = lambda leaf: jnp.where(jnp.any(failed), jnp.nan, leaf)
         return eqx.tree_at(lambda f: (f.A, f.B, f.gap), found, replace_fn=unless_failed)
     if np.any(failed):  # the step once more, for what there is to say of it
