@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import lgsens as lg
 from lgsens.model import Frame
-from lgsens.testing import check_joint
+from lgsens.testing import check_joint, check_sensitivities
 
 X, Y, ORIGIN = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 0.0)
 AT, AT_B = (0.3, -0.7, 1.1), (0.9, 0.2, 0.4)
@@ -133,6 +133,39 @@ def test_gradient_by_the_curve():
 
     found = jax.jit(jax.grad(place))(jnp.array([0.0, RADIUS, 0.0, SWELL]))
     close(found, [-1.0, -2.0, -4.0, -8.0], 1e4)
+
+
+@pytest.mark.slow  # three programs, a minute of processor
+def test_every_number():
+    """DDM, AVM and differences of random sums of the states of a nut whose pitch changes, of a barrel cam that it does
+    not touch, and of a shaft that rubs in a universal joint."""
+    body = lambda at, **more: lg.RigidBody(1.3, (0.1, 0.12, 0.2), position=at, **more)
+    turning = {"angular_velocity": (0.0, 3.0, 0.0)}
+    bodies = {
+        "nut": body(ORIGIN, **turning),
+        "cam": body((1.0, 0.0, 0.0), **turning),
+        "shaft": body((2.0, 0.2, 0.0), angular_velocity=(0.4, -0.7, 0.0), velocity=(0.0, 0.0, 0.08)),
+    }
+    joints = {
+        "thread": lg.ScrewJoint(
+            None, "nut", at=ORIGIN, axis=Y, pitch=lg.Harmonic(amplitude=0.2, frequency=0.5, offset=1.0)
+        ),
+        "groove": lg.ScrewJoint(
+            None, "cam", at=(1.0, 0.0, 0.0), axis=Y, pitch=2.0, travel=lg.Polynomial((0.0, 0.3, 0.0, 0.1))
+        ),
+        "cross": lg.UniversalJoint(None, "shaft", at=(2.0, 0.0, 0.0), axis_a=X, axis_b=Y),
+    }
+    forces = {
+        "weight": lg.Gravity((0.0, -2.0, -9.81)),
+        "rubs": lg.JointFriction("cross", coefficient=0.3, slip_speed=0.1, radius=0.2, arm=0.5, viscous=0.1),
+    }
+
+    def asked(model):
+        states = lg.simulate(model, t1=0.1, num_steps=5).states
+        end = jnp.concatenate([jnp.ravel(leaf[-1]) for leaf in (*states.q, states.v, states.lam)])
+        return jnp.asarray(np.random.default_rng(0).standard_normal((3, end.size))) @ end
+
+    check_sensitivities(asked, lg.Model(bodies, joints, forces)).raise_if_failed()
 
 
 def test_bad_input():
