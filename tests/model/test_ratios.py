@@ -140,7 +140,8 @@ def test_every_number():
     """DDM, AVM and differences of random sums of the states of a nut whose pitch changes, of a barrel cam that it does
     not touch, and of a shaft that rubs in a universal joint."""
     body = lambda at, **more: lg.RigidBody(1.3, (0.1, 0.12, 0.2), position=at, **more)
-    turning = {"angular_velocity": (0.0, 3.0, 0.0)}
+    axis = np.array([0.1, 1.0, 0.3])  # not along one of the frame, where the normals, along which λ is, change over
+    turning = {"angular_velocity": 3.0 * axis}
     bodies = {
         "nut": body(ORIGIN, **turning),
         "cam": body((1.0, 0.0, 0.0), **turning),
@@ -148,10 +149,10 @@ def test_every_number():
     }
     joints = {
         "thread": lg.ScrewJoint(
-            None, "nut", at=ORIGIN, axis=Y, pitch=lg.Harmonic(amplitude=0.2, frequency=0.5, offset=1.0)
+            None, "nut", at=ORIGIN, axis=axis, pitch=lg.Harmonic(amplitude=0.2, frequency=0.5, offset=1.0)
         ),
         "groove": lg.ScrewJoint(
-            None, "cam", at=(1.0, 0.0, 0.0), axis=Y, pitch=2.0, travel=lg.Polynomial((0.0, 0.3, 0.0, 0.1))
+            None, "cam", at=(1.0, 0.0, 0.0), axis=axis, pitch=2.0, travel=lg.Polynomial((0.0, 0.3, 0.0, 0.1))
         ),
         "cross": lg.UniversalJoint(None, "shaft", at=(2.0, 0.0, 0.0), axis_a=X, axis_b=Y),
     }
