@@ -17,7 +17,7 @@ from suspension_closures import Closure, changed, corner_of
 import lgsens as lg
 from lgsens.examples import Axle, QuarterCar, shipped
 from lgsens.examples._axle_parts import Mount
-from lgsens.examples._suspension_parts import Part, reflected
+from lgsens.examples._suspension_parts import Part, Strut, reflected
 from lgsens.model import Frame
 
 DATA = resources.files("lgsens.examples") / "data"
@@ -63,6 +63,9 @@ def test_mirror_image_of_masses_and_moments():
     mount = Mount(jnp.ones(3), preload=jnp.asarray(force), rotational_preload=jnp.asarray(moments[0]))
     np.testing.assert_array_equal(reflected(mount).rotational_preload, moments[1])
     np.testing.assert_array_equal(reflected(mount).preload, FLIP @ force)
+    # a body of a name that curves of bushings have
+    ends = Strut({"chassis": jnp.asarray(force), "spring_3": jnp.asarray(force)}, jnp.ones(()))
+    np.testing.assert_array_equal(reflected(ends).ends["spring_3"], FLIP @ force)
 
 
 def test_mirror_image_of_curves(tmp_path):

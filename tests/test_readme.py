@@ -79,7 +79,7 @@ def _sweeps(names):
 
 
 def _control(names):
-    """Misses are squares: their exponents double, to round-off; those of differences of 1e-4 lose at most 1e-8 each."""
+    """Misses are squares: their exponents double, to round-off; those of differences gain nine digits each at most."""
     exact, rough = (np.log10(names[of]) for of in ("misses", "by_differences"))
     assert exact[-1] < -20 and exact[-1] < 1.8 * exact[-2] < 1.8**2 * exact[-3]
     assert np.all(np.diff(rough)[-3:] > -9.0)

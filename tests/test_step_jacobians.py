@@ -103,7 +103,7 @@ def test_against_differences(name):
 
 @pytest.mark.slow  # programs of a rollout and of its derivative
 def test_products_along_a_rollout():
-    """The end of ten steps by each control is a product of A and one B, to round-off; and of the mass, through A."""
+    """The end of ten steps by each control is a product of A and one B, to round-off."""
     u, t = jnp.asarray(np.random.default_rng(1).normal(size=(10, 2))), 0.02 * np.arange(11)
 
     @jax.jit
@@ -167,6 +167,7 @@ def test_bad_input():
             {"integrator": lg.GeneralizedAlpha()},
             "GeneralizedAlpha carries",
         ),
+        ((states.v, jnp.zeros((1, 1)), jnp.arange(2.0)), {}, "`states` must be a State of all times"),
         ((states, jnp.zeros((2, 1)), jnp.arange(2.0)), {}, "got shapes (2, 1), (2,) and (2, 6) of velocities"),
         ((states, jnp.zeros(1), jnp.arange(2.0)), {}, "`controls` must have shape (n, p)"),
         ((states, jnp.zeros((1, 1)), jnp.arange(2.0)), {"integrator": lg.IndexReducedODE(rtol=1e-6)}, "with `rtol`"),

@@ -44,7 +44,7 @@ Build = Callable[[Float[Array, " p"]], Model | AbstractSystem]
 
 
 class Chart(eqx.Module):
-    """Independent coordinates y = [x; ν] about a state, from `step_jacobians`.
+    """Independent coordinates y = [x; ν] about a state, x [√kg m] and ν [√kg m/s], from `step_jacobians`.
 
     Attributes:
         state: where y = 0.
@@ -131,6 +131,10 @@ def step_jacobians(
             "so steps from (q, v) are not those of its motion. Use RadauIIA() or IndexReducedODE()."
         )
     integrator.require_steps()
+    if not isinstance(states, State):
+        raise ValueError(
+            f"`states` must be a State of all times, `trajectory.states` say, got {type(states).__name__}."
+        )
     controls, t = as_float(controls, None, "`controls`"), as_float(t, None, "`t`")
     count = controls.shape[0] if controls.ndim == 2 else -1
     if t.shape != (count + 1,) or states.v.ndim != 2 or states.v.shape[0] != count + 1:
@@ -171,8 +175,7 @@ def _chart(system: AbstractSystem, state: State, t) -> Chart:
 def _step_jacobians_jit(build: Build, states: State, controls, t, integrator: AbstractScheme):
     system = as_system(build(controls[0]))
     require_independent(system, "`step_jacobians`")
-    plain = State(states.q, states.v, states.vdot, states.lam, states.a)
-    charts = jax.vmap(lambda state, t: _chart(system, state, t))(plain, t)
+    charts = jax.vmap(lambda state, t: _chart(system, state, t))(states, t)
 
     def of_step(chart: Chart, after: Chart, u, t0, t1):
         def step(y, u):

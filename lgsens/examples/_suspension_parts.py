@@ -50,8 +50,8 @@ def reflected(tree: Tree) -> Tree:
     def leaf(path, value):
         names = {entry.name for entry in path if isinstance(entry, jax.tree_util.GetAttrKey)}
         flip = jnp.asarray([1.0, -1.0, 1.0], value.dtype)
-        if getattr(path[-1], "key", None) in TURNED_ROUND:
-            return -value[:, ::-1]
+        if "curves" in names:
+            return -value[:, ::-1] if path[-1].key in TURNED_ROUND else value
         if "inertia" in names:
             return value if value.ndim == 1 else value * jnp.outer(flip, flip)
         sign = -flip if AXIAL in names else flip if names & VECTORS else None

@@ -144,6 +144,7 @@ BAD = {
     "which coordinate": (lambda: lg.CoordinateForce(CROSS), "give the name of one"),
     "unknown coordinate": (lambda: lg.CoordinateForce(HINGE, "length"), "'length' is not one of ['angle']"),
     "no coefficient": (lambda: lg.CoordinateCoupling(HINGE, HINGE, ()), "must have shape (n,)"),
+    "teeth": (lambda: lg.CoordinateCoupling(HINGE, HINGE, teeth=0), "`teeth` must be at least 1, got 0"),
     "zero": (lambda: lg.CoordinateCoupling(HINGE, HINGE, (0.0,)), "`coefficients` are all zero"),
 }
 
