@@ -10,6 +10,7 @@ leave is dense.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -171,7 +172,14 @@ def inverses(blocks: Float[Array, "c p p"]) -> Float[Array, "c p p"]:
         rest = jnp.where((here[:, None] | here[None, :])[:, :, None], jnp.zeros_like(matrix), matrix)
         return rest - column[:, None, :] * row[None, :, :]
 
-    return jnp.moveaxis(fori_loop(0, size, eliminate, jnp.moveaxis(blocks, 0, 2)), 2, 0)
+    def in_turn(matrix):  # elsewhere: what is written out is fused, and no turn of a loop waits for the host
+        for j in range(size):
+            matrix = eliminate(j, matrix)
+        return matrix
+
+    looped = partial(fori_loop, 0, size, eliminate)
+    found = lax.platform_dependent(jnp.moveaxis(blocks, 0, 2), cpu=looped, default=in_turn)
+    return jnp.moveaxis(found, 2, 0)
 
 
 def _turned(blocks):

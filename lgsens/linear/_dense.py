@@ -21,8 +21,13 @@ class LU(eqx.Module):
 
     @classmethod
     def of(cls, matrix) -> "LU":
-        lu, pivots, _ = lax.linalg.lu(matrix)
-        return cls(lu, _permutation(pivots), _permutation(pivots, inverse=True))
+        lu, pivots, permutation = lax.linalg.lu(matrix)
+        exchanged = lambda pivots, _: (_permutation(pivots), _permutation(pivots, inverse=True))
+        # elsewhere a loop over rows would be as many kernels, one after the other, whatever the batch
+        found = lax.platform_dependent(
+            pivots, permutation, cpu=exchanged, default=lambda _, rows: (rows, jnp.argsort(rows).astype(rows.dtype))
+        )
+        return cls(lu, *found)
 
     def solve(self, rhs, *, transposed: bool = False):
         """S⁻¹ rhs or S⁻ᵀ rhs, one column or several."""
