@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Primitive, jaxprs_in_params
+from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive
 from jax.interpreters import ad, batching, mlir
 
 Leaves = list[Any]
+_PROGRAMS = (Jaxpr, ClosedJaxpr)
 
 
 class LinearEquations(NamedTuple):
@@ -133,8 +134,12 @@ mlir.register_lowering(_solution, mlir.lower_fun(_run, multiple_results=True))
 
 
 def programs_in(equation: Any) -> Iterator[Any]:
-    """The programs inside of an operation of a program: those of loops and calls, and of a solution."""
+    """The programs inside of an operation of a program: those of loops, branches and calls, and of a solution.
+
+    Closed ones as they are, with their constants.
+    """
     if equation.primitive is _solution:
-        yield jax.make_jaxpr(partial(_run, **equation.params))(*(place.aval for place in equation.invars)).jaxpr
-    else:
-        yield from jaxprs_in_params(equation.params)
+        yield jax.make_jaxpr(partial(_run, **equation.params))(*(place.aval for place in equation.invars))
+        return
+    for found in equation.params.values():
+        yield from (each for each in (found if isinstance(found, tuple) else (found,)) if isinstance(each, _PROGRAMS))

@@ -21,6 +21,7 @@ from jaxtyping import PyTree
 from lgsens.dynamics import RESULTS
 from lgsens.linear import many_runs, programs_in, tuned
 from lgsens.simulation import Saved, Trajectory, failures_by_callback
+from lgsens.sweeps._one_by_one import WAITS, one_by_one
 
 AXIS = "designs"
 
@@ -106,7 +107,10 @@ def compile_batch(
     mesh = Mesh(np.asarray(devices), (AXIS,))
     rows = PartitionSpec(AXIS)
     sharding = NamedSharding(mesh, rows)
-    spread = jax.jit(jax.shard_map(jax.vmap(traced.run), mesh=mesh, in_specs=rows, out_specs=rows, check_vma=False))
+    run_all = batched = jax.vmap(traced.run)
+    if WAITS and len(devices) > 1 and devices[0].platform == "cpu":
+        run_all = lambda *leaves: one_by_one(jax.make_jaxpr(batched)(*leaves))(*leaves)
+    spread = jax.jit(jax.shard_map(run_all, mesh=mesh, in_specs=rows, out_specs=rows, check_vma=False))
 
     def compiled(size):
         shape = lambda leaf: jax.ShapeDtypeStruct((size, *leaf.shape[1:]), leaf.dtype, sharding=sharding)
