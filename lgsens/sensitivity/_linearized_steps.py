@@ -1,8 +1,8 @@
 """The steps of a known trajectory, linearized, in both directions: what is gone through in turn, or all at once.
 
 A step follows the one before (`StepLink`: δ_n* from δ_n) and solves its linearized equations (`AbstractLinearizedStep`)
-for δ_{n+1}, with the loads E_p p' of the parameters; an empty one is δ_{n+1} = δ_n + b. Backwards it takes the cotangent
-c of δ_{n+1} to the multipliers μ of its rows, and to what it adds to the cotangents of δ_n and of the parameters.
+for δ_{n+1}, with the loads E_p p' of the parameters; an empty one is δ_{n+1} = δ_n + b. Backwards it takes the
+cotangent c of δ_{n+1} to the multipliers μ of its rows, and to what it adds to the cotangents of δ_n and of p.
 """
 
 from collections.abc import Callable
@@ -48,7 +48,13 @@ class LinearizedSteps(NamedTuple):
         return jax.jvp(loads, (system, node), (d.system, d_node))[1]
 
     def forward(
-        self, linearized: AbstractLinearizedStep, step: Step, previous: Variation, loads: Any, row: Variation, d_place: Any
+        self,
+        linearized: AbstractLinearizedStep,
+        step: Step,
+        previous: Variation,
+        loads: Any,
+        row: Variation,
+        d_place: Any,
     ) -> Variation:
         """δ_{n+1}."""
         begun = step.link.begun(previous, d_place)
