@@ -25,8 +25,9 @@ With all c known, all steps give their multipliers, and what they add to p̄, at
 Twice. f_n, the end of a step that begins with δ = 0, is of size 1/h² in u' where the joints have moved, and Ã_n y_n
 takes nearly all of it away again: some 1e-10 of the top's derivative by its length, at h = 4 ms. So what the solution
 leaves of its equations, A_n δ_n + f_n − δ_{n+1}, is solved for again, by the same products, which the compiler finds to
-be the same; then the error is that of the sweeps. Backwards the multipliers of both solutions are added, and not found from the sum of both: their own
-round-off, of size 1/h² again, is in what is left after the first and is corrected by the second.
+be the same; then the error is that of the sweeps. Backwards the multipliers of both solutions are added, and not found
+from the sum of both: their own round-off, of size 1/h² again, is in what is left after the first solution, and is
+corrected by the second.
 
 An empty step hands on what it has got, A = 1, which is in no range: where a grid may have such, y is what is carried.
 
