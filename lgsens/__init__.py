@@ -106,6 +106,7 @@ from lgsens.model import (
 )
 from lgsens.sensitivity import (
     AdjointVariable as AdjointVariable,
+    AssociativeScan as AssociativeScan,
     Autodiff as Autodiff,
     ContinuousAdjoint as ContinuousAdjoint,
     ContinuousDirect as ContinuousDirect,

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -183,6 +184,11 @@ def equations(jaxpr) -> Iterator[Any]:
         yield equation
         for inner in programs_in(equation):
             yield from equations(inner)
+
+
+def random_like(tree, rng):
+    """Normal random numbers in the shapes of arrays."""
+    return jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), tree)
 
 
 def says(*parts):

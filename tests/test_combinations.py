@@ -1,4 +1,4 @@
-"""What combines with what: fifteen features with nine integrators, each against forward mode on the same steps.
+"""What combines with what: seventeen features with nine integrators, each against forward mode on the same steps.
 
 DESIGN: scheme, grid, output, sensitivity and linear solver are separate values. What is refused is refused by the
 mathematics, and the message says so. All of them run with `pytest -m slow`, every thirty-fourth one always.
@@ -82,6 +82,11 @@ def direct(name):
 
 def adjoint(name):
     f = lambda p: psi(p, INTEGRATORS[name], sensitivity=lg.AdjointVariable())
+    agrees(name, *jax.jit(jax.value_and_grad(f))(P))
+
+
+def at_once(name):
+    f = lambda p: psi(p, INTEGRATORS[name], sensitivity=lg.AssociativeScan())
     agrees(name, *jax.jit(jax.value_and_grad(f))(P))
 
 
@@ -176,6 +181,7 @@ def estimate(name):
 FEATURES = {
     "direct": direct,
     "adjoint": adjoint,
+    "all steps at once": at_once,
     "save": saved,
     "checkpoints": checkpoints,
     # the continuous methods differ from the derivative of the run by h²
@@ -184,6 +190,7 @@ FEATURES = {
         for method, bound in (
             (lg.DirectDifferentiation(), 1e-8),
             (lg.AdjointVariable(), 1e-8),
+            (lg.AssociativeScan(), 1e-8),
             (lg.ContinuousDirect(), 5e-3),
             (lg.ContinuousAdjoint(), 5e-3),
             (lg.Autodiff(), 1e-6),
@@ -202,7 +209,7 @@ REFUSED = {
     ("differentiate by ContinuousAdjoint", "adaptive"): says("backwards from t1", "GivenSteps.of(trajectory)"),
 }
 ALL = [(feature, name) for feature in FEATURES for name in INTEGRATORS]
-assert len(ALL) == 135
+assert len(ALL) == 153
 
 
 @pytest.mark.parametrize(

@@ -138,6 +138,7 @@ class IndexReducedODE(AbstractScheme):
     failure = RESULTS.integration_failed
     has_stages = True
     state_is_motion = True
+    carries = ("w", "v", "vdot")  # the first stage has v̇_n; and joints hold to the square of a projection, not exactly
 
     def require_steps(self):
         if self.rtol is not None:

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from lgsens._validate import require_setting
-from lgsens.dynamics import given_way, normal_jerk
+from lgsens.dynamics import given_way, normal_jerk, softness
 from lgsens.integrate._alpha import AbstractAlpha, AbstractEquations, Matrix, Wear
 from lgsens.integrate._alpha_defects import alpha_defects
 from lgsens.integrate._guess import Guess
@@ -48,6 +48,7 @@ class AbstractGeneralizedAlpha(AbstractAlpha):
     """What the scheme is for the march and the sweeps."""
 
     second_order_start: eqx.AbstractVar[bool]
+    carries: ClassVar[tuple[str, ...]] = ("w", "v", "vdot", "a")
 
     def shared(self, system) -> AbstractEquations:
         return self._kind(system).of(self, system)
@@ -159,6 +160,11 @@ class AbstractGeneralizedAlpha(AbstractAlpha):
         due = (matrix.wear.steps == 0) | (matrix.wear.steps >= self.factor_every)
         due = due | watch.ends_by(node.t, (2.0 * self.factor_every) * node.h) | guess.pace.changed(node.h, matrix.h)
         return due if self.iterations is not None else due | matrix.wear.out(unknowns)
+
+    def satisfies(self, system):
+        """Positions, unless joints give way for what they carry; and velocities where they are stabilized."""
+        independent = softness(system) is None
+        return independent, independent and self.stabilized
 
     def numbers(self, system):
         return self._kind(system).numbers(self, system)

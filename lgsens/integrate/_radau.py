@@ -95,6 +95,7 @@ class RadauIIA(AbstractScheme):
     order: ClassVar[int] = 4
     has_stages: ClassVar[bool] = True
     state_is_motion: ClassVar[bool] = True
+    carries: ClassVar[tuple[str, ...]] = ("w", "v")
 
     def __check_init__(self):
         valid = isinstance(self.tolerance, int | float) and 0.0 < self.tolerance < 1e-2
@@ -205,6 +206,9 @@ class RadauIIA(AbstractScheme):
             )
 
         return jax.vmap(stage)(jnp.asarray(_C, node.h.dtype), *_advanced(node, previous, found), found)
+
+    def satisfies(self, system):
+        return True, True
 
     def numbers(self, system):
         k, m = system.group.dim, len(system.constraint_names)

@@ -156,6 +156,8 @@ class AbstractScheme(AbstractIntegrator):
         failure: what a step that failed is called.
         has_stages: whether criteria are integrated over `stages`.
         state_is_motion: whether the steps that follow a state depend on nothing of it but q and v.
+        carries: the parts of δ_n that a linearized step reads; all, unless a scheme knows better. (v̇ may be one of them
+            and the state a motion all the same, as that of q and v.)
     """
 
     tolerance: eqx.AbstractVar[float]
@@ -164,6 +166,7 @@ class AbstractScheme(AbstractIntegrator):
     failure: ClassVar[RESULTS] = RESULTS.newton_failed
     has_stages: ClassVar[bool] = False
     state_is_motion: ClassVar[bool] = False
+    carries: ClassVar[tuple[str, ...]] = Variation._fields
 
     @property
     def scheme(self):
@@ -284,6 +287,11 @@ class AbstractScheme(AbstractIntegrator):
         return state, memory, Stats(jnp.where(running, count, 0), size, left, converged, jnp.full_like(node.h, jnp.inf))
 
     # Sensitivities.
+
+    def satisfies(self, system: AbstractSystem) -> tuple[bool, bool]:
+        """Whether the end of a step satisfies the constraints of positions, and those of velocities: as equations of
+        the step, to round-off, which therefore hold for their derivatives."""
+        return False, False
 
     def for_autodiff(self) -> "AbstractScheme":
         """The scheme whose own loops are differentiated, where they are."""

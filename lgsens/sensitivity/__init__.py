@@ -9,6 +9,7 @@ from lgsens.sensitivity._linearization import (
 from lgsens.sensitivity._methods import (
     AbstractSensitivity as AbstractSensitivity,
     AdjointVariable as AdjointVariable,
+    AssociativeScan as AssociativeScan,
     Autodiff as Autodiff,
     ContinuousAdjoint as ContinuousAdjoint,
     ContinuousDirect as ContinuousDirect,

@@ -63,6 +63,12 @@ def place_tangents(grid: AbstractGrid, d: AbstractGrid) -> Any:
     return jax.jvp(lambda grid: grid.places(), (grid,), (d,))[1]
 
 
+def with_places(grid: AbstractGrid, bar: Parameters, of_places: Any) -> Parameters:
+    """p̄ with what cotangents of the places say of the grid."""
+    (of_grid,) = jax.vjp(lambda grid: grid.places(), grid)[1](of_places)
+    return Parameters(bar.system, jax.tree.map(jnp.add, bar.grid, of_grid))
+
+
 def node_tangent(grid: AbstractGrid, d: AbstractGrid, place, d_place) -> Node:
     """The tangent of a step in time."""
     return jax.jvp(lambda grid, place: grid.node(place), (grid, place), (d, d_place))[1]

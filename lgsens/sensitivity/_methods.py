@@ -29,6 +29,7 @@ from lgsens.sensitivity._linearization import (
     to_algebra,
     to_ambient,
 )
+from lgsens.sensitivity._log_depth import adjoint_at_once, direct_at_once
 from lgsens.sensitivity._sweeps import adjoint_sweep, direct_sweep
 
 _TREATMENTS = ("state", "derivatives", "first_order", None)
@@ -82,7 +83,28 @@ class DirectDifferentiation(AbstractDiscrete):
 
     def trajectory(self, scheme, state0, parameters, found=None):
         self._require_all_states()
-        return _decoded(_direct_trajectory(scheme, state0, parameters, found))
+        return _decoded(_direct_trajectory(_SWEEPS, scheme, state0, parameters, found))
+
+
+class AssociativeScan(AbstractSensitivity):
+    """The derivative of `DirectDifferentiation` in O(log n) depth, for devices with room for many steps at once.
+
+        δ_{n+1} = A_n δ_n + f_n,     (A', f') ∘ (A, f) = (A' A, A' f + f')
+
+    All n steps are linearized at once, and composed by an associative scan, in forward mode and, transposed, in reverse
+    mode. Supports every JAX transformation, nested too. The simulation itself takes one step after the other, as ever.
+
+    The matrices A have s rows, 2 f of a system with f freedoms and RadauIIA, up to 4 k of one with k coordinates and
+    generalized-α (`_carried`). The n s² numbers of all of them are held at once, two to three times over, besides the
+    factors of all steps, and n s³ products take the place of n solutions: that pays where a product of matrices costs
+    little more time than the beginning of an operation does, as on accelerators with small systems and many steps. On
+    a CPU it costs more than the sweeps (`benchmarks/log_depth.py`). Compiled for each number of steps.
+
+    Sources: Blelloch, CMU-CS-90-190 (1990); Särkkä & García-Fernández, IEEE Trans. Autom. Control 66 (2021) 299.
+    """
+
+    def trajectory(self, scheme, state0, parameters, found=None):
+        return _decoded(_direct_trajectory(_AT_ONCE, scheme, state0, parameters, found))
 
 
 class AdjointVariable(AbstractDiscrete):
@@ -228,29 +250,41 @@ def _decoded(run: tuple[State, Stats]) -> tuple[State, Stats]:
 # carries the two sweeps side by side: JAX takes the first one forwards, the other one backwards, and for second
 # derivatives differentiates `matvec`, that is L itself, never the sweeps.
 
+# Either both sweeps, or what takes all steps at once.
+
 _SWEEPS = LinearEquations(
     lambda of, x: matvec(*of, *x), lambda of, b: direct_sweep(*of, *b), lambda of, c: adjoint_sweep(*of, *c)
 )
+_AT_ONCE = LinearEquations(
+    _SWEEPS.product, lambda of, b: direct_at_once(*of, *b), lambda of, c: adjoint_at_once(*of, *c)
+)
 
 
-def linearized_trajectory(scheme: AbstractScheme, states: State, parameters: Parameters, b: Variation, d: Parameters):
-    """δ of L (δ, p') = (b, d) at the states of a run; by either sweep, and differentiable by products with L."""
-    return linear_solve(_SWEEPS, (scheme, states, parameters), (b, d))[0]
+def linearized_trajectory(
+    scheme: AbstractScheme,
+    states: State,
+    parameters: Parameters,
+    b: Variation,
+    d: Parameters,
+    equations: LinearEquations = _SWEEPS,
+):
+    """δ of L (δ, p') = (b, d) at the states of a run, differentiable by products with L."""
+    return linear_solve(equations, (scheme, states, parameters), (b, d))[0]
 
 
-@jax.custom_jvp
-def _direct_trajectory(scheme, state0, parameters, found):
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _direct_trajectory(equations, scheme, state0, parameters, found):
     return _run(scheme, state0, parameters, found)
 
 
 @_direct_trajectory.defjvp
-def _direct_rule(primals, tangents):
+def _direct_rule(equations, primals, tangents):
     scheme, state0, parameters, _ = primals
     _, d_state0, d_parameters, _ = tangents
-    states, stats = _direct_trajectory(*primals)
+    states, stats = _direct_trajectory(equations, *primals)
     group = parameters.system.group
     b = with_first(to_algebra(group, state0, d_state0), earlier(Variation.none(states)))
-    delta = linearized_trajectory(scheme, states, parameters, b, d_parameters)
+    delta = linearized_trajectory(scheme, states, parameters, b, d_parameters, equations)
     d_states = jax.vmap(partial(to_ambient, group))(states, delta)
     return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
 

@@ -28,7 +28,8 @@ from lgsens._xla import scan
 from lgsens.dynamics import State
 from lgsens.integrate import AbstractScheme, Variation, earlier, later, over_steps, with_first
 from lgsens.linear import tuned
-from lgsens.sensitivity._linearization import Parameters, Step, node_tangent, place_tangents, steps
+from lgsens.sensitivity._linearization import Parameters, Step, place_tangents, steps, with_places
+from lgsens.sensitivity._linearized_steps import LinearizedSteps
 
 
 class StepBlocks(NamedTuple):
@@ -96,20 +97,16 @@ def direct_sweep(scheme: AbstractScheme, states: State, parameters: Parameters, 
     The steps after the last, which fill its block, are computed and dropped.
     """
     system, grid = parameters
-    shared, blocks = scheme.shared(system), StepBlocks.of(grid.num_steps, scheme.numbers(system), grid.count)
+    equations = LinearizedSteps.of(scheme, parameters)
+    blocks = StepBlocks.of(grid.num_steps, scheme.numbers(system), grid.count)
 
     def prepare(step: Step, d_place):
-        node = grid.node(step.place)
-        d_node = node_tangent(grid, d.grid, step.place, d_place)
-        loads = scheme.loads(shared, step.begun, step.state)
-        _, of_parameters = jax.jvp(loads, (system, node), (d.system, d_node))
-        return scheme.linearized(system, shared, node, step.begun, step.state), of_parameters
+        loads = equations.loads(step, d, d_place)
+        return equations.linearized(step), loads
 
     def one(previous: Variation, inputs):
         (linearized, loads), step, row, d_place = inputs
-        begun = step.link.begun(previous, d_place)
-        current = linearized.forward(shared, grid.node(step.place), begun, loads, row)
-        current = step.link.unless_empty(current, jax.tree.map(jnp.add, previous, row))
+        current = equations.forward(linearized, step, previous, loads, row, d_place)
         return current, current
 
     def block(previous: Variation, inputs):
@@ -125,41 +122,25 @@ def direct_sweep(scheme: AbstractScheme, states: State, parameters: Parameters, 
 def adjoint_sweep(scheme: AbstractScheme, states: State, parameters: Parameters, c: Variation, c_p: Parameters):
     """Solve Lᵀ (μ, p̄) = (c, c_p) backwards in time; returns μ stacked (row 0: the cotangent of δ_0), and p̄."""
     system, grid = parameters
-    shared, blocks = scheme.shared(system), StepBlocks.of(grid.num_steps, scheme.numbers(system), grid.count)
-
-    def prepare(step: Step):
-        return scheme.linearized(system, shared, grid.node(step.place), step.begun, step.state)
+    equations = LinearizedSteps.of(scheme, parameters)
+    blocks = StepBlocks.of(grid.num_steps, scheme.numbers(system), grid.count)
 
     def one(loads, c: Variation, inputs):
         linearized, step, own = inputs
-        begun, of_loads, mu = linearized.backward(shared, grid.node(step.place), c, loads)
-        previous, of_ratio = step.link.begun_transposed(begun)
-        previous = step.link.unless_empty(previous, c)
-        of_loads = step.link.unless_empty(of_loads, jax.tree.map(jnp.zeros_like, of_loads))
-        previous = jax.tree.map(jnp.add, own, previous)
-        return previous, (step.link.unless_empty(mu, c), of_loads, of_ratio)
+        found = equations.backward(linearized, step, c, loads)
+        return jax.tree.map(jnp.add, own, found.previous), found._replace(previous=None)
 
     def block(carry, inputs):
         c, bar = carry
         step, own = inputs
-
-        def all_loads(system, grid, places):
-            at = lambda step, place: scheme.loads(shared, step.begun, step.state)(system, grid.node(place))
-            return jax.vmap(at)(step, places)
-
-        loads, pull_back = jax.vjp(all_loads, system, grid, step.place)
-        shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), loads)
-        inputs = (jax.vmap(prepare)(step), step, own)
-        c, (mu, of_loads, of_ratio) = scan(partial(one, shapes), c, inputs, reverse=True)
-        of_system, of_grid, of_places = pull_back(of_loads)
-        if of_ratio is not None:
-            of_places = of_places._replace(ratio=of_places.ratio + of_ratio)
-        bar = jax.tree.map(jnp.add, bar, Parameters(of_system, of_grid))
-        return (c, bar), (mu, of_places)
+        loads, pull_back = equations.pull_back(step)
+        inputs = (jax.vmap(equations.linearized)(step), step, own)
+        c, found = scan(partial(one, loads), c, inputs, reverse=True)
+        of_parameters, of_places = pull_back(found)
+        return (c, jax.tree.map(jnp.add, bar, of_parameters)), (found.mu, of_places)
 
     # The steps that fill the last block come first, with zero cotangents, and leave them zero.
     c = blocks.padded(c, repeat=False)
     inputs = (blocks.padded(steps(scheme, states, grid), repeat=True), earlier(c))
     (first, bar), (rest, of_places) = blocks.scan(block, (blocks.last(c), c_p), inputs, reverse=True)
-    (of_grid,) = jax.vjp(lambda grid: grid.places(), grid)[1](of_places)
-    return with_first(first, rest), Parameters(bar.system, jax.tree.map(jnp.add, bar.grid, of_grid))
+    return with_first(first, rest), with_places(grid, bar, of_places)

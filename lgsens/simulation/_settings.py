@@ -22,8 +22,8 @@ def check_sensitivity(sensitivity: Any) -> None:
     """Raise `ValueError` for what is no method to differentiate a trajectory."""
     if not isinstance(sensitivity, AbstractSensitivity):
         raise ValueError(
-            "`sensitivity` must be DirectDifferentiation(), AdjointVariable(), ContinuousDirect() or Autodiff(), got "
-            f"{sensitivity!r}; ContinuousAdjoint() needs a Criterion, see `differentiate`."
+            "`sensitivity` must be DirectDifferentiation(), AdjointVariable(), AssociativeScan(), ContinuousDirect() "
+            f"or Autodiff(), got {sensitivity!r}; ContinuousAdjoint() needs a Criterion, see `differentiate`."
         )
 
 

@@ -97,7 +97,8 @@ def simulate(
             of n and 2n steps, to nearly fourth order. `IndexReducedODE`: an explicit Runge–Kutta scheme of high order.
             `AdaptiveSteps`: generalized-α under error control; `GivenSteps`: with steps of given sizes.
         sensitivity: how the trajectory is differentiated. `DirectDifferentiation` supports every JAX
-            transformation; `AdjointVariable` is reverse mode only.
+            transformation; `AdjointVariable` is reverse mode only; `AssociativeScan` takes all steps at once, for
+            accelerators.
         state0: the state at t0, used as it is: one of `equilibrium`, or `Trajectory.state` to continue. None: the
             consistent initial state of the model.
         save: what to return of each instant instead of the trajectory, a function s ↦ pytree of an `Instant`; the

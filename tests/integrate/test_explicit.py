@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from differences import central
-from helpers import EPS
+from helpers import EPS, random_like
 
 import lgsens as lg
 from lgsens.dynamics import initial_state
@@ -33,10 +33,6 @@ def build(p):
 def psi(p, integrator=TSIT5, **settings):
     """A criterion by an angle, a length and the end of the run."""
     return CRITERION(lg.simulate(build(p), t1=p[2], num_steps=STEPS, integrator=integrator, throw=False, **settings))
-
-
-def random_like(tree, rng):
-    return jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), tree)
 
 
 def inner(one, other):
