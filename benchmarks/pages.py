@@ -163,6 +163,7 @@ TABLES: dict[str, tuple[str, tuple[str, ...], Callable[..., str]]] = {
     "multi-start": ("results/optimizers", ("multi_start",), of("multi_start", "table")),
     "sweeps": ("results/sweeps", ("sweep",), of("sweep", "table")),
     "roofline": ("results/sweeps", ("roofline",), of("roofline", "table")),
+    "batches": ("results/sweeps", ("batches",), of("batches", "table")),
     "rivals": ("results/rivals", ("rivals",), of("rival_tables", "markdown")),
 }
 

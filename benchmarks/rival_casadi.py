@@ -12,7 +12,8 @@ import os
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -207,11 +208,21 @@ class Equations:
         return {"x": self.state, "z": lam, "p": self.theta, "ode": rate, "alg": equation}
 
 
+def arguments(scene: Scene, p):
+    """(y₀, θ)."""
+    numbers = scene.numbers(p)
+    return initial(numbers), parameters(numbers)
+
+
+def pulled_back(scene: Scene, p, bars):
+    """dΨ/dp of dΨ/dy₀ and dΨ/dθ."""
+    return jax.vjp(partial(arguments, scene), p)[1](bars)[0]
+
+
 def puller(scene: Scene):
-    """The function that makes dΨ/dp of dΨ/dy₀ and dΨ/dθ."""
+    """The function that makes dΨ/dp of dΨ/dy₀ and dΨ/dθ, at the start."""
     p = jnp.asarray(scene.start)
-    both = lambda p: (lambda z: (initial(z), parameters(z)))(scene.numbers(p))
-    pull_back = jax.jit(lambda p, bars: jax.vjp(both, p)[1](bars)[0])
+    pull_back = jax.jit(partial(pulled_back, scene))
     return lambda bars: np.asarray(pull_back(p, tuple(jnp.asarray(np.asarray(bar).ravel()) for bar in bars)))
 
 
@@ -241,7 +252,19 @@ def _repeated(function, count: int, name: str):
     return ca.Function(name, [y, theta], [last])
 
 
-def _built(functions, folder: Path) -> tuple[list[Callable[..., Any]], float, float]:
+def functions(scene: Scene, rate, counts: Iterable[int]) -> list[Any]:
+    """For each number of steps Ψ(y₀, θ), and (Ψ, dΨ/dy₀, dΨ/dθ)."""
+    ca, found = casadi(), []
+    for num_steps in counts:
+        psi = _simulation(rate, num_steps, scene.t1, f"psi_{num_steps}")
+        y, theta = ca.MX.sym("y", rate.size1_in(0)), ca.MX.sym("theta", rate.size1_in(1))
+        value = psi(y, theta)
+        outputs = [value, *psi.reverse(1)(y, theta, value, 1)]
+        found += [psi, ca.Function(f"gradient_{num_steps}", [y, theta], outputs)]
+    return found
+
+
+def built(functions, folder: Path) -> tuple[list[Callable[..., Any]], float, float]:
     """The functions as compiled C, the seconds that took, and the size of the C source in MB."""
     ca = casadi()
     started = time.perf_counter()
@@ -263,24 +286,16 @@ def programs(scene: Scene, counts: Mapping[int, str] | None = None) -> list[Prog
     if counts is None and scene.name not in COARSE:
         return []
     counts = {scene.num_steps: "equal step", COARSE[scene.name]: "equal accuracy"} if counts is None else counts
-    ca = casadi()
     rate = Equations(scene).function()
     numbers = scene.arrays()
     y0, theta = (np.asarray(f(numbers)) for f in (initial, parameters))
     pull_back = puller(scene)
     entries = np.asarray(_entries(numbers)).astype(int)
-    functions = []
-    for num_steps in counts:
-        psi = _simulation(rate, num_steps, scene.t1, f"psi_{num_steps}")
-        y, t = ca.MX.sym("y", y0.size), ca.MX.sym("theta", theta.size)
-        value = psi(y, t)
-        outputs = [value, *psi.reverse(1)(y, t, value, 1)]
-        functions += [psi, ca.Function(f"gradient_{num_steps}", [y, t], outputs)]
     with tempfile.TemporaryDirectory() as folder:
-        built, seconds, size = _built(functions, Path(folder))
+        compiled, seconds, size = built(functions(scene, rate, counts), Path(folder))
     details = {"source_megabytes": size, "operations_of_one_evaluation": rate.n_instructions()}
     found = []
-    for (num_steps, basis), forward, reverse in zip(counts.items(), built[::2], built[1::2]):
+    for (num_steps, basis), forward, reverse in zip(counts.items(), compiled[::2], compiled[1::2]):
 
         def run(forward=forward):
             return float(forward(y0, theta)), None

@@ -22,6 +22,11 @@ def criterion(scene: Scene, model):
     return lg.time_integral(trajectory.t, observed**2)
 
 
+def extrapolated(scene: Scene, num_steps: int, model):
+    """Ψ, extrapolated from so many steps and twice as many."""
+    return lg.richardson(lambda n: criterion(scene._replace(num_steps=n), model), num_steps).value
+
+
 def common_entries(scene: Scene, gradient: lg.Model):
     """Entries of a gradient with respect to all numbers that every program has: masses and rates."""
     rates = []
@@ -68,7 +73,7 @@ def reference(scene: Scene) -> tuple[float, list[float]]:
 def _programs_of_system(scene: Scene, basis: dict) -> list[Program]:
     """Ψ and its gradient for p, by the scene's steps and extrapolated from a few."""
     system, pull_back = _system(scene)
-    few = lambda system: lg.richardson(lambda n: criterion(scene._replace(num_steps=n), system), FEW_STEPS).value
+    few = partial(extrapolated, scene, FEW_STEPS)
     shorter = {"rival": "lgsens", "num_steps": 3 * FEW_STEPS, "basis": f"{FEW_STEPS} and {2 * FEW_STEPS} steps"}
     found = []
     for function, title, settings in ((partial(criterion, scene), "simulate", basis), (few, "richardson", shorter)):
