@@ -41,8 +41,7 @@ import numpy as np
 import rival_casadi
 import rival_exudyn
 import rival_lgsens
-from benchmark import WHOLE_LOOPS, circumstances, environment, interleaved, options, write
-from pages import grid
+from benchmark import WHOLE_LOOPS, circumstances, environment, grid, interleaved, options, write
 from rival_run import difference
 from rival_scenes import SCENES, Scene
 

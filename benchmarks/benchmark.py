@@ -7,7 +7,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -69,6 +69,13 @@ def interleaved(calls: Mapping[Any, Callable[[], Any]], repeats: int, *, seconds
             found[name].cpu.append(time.process_time() - cpu_started)
         rounds += 1
     return found
+
+
+def grid(head: str, rows: Iterable[Iterable[Any]]) -> str:
+    """A table in Markdown; `head`: the names of its columns, with bars between them."""
+    line = lambda cells: "| " + " | ".join(str(cell).replace("|", "\\|") for cell in cells) + " |"
+    names = [name.strip() for name in head.split("|")]
+    return "\n".join([line(names), "|---" * len(names) + "|", *map(line, rows)])
 
 
 def environment(threads: Mapping[str, str] | None = None) -> dict[str, Any]:

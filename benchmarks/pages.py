@@ -8,19 +8,13 @@ name. The prose around them is written by hand.
 
 import importlib
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+
+from benchmark import grid
 
 HERE = Path(__file__).parent
 GUIDE = HERE.parent / "notebooks"
-
-
-def grid(head: str, rows: Iterable[Iterable[Any]]) -> str:
-    """A table in Markdown; `head`: the names of its columns, with bars between them."""
-    line = lambda cells: "| " + " | ".join(str(cell).replace("|", "\\|") for cell in cells) + " |"
-    names = [name.strip() for name in head.split("|")]
-    return "\n".join([line(names), "|---" * len(names) + "|", *map(line, rows)])
 
 
 def errors(row: dict, *quantities: str) -> list[str]:
