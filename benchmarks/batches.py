@@ -20,8 +20,7 @@ as `lg.sweep` does.
 
 Errors are the largest over the designs, against CasADi's C at 500 steps, of order four, which itself is compared with
 the reference of rivals.json at the shipped damper. The run fails if an error is larger than `BOUND`. Needs
-benchmarks/requirements.txt, and gcc.
-Writes batches.json and prints a table.
+benchmarks/requirements.txt and gcc. Writes batches.json and prints a table.
 """
 
 import json

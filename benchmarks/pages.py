@@ -156,6 +156,7 @@ TABLES: dict[str, tuple[str, tuple[str, ...], Callable[..., str]]] = {
     "optimizers": ("results/optimizers", ("optimizers",), of("optimizers", "table", "problems")),
     "multi-start": ("results/optimizers", ("multi_start",), of("multi_start", "table")),
     "sweeps": ("results/sweeps", ("sweep",), of("sweep", "table")),
+    "log depth": ("choosing", ("log_depth",), of("log_depth", "table")),
     "roofline": ("results/sweeps", ("roofline",), of("roofline", "table")),
     "batches": ("results/sweeps", ("batches",), of("batches", "table")),
     "rivals": ("results/rivals", ("rivals",), of("rival_tables", "markdown")),

@@ -17,22 +17,18 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from benchmark import WHOLE_LOOPS, environment, options, write
-from jax.extend.core import ClosedJaxpr, Literal
+from sweep import quarter_car
 
-import lgsens as lg
-from lgsens.examples import QuarterCar
-from lgsens.linear import many_runs, programs_in
+from lgsens.linear import many_runs
 from lgsens.simulation import failures_by_callback
+from lgsens.sweeps._one_by_one import bound, evaluated
 
 LANES, STEPS = 26, 100  # those of `sweep`
 COUNTED = (20, 60)  # steps of the runs that are counted
-H = 1e-3
-_CALLS = ("closed_call", "custom_jvp_call", "custom_vjp_call", "custom_vmap_call", "jit", "linear_solve", "pjit")
 # Those that only move numbers.
 _FREE = frozenset(
     (
@@ -43,13 +39,7 @@ _FREE = frozenset(
 )
 
 
-def criterion(damping, steps: int):
-    car = eqx.tree_at(lambda car: car.damper.rate, QuarterCar.load(), damping)
-    trajectory = lg.simulate(car.model(), t1=H * steps, num_steps=steps)
-    return lg.time_integral(trajectory.t, trajectory.body("chassis").acceleration[:, 2] ** 2)
-
-
-KINDS: dict[str, Callable] = {"value": criterion, "value and gradient": jax.value_and_grad(criterion)}
+KINDS: dict[str, Callable] = {"value": quarter_car, "value and gradient": jax.value_and_grad(quarter_car)}
 
 
 class Tally:
@@ -59,12 +49,7 @@ class Tally:
         self.flops, self.bytes = 0.0, 0.0
 
     def run(self, program: Any, operands) -> list[Any]:
-        jaxpr, consts = (program.jaxpr, program.consts) if isinstance(program, ClosedJaxpr) else (program, ())
-        known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *operands]))
-        read = lambda place: place.val if isinstance(place, Literal) else known[place]
-        for equation in jaxpr.eqns:
-            known.update(zip(equation.outvars, self._found(equation, [read(place) for place in equation.invars])))
-        return [read(place) for place in jaxpr.outvars]
+        return evaluated(program, operands, self._found)
 
     def _found(self, equation, operands) -> list[Any]:
         name, params = equation.primitive.name, equation.params
@@ -78,10 +63,7 @@ class Tally:
             return carry
         if name == "cond":
             return self.run(params["branches"][int(operands[0])], operands[1:])
-        if name in _CALLS:
-            return self.run(next(programs_in(equation)), operands)
-        found = equation.primitive.bind(*operands, **params)
-        found = list(found) if equation.primitive.multiple_results else [found]
+        found = bound(equation.primitive, params, operands)
         self._add(equation, operands, found)
         return found
 

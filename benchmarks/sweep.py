@@ -40,9 +40,9 @@ def top(angle):
     return lg.time_integral(trajectory.t, trajectory.body("top").position[:, 0] ** 2)
 
 
-def quarter_car(damping):
+def quarter_car(damping, steps: int = 100):
     car = eqx.tree_at(lambda car: car.damper.rate, QuarterCar.load(), damping)
-    trajectory = lg.simulate(car.model(), t1=0.1, num_steps=100)
+    trajectory = lg.simulate(car.model(), t1=1e-3 * steps, num_steps=steps)
     return lg.time_integral(trajectory.t, trajectory.body("chassis").acceleration[:, 2] ** 2)
 
 

@@ -7,6 +7,7 @@ each instead of 11.5).
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -27,7 +28,7 @@ _LAPACK = frozenset(
 _CALLS = frozenset(
     (
         *("closed_call", "custom_jvp_call", "custom_vjp_call", "custom_vmap_call", "jit", "linear_solve", "pjit"),
-        "remat",
+        *("checkpoint", "remat"),
     )
 )
 Values = Sequence[Any]
@@ -35,15 +36,19 @@ Values = Sequence[Any]
 
 def one_by_one(program: ClosedJaxpr) -> Callable[..., Values]:
     """The program as a function of arrays."""
-    return lambda *arrays: _evaluated(program, arrays)
+    return lambda *arrays: evaluated(program, arrays, _found)
 
 
-def _evaluated(program: Any, operands: Values) -> Values:
+def evaluated(program: Any, operands: Values, found: Callable[[Any, Values], Values]) -> Values:
+    """The outputs of a program of which each operation is `found(equation, operands)`, and calls are entered."""
     jaxpr, consts = (program.jaxpr, program.consts) if isinstance(program, ClosedJaxpr) else (program, ())
     known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *operands]))
     read = lambda place: place.val if isinstance(place, Literal) else known[place]
     for equation in jaxpr.eqns:
-        known.update(zip(equation.outvars, _found(equation, [read(place) for place in equation.invars])))
+        given = [read(place) for place in equation.invars]
+        called = equation.primitive.name in _CALLS
+        outputs = evaluated(next(programs_in(equation)), given, found) if called else found(equation, given)
+        known.update(zip(equation.outvars, outputs))
     return [read(place) for place in jaxpr.outvars]
 
 
@@ -54,25 +59,22 @@ def _found(equation: Any, operands: Values) -> Values:
     if primitive.name == "custom_linear_solve":
         lengths, first = params["const_lengths"], params["const_lengths"].matvec + params["const_lengths"].vecmat
         own = operands[first : first + lengths.solve]
-        return _evaluated(params["jaxprs"].solve, [*own, *operands[sum(lengths) :]])
-    if primitive.name in _CALLS:
-        return _evaluated(next(programs_in(equation)), operands)
+        return evaluated(params["jaxprs"].solve, [*own, *operands[sum(lengths) :]], _found)
     inside = {name: of(params[name]) for name, of in _PROGRAMS.get(primitive.name, {}).items()}
-    found = primitive.bind(*operands, **{**params, **inside})
+    return bound(primitive, {**params, **inside}, operands)
+
+
+def bound(primitive: Any, params: Any, operands: Values) -> Values:
+    """The outputs of an operation as it is, as a list."""
+    found = primitive.bind(*operands, **params)
     return found if primitive.multiple_results else [found]
 
 
 def _alone(primitive: Any, params: Any, operands: Values) -> Values:
     """A factorization: the last axes of each operand are its matrix, or the numbers that belong to it."""
-
-    def bound(operands):
-        found = primitive.bind(*operands, **params)
-        return found if primitive.multiple_results else [found]
-
-    batch = operands[0].shape[:-2]
-    function = bound
-    for _ in batch:
-        function = lambda operands, of=function: lax.map(of, operands)
+    function = partial(bound, primitive, params)
+    for _ in operands[0].shape[:-2]:
+        function = partial(lax.map, function)
     return function(list(operands))
 
 
