@@ -28,7 +28,7 @@ _LAPACK = frozenset(
 _CALLS = frozenset(
     (
         *("closed_call", "custom_jvp_call", "custom_vjp_call", "custom_vmap_call", "jit", "linear_solve", "pjit"),
-        *("checkpoint", "remat"),
+        "remat2",
     )
 )
 Values = Sequence[Any]
