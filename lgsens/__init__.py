@@ -28,11 +28,14 @@ from lgsens.analysis import (
 )
 from lgsens.criteria import (
     Advice as Advice,
+    Certificate as Certificate,
     Costs as Costs,
     Criterion as Criterion,
     FiniteDifferences as FiniteDifferences,
     IndexReduced as IndexReduced,
+    Kink as Kink,
     Sensitivities as Sensitivities,
+    certify as certify,
     differentiate as differentiate,
     direct_or_adjoint as direct_or_adjoint,
     measure_costs as measure_costs,
@@ -143,14 +146,10 @@ _NAMESPACES = (
     "testing",
 )  # imported when first used: optax and matplotlib take their time
 
-_OF_NAMESPACES = {"Certificate": "accuracy", "certify": "accuracy"}  # for the same reason
-
 set_options()
 
 
 def __getattr__(name: str):
     if name in _NAMESPACES:
         return importlib.import_module(f"lgsens.{name}")
-    if name in _OF_NAMESPACES:
-        return getattr(importlib.import_module(f"lgsens.{_OF_NAMESPACES[name]}"), name)
     raise AttributeError(f"module 'lgsens' has no attribute {name!r}")

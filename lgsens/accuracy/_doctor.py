@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lgsens._validate import as_count
-from lgsens.accuracy._certify import rough
 from lgsens.analysis import constraint_rank, sensitivity_growth
+from lgsens.criteria import kinks, roughness
 from lgsens.dynamics import RESULTS, full_jacobian
 from lgsens.integrate import AbstractIntegrator, GeneralizedAlpha, singular_steps
 from lgsens.model import Model, MultibodySystem
@@ -242,19 +242,18 @@ def _of_run(trajectory: Trajectory, h: float, singular: bool):
         "Branches of the motion meet there: avoid it by a stop, an offset or a shorter run.",
         least=True,
     )
-    spikes, unresolved = rough(trajectory)
-    places = [(float(trajectory.t[n]), system.body_names[i]) for n, i in np.argwhere(np.asarray(spikes))]
-    where = ", ".join(f"{name!r} at {t:.4g} s" for t, name in places[:3])
+    rough = roughness(trajectory)
+    places = kinks(trajectory, rough)
     yield Finding(
         "kinks of forces inside of steps",
         float(len(places)),
         0.0,
-        where,
+        ", ".join(map(str, places[:3])),
         "Let a step end there (an edge of a road), or smooth the force over several steps; see `certify`.",
     )
     yield Finding(
         "share of steps that do not resolve accelerations",
-        float(unresolved),
+        float(rough.unresolved),
         0.1,
         "",
         "Take many more steps, or model what is fast as rigid.",

@@ -2,7 +2,6 @@
 
 from lgsens.analysis._growth import (
     Growth as Growth,
-    grows_exponentially as grows_exponentially,
     sensitivity_growth as sensitivity_growth,
 )
 from lgsens.analysis._kinematics import Kinematics as Kinematics, kinematics as kinematics

@@ -16,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from lgsens._validate import as_count
+from lgsens.criteria import grows_exponentially
 from lgsens.dynamics import (
     AbstractSystem,
     State,
@@ -30,7 +31,6 @@ from lgsens.sensitivity import DirectDifferentiation
 from lgsens.simulation import as_system, begin, check_integrator, interval, run, throw_if_failed
 
 _DIRECTIONS = 3  # one is nearly orthogonal to the direction that grows with little probability, three never are
-_REGULAR = 16.0  # of twice the time; in a regular motion sensitivities grow like t, under a constant force like t²
 
 
 class Growth(NamedTuple):
@@ -119,8 +119,3 @@ def _growth_jit(system: AbstractSystem, t0, t1, num_steps: int, integrator: Abst
     lost = factor * jnp.finfo(factor.dtype).eps >= 1.0
     horizon = jnp.where(jnp.any(lost), t[jnp.argmax(lost)], jnp.inf)
     return Growth(t, factor, grows_exponentially(factor), horizon), result, details
-
-
-def grows_exponentially(factor: Float[Array, " n+1"]) -> Bool[Array, ""]:
-    """Whether g, `Growth.factor` on equal steps, grows by more than a regular motion's in the second half."""
-    return factor[-1] > _REGULAR * factor[(factor.shape[0] - 1) // 2]

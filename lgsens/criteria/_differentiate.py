@@ -16,6 +16,7 @@ from lgsens._validate import as_count, as_float
 from lgsens._xla import tracing
 from lgsens.criteria._advice import direct_or_adjoint
 from lgsens.criteria._by_parts import Parts, reverse_by_parts, unique
+from lgsens.criteria._certify import certify, check_certifiable
 from lgsens.criteria._criterion import Criterion
 from lgsens.criteria._criterion_use import Use, checked_for
 from lgsens.criteria._reference_methods import STENCIL, FiniteDifferences, IndexReduced
@@ -59,6 +60,7 @@ class Sensitivities(NamedTuple):
         method: the method that was used.
         result: a value of `RESULTS`, shape (), int32; 0 is success.
         reached: the accuracy, where one was asked for; else None.
+        certificate: what value and gradient are worth, where that was asked for, a `Certificate` for each criterion.
     """
 
     value: PyTree
@@ -66,6 +68,7 @@ class Sensitivities(NamedTuple):
     method: Method
     result: Int[Array, ""]
     reached: Reached | None = None
+    certificate: PyTree = None
 
     __repr__ = brief
 
@@ -82,6 +85,7 @@ def differentiate(
     method: Method | None = None,
     state0: Callable[[Any], State] | None = None,
     accuracy: float | None = None,
+    certificate: bool = False,
     throw: bool = True,
 ) -> Sensitivities:
     """Ψ and dΨ/dp of one or several criteria with respect to one or several parameters, by any method.
@@ -102,6 +106,9 @@ def differentiate(
             that is less work: the largest relative error of a value and of a gradient, of this by its norm, as far as
             runs in n, 2n, 4n, … steps tell. `reached` says what was reached and how. `num_steps` is then the first
             number of steps, 64 by default: enough of them to see the shortest event (the bump of a road).
+        certificate: also say what value and gradient are worth, outside of `jit`: their errors, what may spoil them,
+            and whether they are good to `accuracy`, or to 1e-3 (`certify`, a run of its own). Runs are not extrapolated
+            then.
         throw: raise if the simulation fails. With False, and inside `jit`, `result` says so, and values and gradients
             are NaN.
 
@@ -122,15 +129,21 @@ def differentiate(
         raise ValueError(f"`build` must be a function of the parameters that returns a Model, got {build!r}.")
     if method is not None and not isinstance(method, Method):
         raise ValueError(f"`method` must be a method such as AdjointVariable() or ContinuousAdjoint(), got {method!r}.")
+    settings = {"t0": t0, "t1": t1, "integrator": integrator, "state0": state0}
+    worth = lambda **own: certify(criteria, build, p, **own, **settings) if certificate else None
     if accuracy is not None:
         if not throw:
             raise ValueError("`accuracy` raises where it is not reached; leave `throw` out.")
         order = check_accuracy(accuracy, num_steps, integrator, (p, t0, t1))
-        settings = {"t0": t0, "t1": t1, "integrator": integrator, "method": method, "state0": state0}
-        run = lambda n, throw: differentiate(criteria, build, p, num_steps=n, throw=throw, **settings)
-        return differentiate_to(run, float(accuracy), order, num_steps)
+        if certificate:
+            check_certifiable(integrator, None, (p, t0, t1))
+        run = lambda n, throw: differentiate(criteria, build, p, num_steps=n, method=method, throw=throw, **settings)
+        found = differentiate_to(run, float(accuracy), order, num_steps, extrapolate=not certificate)
+        return found._replace(certificate=worth(num_steps=found.reached.num_steps, tolerance=float(accuracy)))
     num_steps = as_count(num_steps, "num_steps", " (it is static), unless `accuracy` is given")
     check_integrator(integrator, num_steps)
+    if certificate:
+        check_certifiable(integrator, num_steps, (p, t0, t1))
     t0, t1 = interval(t0, t1)
     p = jax.tree_util.tree_map_with_path(lambda path, leaf: as_float(leaf, None, f"`p`{jax.tree_util.keystr(path)}"), p)
     size = sum(leaf.size for leaf in jax.tree.leaves(p))
@@ -162,7 +175,7 @@ def differentiate(
     values, gradients = (jax.tree.unflatten(structure, leaves) for leaves in (value, gradient))
     if throw and details is not None:
         values, gradients = throw_if_failed((values, gradients), result, details, labels, note)
-    return Sensitivities(values, gradients, method, result)
+    return Sensitivities(values, gradients, method, result, certificate=worth(num_steps=num_steps, throw=throw))
 
 
 def _flies(method: Method, integrator: AbstractIntegrator) -> bool:

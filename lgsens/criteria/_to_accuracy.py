@@ -10,7 +10,9 @@ from jax.flatten_util import ravel_pytree
 from lgsens.simulation import richardson, to_accuracy
 
 
-def differentiate_to(run: Callable[[int, bool], Any], accuracy: float, order: int, fewest: int | None) -> Any:
+def differentiate_to(
+    run: Callable[[int, bool], Any], accuracy: float, order: int, fewest: int | None, *, extrapolate: bool
+) -> Any:
     """The `Sensitivities` that have it, with `reached`; `run`: number of steps, whether to raise ↦ `Sensitivities`."""
 
     def distance(coarse, fine) -> float:
@@ -22,7 +24,8 @@ def differentiate_to(run: Callable[[int, bool], Any], accuracy: float, order: in
         value, gradient = richardson(lambda _: next(two), 1).value
         return fine._replace(value=value, gradient=gradient)
 
-    found, reached = to_accuracy(run, distance, extrapolated if order == 2 else None, accuracy, order, fewest)
+    how = extrapolated if extrapolate and order == 2 else None
+    found, reached = to_accuracy(run, distance, how, accuracy, order, fewest)
     return found._replace(reached=reached)
 
 

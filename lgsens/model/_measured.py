@@ -4,8 +4,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
 from lgsens._validate import suggestion
+from lgsens.model._frames import BODY_DIM, ROTATION
+from lgsens.model._loads import generalized_force
 from lgsens.model._stack import at_ends
 from lgsens.model._system import MultibodySystem
 
@@ -38,3 +42,22 @@ def measured(system: MultibodySystem, force: str, q, v, vdot, lam, t) -> Any:
         return stack.map(lambda e, *args: e.measure(*args), ends, (t, *stack.inputs(twist, lam, read)))
 
     return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(at_time)(placed, twists, lam, t))
+
+
+def element_forces(
+    system: MultibodySystem, q, v, lam, t, length
+) -> list[tuple[tuple[str, ...], Float[Array, "n e w"]]]:
+    """The generalized forces of all loads along a leading axis of states and times, moments as forces at the arm
+    `length` [N]; after those of two bodies, 12, the rates of states. Of each stack, with the names of its elements."""
+
+    def at_time(q, v, lam, t):
+        acting = system._acting(system._placed(q), system.twists(v), lam, t, system.topology.forces)
+        return [stack.map(generalized_force, ends, inputs) for stack, ends, inputs, _ in acting]
+
+    def scaled(forces):
+        w = np.arange(forces.shape[-1])
+        moments = (w < 2 * BODY_DIM) & (w % BODY_DIM >= ROTATION.start)
+        return jnp.where(moments, forces / length, forces)
+
+    found = jax.vmap(at_time)(q, v, lam, t)
+    return [(stack.owners, scaled(forces)) for stack, forces in zip(system.loads, found)]

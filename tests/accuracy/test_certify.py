@@ -9,8 +9,10 @@ from oscillator import CRITERION, T1, P, build, exact
 
 import lgsens as lg
 from lgsens.accuracy import certify
+from lgsens.examples import linear_quarter_car
 
 HEIGHT = lg.Criterion(terminal=lambda s, p: s.body("mass").position[2])
+BOTH = {"squares": CRITERION, "end": HEIGHT}
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +43,28 @@ def test_it_says_how_many_digits_and_what_to_do(oscillator):
     assert strict._replace(tolerance=0.5).good
 
 
+def test_differentiate_has_a_certificate_of_each_criterion(oscillator):
+    found = lg.differentiate(BOTH, build, P, t1=T1, num_steps=100, certificate=True)
+    for name, certificate in found.certificate.items():
+        np.testing.assert_allclose(certificate.value, found.value[name], rtol=1e-12)  # round-off of a hundred steps
+        for key in P:
+            np.testing.assert_allclose(certificate.gradient[key], found.gradient[name][key], rtol=1e-10)
+    # of two criteria at once and of one alone: other programs, the same formulas
+    np.testing.assert_allclose(found.certificate["squares"].value_error, oscillator.value_error, rtol=1e-8)
+    at_end = lambda p: 1.0 + 0.3 * jnp.sin(jnp.sqrt(p["k"] / p["m"])) * jnp.sqrt(p["m"] / p["k"])  # V = 0.3, T1 = 1
+    own = found.certificate["end"]
+    np.testing.assert_allclose(own.value_error, at_end(P) - own.value, rtol=0.1)
+
+
+@pytest.mark.slow
+def test_a_certificate_at_an_accuracy_is_that_of_the_run_found():
+    found = lg.differentiate(CRITERION, build, P, t1=T1, accuracy=1e-4, certificate=True)
+    assert not found.reached.extrapolated
+    assert found.certificate.tolerance == 1e-4
+    assert found.certificate.good
+    np.testing.assert_allclose(found.certificate.value, found.value, rtol=1e-12)  # one number of steps, round-off
+
+
 def scene(p, signal):
     mass = lg.RigidBody(mass=p, inertia=None, free="z")
     forces = {
@@ -56,11 +80,13 @@ def pushed(p):
 
 def test_a_kink_inside_of_a_step_is_named():
     found = certify(HEIGHT, pushed, 1.0, t1=1.0, num_steps=100)
-    ((t, body),) = found.kinks
+    ((t, body, forces),) = found.kinks
     assert body == "mass"
+    assert forces == ("push",)  # not the spring
     assert abs(t - 0.5037) <= 0.01
     assert not found.good
     assert "have a kink" in str(found)
+    assert "'push'" in str(found)
 
 
 def smoothly(p):
@@ -97,6 +123,69 @@ def test_exponential_growth_is_named():
     assert "unstable or chaotic" in str(found)
 
 
+def on_a_stop(p, rounding):
+    """A mass falls on a stop from a height p above it."""
+    mass = lg.RigidBody(mass=1.0, inertia=None, position=(0.0, 0.0, p), free="z")
+    at = {"at_a": (0.0, 0.0, -1.0), "at_b": jnp.stack([0.0 * p, 0.0 * p, p])}
+    stop = lg.BumpStop(None, "mass", **at, gap=p, stiffness=1e3, rounding=rounding)
+    damper = lg.SpringDamper(None, "mass", **at, stiffness=0.0, damping=2.0)
+    return lg.Model({"mass": mass}, {}, {"gravity": lg.Gravity((0.0, 0.0, -9.81)), "stop": stop, "damper": damper})
+
+
+@pytest.mark.slow
+def test_a_hard_stop_is_named_and_one_that_steps_resolve_is_not():
+    settings = {"t1": 0.25, "num_steps": 500}
+    hard = certify(HEIGHT, lambda p: on_a_stop(p, 1e-7), 0.1, **settings)
+    (kink,) = hard.kinks
+    assert kink.forces == ("stop",)
+    fallen = lambda t: 9.81 / 4.0 * (2.0 * t - 1.0 + np.exp(-2.0 * t))  # against 2 N s/m
+    assert fallen(kink.t - 0.25 / 500) <= 0.1 <= fallen(kink.t)
+    soft = certify(HEIGHT, lambda p: on_a_stop(p, 0.02), 0.1, **settings)
+    assert not soft.kinks
+    finer = lg.differentiate(HEIGHT, lambda p: on_a_stop(p, 0.02), 0.1, t1=0.25, num_steps=4000)
+    # the next order of the estimate, and 1/64 of the error itself
+    np.testing.assert_allclose(soft.value + soft.value_error, finer.value, atol=0.2 * abs(soft.value_error))
+    np.testing.assert_allclose(soft.gradient + soft.gradient_error, finer.gradient, atol=0.3 * abs(soft.gradient_error))
+
+
+def on_a_ramp(p, end):
+    """A wheel and a car on a road that rises from 0.1 s to `end`."""
+    car = linear_quarter_car(ks=p)
+    road = lg.SampledRoad((0.0, 0.1, end, 1.0), (0.0, 0.0, 0.05, 0.05))
+    tyre = lg.TyreSpring("unsprung", at=(0.0, 0.0, 0.0), stiffness=2e5, road=road)
+    return lg.Model(car.bodies, car.joints, car.forces | {"tyre": tyre})
+
+
+@pytest.mark.slow
+def test_the_edge_of_a_road_is_named_where_no_step_ends_there():
+    lifted = lg.Criterion(terminal=lambda s, p: s.body("sprung").position[2])
+    found = certify(lifted, lambda p: on_a_ramp(p, 0.2037), 2e4, t1=0.5, num_steps=500)
+    assert {(round(kink.t, 3), kink.forces) for kink in found.kinks} == {(0.204, ("tyre",))}
+    assert not found.good
+
+
+def double_pendulum(p):
+    """Two equal bars in a plane, released at rest, the first at p over the horizontal, high above rest."""
+    bodies, joints, start = {}, {}, jnp.zeros(3)
+    for i, angle in enumerate((p, jnp.full_like(p, 1.2))):
+        along = jnp.stack([jnp.cos(angle), jnp.zeros_like(angle), jnp.sin(angle)])
+        bodies[f"bar{i}"] = lg.RigidBody(1.0, (1 / 12, 1 / 12, 1 / 12), position=start + along / 2)
+        hinge = {"at": start, "axis": (0.0, 1.0, 0.0)}
+        joints[f"hinge{i}"] = lg.RevoluteJoint(f"bar{i - 1}" if i else None, f"bar{i}", **hinge)
+        start = start + along
+    return lg.Model(bodies, joints, {"gravity": lg.Gravity((0.0, 0.0, -9.81))})
+
+
+@pytest.mark.slow
+def test_the_chaotic_double_pendulum_is_named():
+    tip = lg.Criterion(terminal=lambda s, p: s.body("bar1").position[0])
+    found = certify(tip, double_pendulum, 1.0, t1=20.0, num_steps=5000)
+    assert found.exponential
+    assert not found.good
+    assert "unstable or chaotic" in str(found)
+    assert not certify(tip, double_pendulum, -1.5, t1=5.0, num_steps=1000, tolerance=0.3).exponential
+
+
 @pytest.mark.parametrize(
     "changes, message",
     [
@@ -105,9 +194,17 @@ def test_exponential_growth_is_named():
         ({"tolerance": 2.0}, says("`tolerance`", "between 0 and 1", "2.0")),
         ({"p": {}}, says("`p`", "at least one number")),
         ({"criterion": 3.0}, says("`criterion` and `build`", "functions", "3.0")),
+        ({"criterion": {}}, says("`criterion` and `build`", "functions", "{}")),
     ],
 )
 def test_bad_input(changes, message):
     given = {"criterion": HEIGHT, "build": build, "p": P, "num_steps": 100} | changes
     with pytest.raises(ValueError, match=message):
         certify(given.pop("criterion"), given.pop("build"), given.pop("p"), t1=1.0, **given)
+
+
+def test_differentiate_refuses_it_before_it_computes():
+    with pytest.raises(ValueError, match=says("`integrator`", "equal steps", "AdaptiveSteps")):
+        lg.differentiate(HEIGHT, build, P, t1=1.0, num_steps=100, integrator=lg.AdaptiveSteps(), certificate=True)
+    with pytest.raises(ValueError, match=says("outside of `jit`")):
+        jax.jit(lambda p: lg.differentiate(HEIGHT, build, p, t1=1.0, num_steps=100, certificate=True).value)(P)

@@ -6,6 +6,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
+from lgsens.criteria._kinks import Kink
 from lgsens.dynamics import RESULTS
 
 _DUALITY = 1e-6  # round-off of long runs is far below
@@ -25,7 +26,7 @@ class Certificate(NamedTuple):
         growth: how much the motion changes for a relative change of p of 1, in rad or lengths of the scene, shape ().
         exponential: whether it grows exponentially, shape ().
         margin: the least margin to a singular configuration of those looked at, relative to the largest, shape ().
-        kinks: times in whose step an acceleration has a kink or a jump [s], and names of the bodies.
+        kinks: where in time an acceleration has a kink or a jump inside of a step, of which body, by which forces.
         unresolved: the share of steps in which accelerations change as much as they are large, shape ().
         result: a value of `RESULTS`, shape (), int32.
     """
@@ -40,7 +41,7 @@ class Certificate(NamedTuple):
     growth: Float[Array, ""]
     exponential: Any
     margin: Float[Array, ""]
-    kinks: tuple[tuple[float, str], ...]
+    kinks: tuple[Kink, ...]
     unresolved: Float[Array, ""]
     result: Int[Array, ""]
 
@@ -74,7 +75,7 @@ class Certificate(NamedTuple):
                 "the steps do not resolve the motion, take many more of them, or model what is fast as rigid"
             )
         elif self.kinks:
-            places = ", ".join(f"{name!r} at t = {t:.6g} s" for t, name in self.kinks[:4])
+            places = ", ".join(map(str, self.kinks[:4]))
             more = f" and {len(self.kinks) - 4} more" if len(self.kinks) > 4 else ""
             said.append(
                 f"accelerations have a kink or a jump inside of a step: {places}{more}. Estimates do not see it; let "

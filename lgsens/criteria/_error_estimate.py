@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lgsens._validate import is_concrete, require
-from lgsens.accuracy._refined_run import refined_error
+from lgsens.criteria._refined_run import refined_error
 from lgsens.dynamics import State
 from lgsens.integrate import (
     AbstractIntegrator,
