@@ -32,11 +32,8 @@ def potential(load, a, b, t):
         for frame, point, triad in ((a, load.point_a, load.triad_a), (b, load.point_b, load.triad_b))
     ]
     H, eye = jnp.linalg.inv(ends[0]) @ ends[1], jnp.eye(4)
-    for _ in range(6):
-        root, other = H, eye
-        for _ in range(12):
-            root, other = (root + jnp.linalg.inv(other)) / 2, (other + jnp.linalg.inv(root)) / 2
-        H = root
+    nearer = lambda _, pair: ((pair[0] + jnp.linalg.inv(pair[1])) / 2, (pair[1] + jnp.linalg.inv(pair[0])) / 2)
+    H = jax.lax.fori_loop(0, 6, lambda _, H: jax.lax.fori_loop(0, 12, nearer, (H, eye))[0], H)
     X, power, D = H - eye, H - eye, jnp.zeros((4, 4))
     for n in range(1, 13):  # |X| is at most π/64 and the translation's: X¹³ is round-off
         D, power = D - (-1.0) ** n / n * power, power @ X
