@@ -94,6 +94,8 @@ def test_a_design_and_its_derivatives(car):
 def test_bad_limits(car, name):
     with pytest.raises(ValueError, match=says(f"`{name}` must be positive, got 0.0")):
         RoadLimits.around(car, **ROAD, **{name: 0.0})
+    with pytest.raises(ValueError, match=says(f"RoadLimits: `{name}` must be positive, got -1.0")):
+        RoadLimits(**{"roughness": 256e-6, "speed": SPEED, "tyre": 700.0, "travel": 0.01} | {name: -1.0})
 
 
 @pytest.mark.slow  # the programs of a search

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float, require
+from lgsens._validate import as_float, number_field, require, require_positive
 from lgsens.examples._quarter_car import QuarterCar, RoadResponse
 from lgsens.model import ISO_8608
 
@@ -20,12 +20,17 @@ class RoadLimits(eqx.Module):
         speed: V [m/s], shape ().
         tyre: σ_tyre,max, standard deviation of the load of the tyre [N], shape ().
         travel: σ_travel,max, that of the wheel to the chassis [m], shape ().
+
+    Raises `ValueError` for numbers that are not positive.
     """
 
-    roughness: Float[Array, ""]
-    speed: Float[Array, ""]
-    tyre: Float[Array, ""]
-    travel: Float[Array, ""]
+    roughness: Float[Array, ""] = number_field("roughness")
+    speed: Float[Array, ""] = number_field("speed")
+    tyre: Float[Array, ""] = number_field("tyre")
+    travel: Float[Array, ""] = number_field("travel")
+
+    def __check_init__(self):
+        require_positive(self, "roughness", "speed", "tyre", "travel")
 
     @staticmethod
     def around(car: QuarterCar, *, roughness, speed, tyre=1.1, travel=1.1) -> "RoadLimits":
@@ -43,8 +48,8 @@ class RoadLimits(eqx.Module):
             require(lambda value: 0.0 < value < np.inf, f"`{name}` must be positive, got {value}.", value)
         own = car.random_road(roughness=roughness, speed=speed)
         limits = {name: factor * getattr(own, name) for name, factor in factors.items()}
-        number = ISO_8608[roughness] if isinstance(roughness, str) else roughness
-        return RoadLimits(as_float(number, (), "`roughness`"), as_float(speed, (), "`speed`"), **limits)
+        number = as_float(ISO_8608[roughness] if isinstance(roughness, str) else roughness, (), "`roughness`")
+        return RoadLimits(roughness=number, speed=speed, **limits)
 
     def response(self, car: QuarterCar) -> RoadResponse:
         """What the road does to a car; the acceleration weighted by ISO 2631, Wk."""
