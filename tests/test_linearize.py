@@ -481,6 +481,16 @@ def test_random_road_in_closed_form(car):
     assert found["height"] == np.inf
 
 
+def test_random_road_in_other_coordinates(car):
+    """Also where the static response is one of them, and what an output sees of the others is round-off."""
+    rest = -np.linalg.solve(car.A, car.B)[:2]
+    turn = np.linalg.qr(np.hstack([rest, [[0.0], [1.0]]]))[0]
+    t = scipy.linalg.block_diag(turn, turn)
+    turned = dataclasses.replace(car, A=jnp.asarray(t.T @ car.A @ t), B=jnp.asarray(t.T @ car.B), C=car.C @ t)
+    found, expected = lg.random_road(turned, **ROAD), lg.random_road(car, **ROAD)
+    np.testing.assert_allclose([*found.values()], [*expected.values()], rtol=1e-10)
+
+
 def test_two_masses_over_random_roads(car):
     """In time; the slower mode, e^(−1.58 t), leaves 4e-4 of a variance after 2.5 s, and 2e-5 of it on the mean."""
     outputs = {name: f for name, f in SEEN.items() if name != "height"}  # which has no variance

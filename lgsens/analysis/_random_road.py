@@ -61,7 +61,8 @@ def _deviations(linear: Linearization, intensity, weightings: tuple[FrequencyWei
     for i, weighting in enumerate(weightings):
         if weighting is not None:
             square = square.at[i].set(_weighted(a, rest, c[i], intensity, weighting))
-    follows, size = (c @ rest + linear.D[:, 0]), jnp.abs(c) @ jnp.abs(rest) + jnp.abs(linear.D[:, 0])
+    follows = c @ rest + linear.D[:, 0]
+    size = jnp.linalg.norm(c, axis=1) * jnp.linalg.norm(rest) + jnp.abs(linear.D[:, 0])
     eps = jnp.finfo(a.dtype).eps
     infinite = (jnp.abs(follows) > jnp.sqrt(eps) * size) | (linear.D1[:, 0] != 0.0) | (linear.D2[:, 0] != 0.0)
     none = square <= 0.0
