@@ -224,7 +224,8 @@ class Outcome(NamedTuple):
             panel("suspension length\n[mm]", "spring_length", 1e3, **lengths),
             panel("tyre force\n[kN]", "tyre_force", 1e-3, **{"F_{min}": limits.minimum_tyre_force}),
         ]
-        title = f"Quarter-car over a bump: {self.search.change}"
+        where = "a bump" if self.problem.road is None else "a bump, designed for a random road"
+        title = f"Quarter-car over {where}: {self.search.change}"
         figures = {"response": plotting.time_histories(before.t, panels, title)}
         cars = {"before": self.problem.car}
         if self.curves is not None:  # k and c do not show
