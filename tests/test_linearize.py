@@ -12,6 +12,7 @@ import pytest
 import scipy.linalg
 from differences import central
 from helpers import says
+from random_roads import compared
 from scipy.integrate import quad
 
 import lgsens as lg
@@ -480,6 +481,22 @@ def test_random_road_in_closed_form(car):
     assert found["height"] == np.inf
 
 
+def test_random_road_in_other_coordinates(car):
+    """Also where the static response is one of them, and what an output sees of the others is round-off."""
+    rest = -np.linalg.solve(car.A, car.B)[:2]
+    turn = np.linalg.qr(np.hstack([rest, [[0.0], [1.0]]]))[0]
+    t = scipy.linalg.block_diag(turn, turn)
+    turned = dataclasses.replace(car, A=jnp.asarray(t.T @ car.A @ t), B=jnp.asarray(t.T @ car.B), C=car.C @ t)
+    found, expected = lg.random_road(turned, **ROAD), lg.random_road(car, **ROAD)
+    np.testing.assert_allclose([*found.values()], [*expected.values()], rtol=1e-10)
+
+
+def test_two_masses_over_random_roads(car):
+    """In time; the slower mode, e^(−1.58 t), leaves 4e-4 of a variance after 2.5 s, and 2e-5 of it on the mean."""
+    outputs = {name: f for name, f in SEEN.items() if name != "height"}  # which has no variance
+    compared(lg.examples.linear_quarter_car(**CAR), car, outputs, runs=64, t1=6.0, settled=2.5, h=0.01)
+
+
 def test_random_road_weighted_by_frequency(car):
     """By quadrature of the closed transfer function and of the weighting; the gradient by differences of that."""
     weighting = lg.FrequencyWeighting("Wk")
@@ -518,6 +535,10 @@ def test_what_is_refused(car):
         lg.linearize(model)
     with pytest.raises(ValueError, match=says("must have one input")):
         lg.random_road(dataclasses.replace(car, inputs=()), roughness=1e-6, speed=1.0)
+    with pytest.raises(ValueError, match=says("`roughness`: 'Z' is not one of ['A', 'B'", "classes of ISO 8608")):
+        lg.random_road(car, roughness="Z", speed=1.0)
+    with pytest.raises(ValueError, match=says("`speed` must be positive, got -1.0")):
+        lg.SampledRoad.random(jax.random.key(0), [0.0, 1.0], roughness="A", speed=-1.0)
     unstable = dataclasses.replace(car, eigenvalues=-car.eigenvalues)
     with pytest.raises(ValueError, match=says("`linear` must settle")):
         lg.random_road(unstable, roughness=1e-6, speed=1.0)

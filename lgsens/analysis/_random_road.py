@@ -1,11 +1,7 @@
 """The stationary response to a random road, by the Lyapunov equation of the linearized car.
 
-The height z of an ISO 8608 road has the power spectral density G_d(n) = G_d(n_0) (n/n_0)⁻² over wave numbers n, so that
-at the speed V its rate ż is white noise, one-sided in Hz and as E[ż(t) ż(t + τ)] = S δ(τ)
-
-    G_ż = (2π n_0)² G_d(n_0) V = 2 S.
-
-z itself has no variance. With the static response y_s, A y_s + B = 0, and y = ỹ + y_s z, of ẏ = A y + B z remains
+The rate ż of an ISO 8608 road is white noise, E[ż(t) ż(t + τ)] = S δ(τ) (`lgsens/model/_roads.py`), and z itself has no
+variance. With the static response y_s, A y_s + B = 0, and y = ỹ + y_s z, of ẏ = A y + B z remains
 
     ỹ' = A ỹ − y_s ż,     A P + P Aᵀ + S y_s y_sᵀ = 0,     P = E[ỹ ỹᵀ],     E[f²] = C P Cᵀ
 
@@ -29,10 +25,11 @@ import jax.scipy.linalg as jsl
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float, require
+from lgsens._validate import require
 from lgsens.analysis._linearize import Linearization
 from lgsens.analysis._weighting import FrequencyWeighting
 from lgsens.linear import LinearEquations, linear_solve
+from lgsens.model import rate_intensity
 
 _LYAPUNOV = LinearEquations(
     lambda a, p: a @ p + p @ a.T,
@@ -64,7 +61,8 @@ def _deviations(linear: Linearization, intensity, weightings: tuple[FrequencyWei
     for i, weighting in enumerate(weightings):
         if weighting is not None:
             square = square.at[i].set(_weighted(a, rest, c[i], intensity, weighting))
-    follows, size = (c @ rest + linear.D[:, 0]), jnp.abs(c) @ jnp.abs(rest) + jnp.abs(linear.D[:, 0])
+    follows = c @ rest + linear.D[:, 0]
+    size = jnp.linalg.norm(c, axis=1) * jnp.linalg.norm(rest) + jnp.abs(linear.D[:, 0])
     eps = jnp.finfo(a.dtype).eps
     infinite = (jnp.abs(follows) > jnp.sqrt(eps) * size) | (linear.D1[:, 0] != 0.0) | (linear.D2[:, 0] != 0.0)
     none = square <= 0.0
@@ -87,15 +85,16 @@ def random_road(
 
     Arguments:
         linear: the car, `linearize(model, inputs=("tyre",), outputs=…)`: its one input is the road's height.
-        roughness: G_d(n_0) [m³], shape (): 16e-6, 64e-6, 256e-6 for roads of class A, B, C.
-        speed: V [m/s], shape ().
-        wave_number: n_0 [cycles/m], shape ().
+        roughness: G_d(n_0) [m³], shape (), positive, or the class of the road, "A" to "H".
+        speed: V [m/s], shape (), positive.
+        wave_number: n_0 [cycles/m], shape (), positive.
         weighting: how outputs are weighted by frequency, by their names: `{"acceleration": FrequencyWeighting("Wk")}`.
 
     Returns by the name of the output its standard deviation (RMS about the equilibrium), shape (), in its unit; inf for
     one that follows the road, as a height does, or sees its rate. Differentiable, by the adjoint Lyapunov equation.
-    Raises `ValueError` for another number of inputs, and a car that does not settle (a wheel that turns freely: lock
-    it); inside `jit` that is NaN. Source: `_random_road`.
+    Raises `ValueError` for another number of inputs, another class, numbers that are not positive, and a car that does
+    not settle (a wheel that turns freely: lock it); inside `jit` that is NaN. `SampledRoad.random` is a road to run
+    over. Source: `_random_road`.
     """
     if len(linear.inputs) != 1:
         raise ValueError(f"`linear` must have one input, the road, got {linear.inputs}.")
@@ -106,14 +105,12 @@ def random_road(
                 f"`weighting` must give outputs of `linear`, {', '.join(linear.outputs)}, a FrequencyWeighting each; "
                 f"got {name!r}: {own!r}."
             )
-    numbers = {"roughness": roughness, "speed": speed, "wave_number": wave_number}
-    roughness, speed, wave_number = (as_float(value, (), f"`{name}`") for name, value in numbers.items())
+    intensity = rate_intensity(roughness, speed, wave_number)
     require(
         lambda values: np.max(values.real) < 0.0,
         "`linear` must settle, all eigenvalues with Re λ < 0, and has one that does not. Lock what turns freely (a "
         "wheel on its hinge), hold what floats.",
         linear.eigenvalues,
     )
-    intensity = (2.0 * jnp.pi * wave_number) ** 2 * roughness * speed / 2.0
     weightings = tuple(weighting.get(name) for name in linear.outputs)
     return dict(zip(linear.outputs, _deviations(linear, intensity, weightings)))

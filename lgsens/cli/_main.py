@@ -18,6 +18,7 @@ from lgsens._xla import compilation_cache
 from lgsens.cli import _curves, _doctor, _import, _kc, _optimize, _paper, _top, _tradeoff
 from lgsens.cli._report import INTERRUPTED, UNFINISHED, interrupted, version
 from lgsens.examples import DEFAULT, PARAMETERS, shipped
+from lgsens.model import ISO_8608
 from lgsens.simulation import SimulationError
 
 BAD_INPUT = 2
@@ -91,8 +92,8 @@ def _parser() -> argparse.ArgumentParser:
     optimize = commands.add_parser(
         "optimize",
         help="optimize a suspension",
-        description="Find the suspension whose chassis accelerates least over a bump, its tyre on the "
-        "road and its spring within its travel (Sonneville & Brüls 2014, §9).",
+        description="Find the suspension whose chassis accelerates least over a bump, or on a random road, its tyre on "
+        "the road and its spring within its travel (Sonneville & Brüls 2014, §9).",
     )
     optimize.set_defaults(run=_optimize.run)
     optimize.hardpoints()
@@ -114,6 +115,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     kept += "stays within a width of its start, or between LOWER:UPPER; as often as needed"
     optimize.add_argument("--keep", type=_named, action="append", metavar="NAME=WIDTH", help=kept)
+    road = (
+        "minimize the RMS acceleration, weighted by ISO 2631, on a random road of this class of ISO 8608, in place of"
+    )
+    road += " the integral over the bump, whose limits stay (default: the bump alone)"
+    optimize.add_argument("--road", choices=list(ISO_8608), help=road)
+    optimize.add_argument("--speed", type=_positive, metavar="V", help="on the random road [m/s] (default: 20)")
+    limit = "most RMS tyre load and wheel travel on the random road, over those at the start (default: 1.1 each)"
+    optimize.add_argument("--limit", type=_named, action="append", metavar="tyre|travel=FACTOR", help=limit)
     optimize.option("--t1", 2.0, "duration [s]", type=_positive)
     optimize.option("--dt", 2e-3, "step size [s]", type=_positive)
     optimize.option("--steps", 300, "most gradients that the optimizer takes", type=_count)

@@ -15,14 +15,15 @@ def run(arguments: argparse.Namespace) -> int:
         plotting.figure()  # asks for matplotlib now, not after minutes
         checkpoint = unfinished(out, "search.npz", arguments.resume)
         job = (AxleJob if arguments.vary else QuarterCarJob).of(arguments)
-        found = search(job.problem, job.criteria, job.scale, arguments.steps, checkpoint, progress=not arguments.quiet)
+        found = search(job, arguments.steps, checkpoint, progress=not arguments.quiet)
         settings = {name: value for name, value in vars(arguments).items() if name not in ("run", "command", "resume")}
         outcome = job.outcome(found)
         document = outcome.document() | search_document(found, settings)
         write_json(document, out / "result.json", indent=2, default=str)
         for name, figure in outcome.figures().items():
             plotting.save(figure, out / f"{name}.png")
-        marked = {"tolerance": TOLERANCE, "best": found.result.step, "objective": "$\\Psi_0$ [m²/s³]"}
+        objective = f"{found.goal.label} [{found.goal.shown}]"
+        marked = {"tolerance": TOLERANCE, "best": found.result.step, "objective": objective}
         plotting.save(plotting.convergence(found.result.history, **marked), out / "convergence.png")
         if found.result.reason != "interrupted":
             checkpoint.unlink()

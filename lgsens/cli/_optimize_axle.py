@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from lgsens import plotting
 from lgsens.cli._report import suspension_file
-from lgsens.cli._search import Search, band_row, closing_rows, point_row, run_length, stages, table_lines
+from lgsens.cli._search import BUMP, Goal, Search, band_row, closing_rows, point_row, run_length, stages, table_lines
 from lgsens.examples import Axle
 from lgsens.rigs import CHARACTERISTICS, AxleDesign
 
@@ -16,11 +16,10 @@ DEGREE = float(np.degrees(1.0))
 
 
 class Response(NamedTuple):
-    """What is said of a design: the run over the bump, Ψ₀ [m²/s³], and by name what is kept, SI units."""
+    """What is said of a design: the run over the bump, and by name what is kept, SI units."""
 
     t: Float[Array, " n"]
     acceleration: Float[Array, " n"]
-    objective: Float[Array, ""]
     kept: dict[str, Float[Array, " m"]]
 
 
@@ -28,10 +27,14 @@ class AxleJob(NamedTuple):
     """The problem."""
 
     problem: AxleDesign
+    goal: Goal = BUMP
 
     @staticmethod
     def of(arguments: argparse.Namespace) -> "AxleJob":
         """The problem that the arguments ask for."""
+        for name in ("road", "speed", "limit"):
+            if getattr(arguments, name):
+                raise ValueError(f"--{name} is of a corner; an axle, with --vary, is designed over the bump alone")
         for name in ("camber", "toe"):
             if getattr(arguments, f"keep_{name}"):
                 raise ValueError(f"--keep-{name} is of a corner; of an axle, with --vary, it is --keep {name}=DEG")
@@ -40,10 +43,10 @@ class AxleJob(NamedTuple):
         return AxleJob(AxleDesign.of(Axle.load(suspension_file(arguments)), dict(arguments.vary), keep, **settings))
 
     def criteria(self, x):
-        """The response of a design, and the result of its simulation."""
+        """Ψ₀ of a design, its response, and the result of its simulation."""
         run = self.problem.bump(x, throw=False)
         acceleration = run.body("chassis").acceleration[:, 2]
-        return Response(run.t, acceleration, self.problem.objective(run), self.problem.outputs(x)), run.result
+        return self.problem.objective(run), Response(run.t, acceleration, self.problem.outputs(x)), run.result
 
     @property
     def scale(self) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """The quarter-car of `lgsens optimize`: the problem of the paper's §9, and what is said and drawn of it."""
 
 import argparse
+import dataclasses
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,17 +9,28 @@ import numpy as np
 from lgsens import plotting
 from lgsens.cli._report import suspension_file
 from lgsens.cli._search import (
+    BUMP,
+    Goal,
     Search,
     band_row,
     closing_rows,
     constraint_row,
+    objective_row,
     point_row,
     run_length,
     stages,
     table_lines,
     worst,
 )
-from lgsens.examples import CurveBounds, QuarterCar, SuspensionCurves, SuspensionDesign
+from lgsens.examples import (
+    CurveBounds,
+    QuarterCar,
+    Response,
+    RoadLimits,
+    RoadResponse,
+    SuspensionCurves,
+    SuspensionDesign,
+)
 
 CURVE_POINTS = 41  # of the figure
 # Name, quantity of the Response, limit of the DesignLimits, unit; in the order of `Response.constraints`.
@@ -27,7 +39,36 @@ CONSTRAINTS = (
     ("minimum spring length", "spring_length", "minimum_spring_length", "m"),
     ("maximum spring length", "spring_length", "maximum_spring_length", "m"),
 )
+# Name, quantity of RoadResponse and of RoadLimits, unit; in the order of `RoadLimits.constraints`.
+ROAD_CONSTRAINTS = (("RMS tyre load on the road", "tyre", "N"), ("RMS wheel travel on the road", "travel", "m"))
+ROAD = Goal(
+    "sigma_w, RMS of the vertical acceleration of the chassis on the random road, weighted by ISO 2631, Wk",
+    *("m/s^2", "$\\sigma_w$", "m/s²"),
+)
+SPEED, FACTOR = 20.0, 1.1  # m/s, and of what the start does
 UNITS = {"stiffness": "N/m", "damping": "N s/m", "hardpoints": "m"}
+
+
+class Responses(NamedTuple):
+    """What is said of a design: over the bump, and on the random road."""
+
+    bump: Response
+    road: RoadResponse | None
+
+
+def road_limits(arguments: argparse.Namespace, car: QuarterCar) -> RoadLimits | None:
+    """The random road that the arguments ask for."""
+    limits = dict(arguments.limit or ())
+    if arguments.road is None:
+        given = [f"--{name}" for name in ("speed", "limit") if getattr(arguments, name)]
+        if given:
+            raise ValueError(f"{' and '.join(given)} is of a random road; give its class as well, --road C")
+        return None
+    for name, factor in limits.items():
+        if name not in ("tyre", "travel") or isinstance(factor, tuple) or factor <= 0:
+            raise ValueError(f"--limit must be tyre=FACTOR or travel=FACTOR, positive, got {name}={factor}")
+    factors = {"tyre": FACTOR, "travel": FACTOR} | limits
+    return RoadLimits.around(car, roughness=arguments.road, speed=arguments.speed or SPEED, **factors)
 
 
 class QuarterCarJob(NamedTuple):
@@ -46,14 +87,25 @@ class QuarterCarJob(NamedTuple):
         if kept and "hardpoints" not in arguments.parameters:
             names = " and ".join(f"--keep-{name}" for name in kept)
             raise ValueError(f"{names} is about hardpoints, which --parameters {arguments.parameters} does not move")
-        keep = CurveBounds.around(QuarterCar.load(path), travel=arguments.travel, **kept) if kept else None
         settings = {"parameters": arguments.parameters, "wheel": arguments.wheel} | run_length(arguments)
-        return QuarterCarJob(SuspensionDesign.load(path, keep=keep, **settings), arguments.travel)
+        design = SuspensionDesign.load(path, **settings)
+        keep = CurveBounds.around(design.car, travel=arguments.travel, **kept) if kept else None
+        road = road_limits(arguments, design.car)
+        return QuarterCarJob(dataclasses.replace(design, keep=keep, road=road), arguments.travel)
+
+    @property
+    def goal(self) -> Goal:
+        """What is minimized."""
+        return BUMP if self.problem.road is None else ROAD
 
     def criteria(self, x):
-        """The response of a design, and the result of its simulation."""
-        trajectory = self.problem.simulate(x, throw=False)
-        return self.problem.response(trajectory), trajectory.result
+        """The objective of a design, its response, and the result of its simulation."""
+        trajectory, road = self.problem.simulate(x, throw=False), self.problem.road
+        bump = self.problem.response(trajectory)
+        if road is None:
+            return bump.objective, Responses(bump, None), trajectory.result
+        on_road = road.response(self.problem.with_design(x))
+        return on_road.acceleration, Responses(bump, on_road), trajectory.result
 
     @property
     def scale(self) -> dict[str, Any]:
@@ -92,7 +144,8 @@ class Outcome(NamedTuple):
                 name: {"unit": UNITS[name]} | {label: self._values(name, x[name]) for label, x in stages(self.search)}
                 for name in self.problem.start
             },
-            "constraints": self._path_constraints() + self.kept_curves(),
+            "constraints": self._path_constraints() + self.kept_curves() + self._road_constraints(),
+            "road": self._road(),
             "curves": self.curves
             and {
                 label: {member: np.asarray(values).tolist() for member, values in curves._asdict().items()}
@@ -110,11 +163,40 @@ class Outcome(NamedTuple):
         rows = []
         for i, (name, quantity, limit, unit) in enumerate(CONSTRAINTS):
             ends = {
-                label: worst(getattr(response, quantity), response.constraints[:, i], time=response.t)
-                for label, response in (("before", self.search.before), ("after", self.search.after))
+                label: worst(getattr(run.bump, quantity), run.bump.constraints[:, i], time=run.bump.t)
+                for label, run in self._ends.items()
             }
             rows.append(constraint_row(name, unit, float(getattr(self.problem.limits, limit)), ends))
         return rows
+
+    @property
+    def _ends(self) -> dict[str, Responses]:
+        return {"before": self.search.before, "after": self.search.after}
+
+    def _road_constraints(self) -> list[dict[str, Any]]:
+        """Tyre load and travel on the random road, before and after."""
+        road = self.problem.road
+        if road is None:
+            return []
+        rows, runs = [], {label: run.road for label, run in self._ends.items() if run.road is not None}
+        for i, (name, quantity, unit) in enumerate(ROAD_CONSTRAINTS):
+            ends = {
+                label: worst([getattr(run, quantity)], road.constraints(run)[i : i + 1]) for label, run in runs.items()
+            }
+            rows.append(constraint_row(name, unit, float(getattr(road, quantity)), ends))
+        return rows
+
+    def _road(self) -> dict[str, Any] | None:
+        """The random road, and next to the objective Ψ₀ over the bump."""
+        road = self.problem.road
+        if road is None:
+            return None
+        bump = {label: float(run.bump.objective) for label, run in self._ends.items()}
+        return {
+            "roughness": float(road.roughness),
+            "speed": float(road.speed),
+            "bump": {"name": BUMP.name, "unit": BUMP.unit} | bump,
+        }
 
     def kept_curves(self) -> list[dict[str, Any]]:
         """How far each curve that is kept strays from its band's middle, before and after, at worst."""
@@ -129,7 +211,7 @@ class Outcome(NamedTuple):
 
     def figures(self) -> dict[str, Any]:
         """Responses, curves and mechanism."""
-        before, after, limits = self.search.before, self.search.after, self.problem.limits
+        before, after, limits = self.search.before.bump, self.search.after.bump, self.problem.limits
 
         def panel(label: str, member: str, factor: float, **limit) -> plotting.Panel:
             series = {"before": factor * getattr(before, member), "after": factor * getattr(after, member)}
@@ -142,7 +224,8 @@ class Outcome(NamedTuple):
             panel("suspension length\n[mm]", "spring_length", 1e3, **lengths),
             panel("tyre force\n[kN]", "tyre_force", 1e-3, **{"F_{min}": limits.minimum_tyre_force}),
         ]
-        title = f"Quarter-car over a bump: {self.search.change}"
+        where = "a bump" if self.problem.road is None else "a bump, designed for a random road"
+        title = f"Quarter-car over {where}: {self.search.change}"
         figures = {"response": plotting.time_histories(before.t, panels, title)}
         cars = {"before": self.problem.car}
         if self.curves is not None:  # k and c do not show
@@ -168,6 +251,8 @@ class Outcome(NamedTuple):
                     ends = (1e3 * row[label][link][i] for label in ("before", "after", "lower", "upper"))
                     rows.append(point_row(f"{link} {axis}", *ends))
         rows += closing_rows(found)
+        if found["road"]:
+            rows.append(objective_row(found["road"]["bump"], "over the bump"))
         kept = [row["name"] for row in found["constraints"]]
         for name in ("camber", "toe"):
             if found["curves"] and f"change of {name}" not in kept:

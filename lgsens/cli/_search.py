@@ -1,7 +1,7 @@
 """What is common to all that `lgsens optimize` takes: search, gradients against differences, and what is said."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,12 +20,26 @@ SHOWN = {"m": (1e3, "mm"), "rad": (float(np.degrees(1.0)), "deg")}
 CHECK_STEP = 3e-5  # accelerations carry the round-off of positions over βh², too much for a smaller step
 
 
-class Search(NamedTuple):
-    """A search and its two ends; `before` and `after` are responses, of NumPy arrays, with a member `objective`."""
+class Goal(NamedTuple):
+    """What is minimized: its symbol and what it is, its unit, and both for figures."""
 
+    name: str
+    unit: str
+    label: str
+    shown: str
+
+
+BUMP = Goal("Psi_0, integral of the squared vertical acceleration of the chassis", "m^2/s^3", "$\\Psi_0$", "m²/s³")
+
+
+class Search(NamedTuple):
+    """A search for less of a goal, and its two ends; `before` and `after` are responses, of NumPy arrays."""
+
+    goal: Goal
     start: dict[str, Any]
     bounds: tuple[dict[str, Any], dict[str, Any]]
     result: OptimizationResult
+    objective: float  # at the start
     before: Any
     after: Any
     checks: dict[str, GradientCheck]
@@ -34,8 +48,8 @@ class Search(NamedTuple):
     @property
     def change(self) -> str:
         """Of the objective, for a title."""
-        before, after = float(self.before.objective), self.result.objective
-        return f"$\\Psi_0$ from {before:.3f} to {after:.3f} m²/s³ (−{100 * (1 - after / before):.0f} %)"
+        before, after, goal = self.objective, self.result.objective, self.goal
+        return f"{goal.label} from {before:.3f} to {after:.3f} {goal.shown} (−{100 * (1 - after / before):.0f} %)"
 
 
 def run_length(arguments: Any) -> dict[str, Any]:
@@ -52,23 +66,22 @@ def stages(found: Search) -> Iterator[tuple[str, dict[str, Any]]]:
     return zip(("before", "after", "lower", "upper"), (found.start, found.result.x, *found.bounds))
 
 
-def search(
-    problem: Any, criteria: Callable, scale: dict[str, Any], steps: int, checkpoint: Path, progress: bool
-) -> Search:
+def search(job: Any, steps: int, checkpoint: Path, progress: bool) -> Search:
     """The start design, the search, the best design, and the gradients at both against differences.
 
     Arguments:
-        problem: for `minimize`, with `start` and `bounds`, and `log_scale` if it likes.
-        criteria: design ↦ its response, which has an `objective`, and the result of its simulation.
-        scale: what is a large change of the design.
+        job: has `problem` for `minimize`, with `start` and `bounds`, and `log_scale` if it likes; `goal`; `scale`, a
+            large change of the design; and `criteria`, design ↦ objective, response and result of its simulation.
         steps: most gradients of the search.
         checkpoint: the file from which it goes on.
         progress: whether it says what it does.
     """
 
+    problem = job.problem
+
     def objective(x):
-        response, result = criteria(x)
-        return response.objective, (response, result)
+        value, *response = job.criteria(x)
+        return value, response
 
     started = time.perf_counter()
     with compiling("the gradient", progress):
@@ -79,16 +92,15 @@ def search(
         (value, _), gradient = evaluate(x)
         return value, gradient
 
-    def respond(x) -> tuple[Any, GradientCheck]:
-        (_, (response, result)), _ = evaluate(x)
+    def respond(x) -> tuple[float, Any, GradientCheck]:
+        (value, (response, result)), _ = evaluate(x)
         if int(result) != RESULTS.successful:
             raise ValueError(f"the suspension cannot be simulated: {RESULTS(int(result)).message}")
         checked = {"step": CHECK_STEP, "max_directions": CHECKED_DIRECTIONS, "value_and_grad": objective_and_gradient}
-        return jax.tree.map(np.asarray, response), check_gradient(
-            lambda x: evaluate(x)[0][0], x, scale=scale, **checked
-        )
+        check = check_gradient(lambda x: evaluate(x)[0][0], x, scale=job.scale, **checked)
+        return float(value), jax.tree.map(np.asarray, response), check
 
-    before, check_before = respond(problem.start)
+    at_start, before, check_before = respond(problem.start)
     lower, upper = problem.bounds
     settings = {"log_scale": getattr(problem, "log_scale", False), "constraint_tolerance": TOLERANCE}
     result = minimize(
@@ -101,7 +113,7 @@ def search(
         checkpoint=checkpoint,
         **settings,
     )
-    after, check_after = respond(result.x)
+    _, after, check_after = respond(result.x)
     seconds = {
         "compilation": compiled - started + result.compile_seconds,
         "optimization": result.run_seconds,
@@ -109,16 +121,16 @@ def search(
         "total": time.perf_counter() - started,
     }
     checks = {"start": check_before, "optimum": check_after}
-    return Search(problem.start, (lower, upper), result, before, after, checks, seconds)
+    return Search(job.goal, problem.start, (lower, upper), result, at_start, before, after, checks, seconds)
 
 
 def search_document(found: Search, settings: dict[str, Any]) -> dict[str, Any]:
     """What is said of every search, as JSON: SI units, finite numbers only."""
-    result, before = found.result, float(found.before.objective)
+    result, before, goal = found.result, found.objective, found.goal
     return {
         "objective": {
-            "name": "Psi_0, integral of the squared vertical acceleration of the chassis",
-            "unit": "m^2/s^3",
+            "name": goal.name,
+            "unit": goal.unit,
             "before": before,
             "after": result.objective,
             "reduction": 1 - result.objective / before,
@@ -127,7 +139,7 @@ def search_document(found: Search, settings: dict[str, Any]) -> dict[str, Any]:
         "feasible": result.feasible,
         "gradient_check": {
             where: {
-                "what": "dPsi_0 per change of the design by its scale: adjoint method and differences",
+                "what": f"d{_symbol(goal.name)} per change of the design by its scale: adjoint method and differences",
                 "directions": list(check.directions),
                 "gradient": check.exact.tolist(),
                 "central_differences": check.difference.tolist(),
@@ -149,6 +161,16 @@ def search_document(found: Search, settings: dict[str, Any]) -> dict[str, Any]:
         "seconds": found.seconds,
         "versions": versions("optax"),
     }
+
+
+def _symbol(name: str) -> str:
+    """Of a goal, for a table."""
+    return name.partition(",")[0]
+
+
+def objective_row(row: dict[str, Any], note: str) -> tuple[str, float, float, str, int]:
+    """An objective in a table."""
+    return f"{_symbol(row['name'])} [{row['unit']}]", row["before"], row["after"], note, 4
 
 
 def constraint_row(name: str, unit: str, limit: Any, stages: dict[str, dict[str, float]]) -> dict[str, Any]:
@@ -178,7 +200,7 @@ def closing_rows(found: dict[str, Any]) -> list[tuple[str, float, float, str, in
     """Of a document's table the objective and the constraints, in the units shown."""
     objective = found["objective"]
     change = f"{-100 * objective['reduction']:+.1f} %"
-    rows = [("Psi_0 [m^2/s^3]", objective["before"], objective["after"], change, 4)]
+    rows = [objective_row(objective, change)]
     for row in found["constraints"]:
         factor, unit = SHOWN.get(row["unit"], (1.0, row["unit"]))
         before, after = (factor * row[label]["worst_value"] for label in ("before", "after"))

@@ -19,13 +19,18 @@ from lgsens.examples._problems import (
     Problem as Problem,
     Reference as Reference,
 )
-from lgsens.examples._quarter_car import QuarterCar as QuarterCar, stiff_quarter_car as stiff_quarter_car
+from lgsens.examples._quarter_car import (
+    QuarterCar as QuarterCar,
+    RoadResponse as RoadResponse,
+    stiff_quarter_car as stiff_quarter_car,
+)
 from lgsens.examples._quarter_car_design import (
     PARAMETERS as PARAMETERS,
     DesignLimits as DesignLimits,
     Response as Response,
     SuspensionDesign as SuspensionDesign,
 )
+from lgsens.examples._road_limits import RoadLimits as RoadLimits
 from lgsens.examples._suspension_curves import (
     SuspensionCurves as SuspensionCurves,
     WheelPlane as WheelPlane,

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, suggestion
-from lgsens.analysis import Kinematics, kinematics
+from lgsens.analysis import FrequencyWeighting, Kinematics, kinematics, linearize, random_road
 from lgsens.examples._axle_parts import Mount, Stop
 from lgsens.examples._corner_scene import corner_scene
 from lgsens.examples._hardpoint_file import read
@@ -32,6 +32,20 @@ from lgsens.model import (
 
 GRAVITY = 9.81  # m/s²
 ALONG_Z: Any = (0.0, 0.0, 1.0)
+
+
+class RoadResponse(NamedTuple):
+    """A quarter-car on a random road: standard deviations (RMS about the equilibrium), shape () each.
+
+    Attributes:
+        acceleration: of the chassis, vertical [m/s²], weighted by frequency.
+        tyre: of the load of the tyre [N].
+        travel: of the centre of the wheel to the chassis, vertical [m].
+    """
+
+    acceleration: Float[Array, ""]
+    tyre: Float[Array, ""]
+    travel: Float[Array, ""]
 
 
 class QuarterCar(eqx.Module):
@@ -251,6 +265,32 @@ class QuarterCar(eqx.Module):
         """
         check_choice("axle", axle, ("rear", "front"))
         return suspension_curves(self.travel(travel, throw=throw), self.wheel.centre, rear=axle == "rear")
+
+    def random_road(self, *, roughness, speed, weighting: str | None = "Wk") -> RoadResponse:
+        """What a random road of ISO 8608 does to the car, by its linear equations about the design position.
+
+        Arguments:
+            roughness: G_d(0.1 cycles/m) [m³], shape (), positive, or the class of the road, "A" to "H".
+            speed: V [m/s], shape (), positive.
+            weighting: of the acceleration, by the name of a `FrequencyWeighting`; None: none.
+
+        The wheel is locked: one that turns freely does not settle. Differentiable by every number of the car, by the
+        adjoint Lyapunov equation. Raises `ValueError` as `lgsens.random_road`. Source: `lgsens.random_road`.
+        """
+        linear = linearize(self.model(wheel="locked", chassis="heave"), inputs=("tyre",), outputs=_ON_ROAD)
+        weighted = {} if weighting is None else {"acceleration": FrequencyWeighting(weighting)}
+        return RoadResponse(**random_road(linear, roughness=roughness, speed=speed, weighting=weighted))
+
+
+def _travel(instant) -> Float[Array, ""]:
+    return instant.body("wheel").position[2] - instant.body("chassis").position[2]
+
+
+_ON_ROAD = {
+    "acceleration": lambda instant: instant.body("chassis").acceleration[2],
+    "tyre": lambda instant: instant.force("tyre"),
+    "travel": _travel,
+}
 
 
 def stiff_quarter_car(car: QuarterCar, *, wheel: str = "locked", **settings: Any) -> Model:

@@ -12,6 +12,7 @@ from lgsens.criteria import time_integral
 from lgsens.examples._curve_bounds import CurveBounds
 from lgsens.examples._hardpoint_file import Reader, read
 from lgsens.examples._quarter_car import GRAVITY, QuarterCar
+from lgsens.examples._road_limits import RoadLimits
 from lgsens.simulation import Trajectory, simulate
 
 # What the user may ask for, and the members of the design that it frees.
@@ -91,8 +92,9 @@ class SuspensionDesign(eqx.Module):
         Ψ₂(t) = l_min − l(t) ≤ 0   over l_max − l_min          (49)
         Ψ₃(t) = l(t) − l_max ≤ 0   over l_max − l_min          (50)
 
-    at every time step; and, with `keep`, camber and toe within bands over the travel of the wheel. The design is a
-    dict: `stiffness` k [N/m] and `damping` c [N s/m] of shape (), `hardpoints` [m] of shape (n, 3), those of
+    at every time step; with `keep`, camber and toe within bands over the travel of the wheel. With `road` the objective
+    is the weighted RMS of v̇_z on that random road in place of Ψ₀, under its limits and those over the bump. The design
+    is a dict: `stiffness` k [N/m] and `damping` c [N s/m] of shape (), `hardpoints` [m] of shape (n, 3), those of
     `QuarterCar.hardpoints`, or all three. Whatever the design, the preloads of spring and tyre are
     those that hold the car at rest at the design position.
 
@@ -103,6 +105,7 @@ class SuspensionDesign(eqx.Module):
         wheel: "hinged" or "locked".
         t1: duration [s]. num_steps: its number of steps, static.
         keep: bands for the curves of the suspension, `CurveBounds`; None: the curves may change.
+        road: a random road and its limits, `RoadLimits`, on which the wheel is locked; None: the bump alone.
 
     The limits that ship with lgsens, and why:
       - the start (k = 109 kN/m, c = 4.9 kN s/m, as in the source) is a firm production set-up: motion ratios
@@ -128,6 +131,7 @@ class SuspensionDesign(eqx.Module):
     t1: float = eqx.field(static=True, default=2.0)
     num_steps: int = eqx.field(static=True, default=1000)
     keep: CurveBounds | None = None
+    road: RoadLimits | None = None
 
     def __check_init__(self):
         if self.parameters not in PARAMETERS:
@@ -139,7 +143,7 @@ class SuspensionDesign(eqx.Module):
 
         Arguments:
             path: the TOML file.
-            settings: `parameters`, `wheel`, `t1`, `num_steps`, `keep` as above.
+            settings: `parameters`, `wheel`, `t1`, `num_steps`, `keep`, `road` as above.
 
         Raises `ValueError` naming the file and the key for a file that cannot be read, is incomplete, or
         starts outside its own bounds.
@@ -199,14 +203,17 @@ class SuspensionDesign(eqx.Module):
         return Response(trajectory.t, acceleration, length, force, objective, jnp.stack(constraints, axis=1))
 
     def __call__(self, design: dict[str, Array]) -> tuple[Float[Array, ""], Float[Array, " m"]]:
-        """Ψ₀ [m²/s³] and the scaled constraints in a row, those of the path and of the curves.
+        """Ψ₀ [m²/s³], or the RMS on the road [m/s²], and the scaled constraints in a row: of path, curves and road.
 
         As `lgsens.optimize.minimize` wants them: a step that does not converge makes them NaN from there on, which
         `minimize` steps back from.
         """
         response = self.response(self.simulate(design, throw=False))
-        constraints = response.constraints.ravel()
+        objective, constraints = response.objective, [response.constraints.ravel()]
         if self.keep is not None:
-            kept = self.keep.constraints(self.keep.curves(self.with_design(design)))
-            constraints = jnp.concatenate([constraints, kept])
-        return response.objective, constraints
+            constraints.append(self.keep.constraints(self.keep.curves(self.with_design(design))))
+        if self.road is not None:
+            on_road = self.road.response(self.with_design(design))
+            objective = on_road.acceleration
+            constraints.append(self.road.constraints(on_road))
+        return objective, jnp.concatenate(constraints)

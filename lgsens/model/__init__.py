@@ -91,7 +91,13 @@ from lgsens.model._relative import (
     continued as continued,
     relative_motion as relative_motion,
 )
-from lgsens.model._roads import BumpRoad as BumpRoad, FlatRoad as FlatRoad, SampledRoad as SampledRoad
+from lgsens.model._roads import (
+    ISO_8608 as ISO_8608,
+    BumpRoad as BumpRoad,
+    FlatRoad as FlatRoad,
+    SampledRoad as SampledRoad,
+    rate_intensity as rate_intensity,
+)
 from lgsens.model._rolling import Rolling as Rolling
 from lgsens.model._screws import RackAndPinionJoint as RackAndPinionJoint, ScrewJoint as ScrewJoint
 from lgsens.model._shafts import ConstantVelocityJoint as ConstantVelocityJoint, GearJoint as GearJoint

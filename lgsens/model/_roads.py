@@ -1,10 +1,43 @@
-"""Road profiles, signals of time."""
+"""Road profiles, signals of time.
 
+Random roads. The height z of an ISO 8608 road has the power spectral density G_d(n) = G_d(n_0) (n/n_0)⁻² over wave
+numbers n. Passed at the speed V, f = V n, its rate has (2πf)² G_d(f/V)/V, the same at every frequency f: white noise,
+one-sided in Hz and as E[ż(t) ż(t + τ)] = S δ(τ)
+
+    G_ż = (2π n_0)² G_d(n_0) V = 2 S.
+
+z itself has no variance: over time steps Δt it grows by independent normal numbers of variance S Δt. Samples made so
+are exact, and what lies between them has a rate with the spectral density S sinc²(f Δt).
+
+Source: ISO 8608:2016; of the classes of its annex C, the geometric means of their roughness.
+"""
+
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
-from lgsens._validate import number_field, require
+from lgsens._validate import as_float, number_field, require, suggestion
 from lgsens.model._signals import AbstractSignal, samples
+
+# G_d(n_0) [m³] at n_0 = 0.1 cycles/m of each class of roads.
+ISO_8608 = {name: 16e-6 * 4.0**i for i, name in enumerate("ABCDEFGH")}
+
+
+def rate_intensity(roughness, speed, wave_number) -> Float[Array, ""]:
+    """S = (2π n_0)² G_d(n_0) V/2 [m²/s] of the rate of a random road.
+
+    Raises `ValueError` for a class that is not one of ISO 8608, and numbers of another shape or not positive.
+    """
+    if isinstance(roughness, str):
+        if roughness not in ISO_8608:
+            raise ValueError(f"`roughness`: {suggestion(roughness, ISO_8608)}, the classes of ISO 8608.")
+        roughness = ISO_8608[roughness]
+    given = {"roughness": roughness, "speed": speed, "wave_number": wave_number}
+    numbers = {name: as_float(value, (), f"`{name}`") for name, value in given.items()}
+    for name, value in numbers.items():
+        require(lambda value: 0.0 < value < jnp.inf, f"`{name}` must be positive, got {value}.", value)
+    roughness, speed, wave_number = numbers.values()
+    return (2.0 * jnp.pi * wave_number) ** 2 * roughness * speed / 2.0
 
 
 class FlatRoad(AbstractSignal):
@@ -65,6 +98,29 @@ class SampledRoad(AbstractSignal):
 
     def __init__(self, times, heights):
         self.times, self.heights = samples(times, heights, "SampledRoad", "heights")
+
+    @staticmethod
+    def random(key: Key[Array, ""], times, *, roughness, speed, wave_number=0.1) -> "SampledRoad":
+        """A random road of ISO 8608, passed at constant speed: z = 0 at the first of the times.
+
+            z(t_{i+1}) = z(t_i) + √(S (t_{i+1} − t_i)) ξ_i,     S = (2π n_0)² G_d(n_0) V/2,     ξ_i normal
+
+        Arguments:
+            key: of the random numbers, `jax.random.key(0)`; another key, another road.
+            times: sample times [s], shape (n,), increasing: those of the time steps, as what is between is straight.
+            roughness: G_d(n_0) [m³], shape (), positive, or the class of the road, "A" to "H".
+            speed: V [m/s], shape (), positive.
+            wave_number: n_0 [cycles/m], shape (), positive.
+
+        `lgsens.random_road` has the deviations of a linear car on it. A road without bounds of its wave numbers: it
+        wanders off by √(S t), with all of what stands on it. Raises `ValueError` for times that do not increase, other
+        classes, and numbers that are not positive. Source: ISO 8608:2016; `lgsens/model/_roads.py`.
+        """
+        times = as_float(times, None, "SampledRoad: `times`")
+        start = SampledRoad(times, jnp.zeros_like(times))
+        intensity = rate_intensity(roughness, speed, wave_number)
+        growth = jnp.sqrt(intensity * jnp.diff(times)) * jax.random.normal(key, (times.size - 1,), times.dtype)
+        return SampledRoad(times, start.heights.at[1:].set(jnp.cumsum(growth)))
 
     def __call__(self, t):
         return jnp.interp(t, self.times, self.heights)
