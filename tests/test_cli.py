@@ -56,6 +56,18 @@ def test_the_optimum_is_better_feasible_and_constrained(optimized):
 
 
 @pytest.mark.slow
+def test_steps_for_an_accuracy(tmp_path, capsys):
+    arguments = ["--accuracy", "1e-2", "--steps", "2", "--out", tmp_path / "out"]
+    _, _, err = run(capsys, "optimize", "quarter-car", *arguments)
+    assert "Psi_0 and its gradient at the start: error" in err
+    result = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
+    found = result["settings"]
+    assert found["error"] <= 1e-2
+    assert f"in {round(2.0 / found['dt'])} steps" in err
+    assert abs(result["objective"]["before"] / 7.697902 - 1.0) <= 1e-2  # what was asked for, of the value for h → 0
+
+
+@pytest.mark.slow
 def test_the_report_is_complete(optimized):
     _, out, result = optimized
     assert sorted(path.name for path in out.iterdir()) == [
@@ -163,6 +175,7 @@ def test_a_bad_hardpoint_file_is_named_with_its_key_or_line(text, message, tmp_p
         (["--t1", "nan"], "argument --t1: must be positive"),
         (["--dt", "0.3"], "--t1 must be a whole number of steps --dt, got t1 = 2.0 s and dt = 0.3 s"),
         (["--dt", "5"], "--t1 must be a whole number of steps --dt"),
+        (["--accuracy", "2"], "`accuracy` must be a number between 0 and 1, got 2.0"),
         (["--parameters", "mass"], "argument --parameters: invalid choice: 'mass'"),
         (["--wheel", "square"], "argument --wheel: invalid choice: 'square'"),
     ],

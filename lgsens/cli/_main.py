@@ -125,6 +125,9 @@ def _parser() -> argparse.ArgumentParser:
     optimize.add_argument("--limit", type=_named, action="append", metavar="tyre|travel=FACTOR", help=limit)
     optimize.option("--t1", 2.0, "duration [s]", type=_positive)
     optimize.option("--dt", 2e-3, "step size [s]", type=_positive)
+    reached = "in place of --dt: as many steps as Psi_0 over the bump and its gradient at the start take to have this "
+    reached += "relative error"
+    optimize.add_argument("--accuracy", type=_positive, metavar="ERROR", help=reached)
     optimize.option("--steps", 300, "most gradients that the optimizer takes", type=_count)
     optimize.option("--wheel", "hinged", "whether the wheel turns on its hinge", choices=["hinged", "locked"])
     for angle in ("camber", "toe"):

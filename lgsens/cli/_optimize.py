@@ -6,7 +6,7 @@ from lgsens import plotting
 from lgsens.cli._optimize_axle import AxleJob
 from lgsens.cli._optimize_quarter_car import QuarterCarJob
 from lgsens.cli._report import interrupted, output_folder, unfinished, write_json, written
-from lgsens.cli._search import TOLERANCE, search, search_document
+from lgsens.cli._search import TOLERANCE, at_accuracy, search, search_document
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -15,8 +15,11 @@ def run(arguments: argparse.Namespace) -> int:
         plotting.figure()  # asks for matplotlib now, not after minutes
         checkpoint = unfinished(out, "search.npz", arguments.resume)
         job = (AxleJob if arguments.vary else QuarterCarJob).of(arguments)
-        found = search(job, arguments.steps, checkpoint, progress=not arguments.quiet)
         settings = {name: value for name, value in vars(arguments).items() if name not in ("run", "command", "resume")}
+        if arguments.accuracy is not None:
+            job, reached = at_accuracy(job, arguments.accuracy, progress=not arguments.quiet)
+            settings |= {"dt": arguments.t1 / reached.num_steps, "error": reached.error}
+        found = search(job, arguments.steps, checkpoint, progress=not arguments.quiet)
         outcome = job.outcome(found)
         document = outcome.document() | search_document(found, settings)
         write_json(document, out / "result.json", indent=2, default=str)

@@ -1,5 +1,7 @@
 """What is common to all that `lgsens optimize` takes: search, gradients against differences, and what is said."""
 
+import dataclasses
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,13 +12,18 @@ import numpy as np
 
 from lgsens._progress import compiling
 from lgsens.cli._report import versions
+from lgsens.criteria import Criterion, differentiate, differentiate_to
 from lgsens.dynamics import RESULTS
+from lgsens.integrate import GeneralizedAlpha
 from lgsens.optimize import GradientCheck, OptimizationResult, check_gradient, minimize
+from lgsens.simulation import Reached, check_accuracy
 
 TOLERANCE = 1e-3  # of the scale of a constraint
 CHECKED_DIRECTIONS = 4
 NAMES = 36  # columns of the table for them, at least
 SHOWN = {"m": (1e3, "mm"), "rad": (float(np.degrees(1.0)), "deg")}
+COMFORT = Criterion(integrand=lambda instant, x: instant.body("chassis").acceleration[2] ** 2)  # Ψ₀
+FEWEST = 62  # steps in a second: a bump of 0.1 s is six of them
 CHECK_STEP = 3e-5  # accelerations carry the round-off of positions over βh², too much for a smaller step
 
 
@@ -59,6 +66,19 @@ def run_length(arguments: Any) -> dict[str, Any]:
     if num_steps < 1 or abs(num_steps * dt / t1 - 1) > 1e-6:
         raise ValueError(f"--t1 must be a whole number of steps --dt, got t1 = {t1} s and dt = {dt} s")
     return {"t1": t1, "num_steps": num_steps}
+
+
+def at_accuracy(job: Any, accuracy: float, progress: bool) -> tuple[Any, Reached]:
+    """The job in as many steps as Ψ₀ over the bump and its gradient at the start take to have a relative error."""
+    problem, fewest = job.problem, max(1, round(FEWEST * float(job.problem.t1)))
+    order = check_accuracy(accuracy, fewest, GeneralizedAlpha(), problem.start)
+    at = {"t1": problem.t1}
+    run = lambda n, throw: differentiate(COMFORT, job.scene, problem.start, num_steps=n, throw=throw, **at)
+    with compiling("the gradient for the number of steps", progress):
+        reached = differentiate_to(run, accuracy, order, fewest, extrapolate=False).reached
+    if progress:
+        print(f"Psi_0 and its gradient at the start: {reached.brief}", file=sys.stderr, flush=True)
+    return job._replace(problem=dataclasses.replace(problem, num_steps=reached.num_steps)), reached
 
 
 def stages(found: Search) -> Iterator[tuple[str, dict[str, Any]]]:
