@@ -27,7 +27,7 @@ exactly; backwards JAX transposes it.
 Error of a step. The polynomials of x and v through the stages satisfy the equations at c_i h. At its begin the step
 knows ẋ = v_n and v̇_n, and the polynomials, ξ and w continued to there, miss them by
 
-    d = (v_n − Σ_i ℓ_i(0) ξ_i,  v̇_n − Σ_i ℓ_i(0) w_i) = h³/60 · (x⁗, v⁗) + …,      ℓ_i the Lagrange polynomials of c_i,
+    d = (v_n − Σ_i ℓ_i(0) ξ_i,  v̇_n − Σ_i ℓ_i(0) w_i) = −h³/60 · (x⁗, v⁗) + …,     ℓ_i the Lagrange polynomials of c_i,
 
 of which the defect within the step follows, d · (1 − 9 s + 18 s² − 10 s³) at t_n + s h, zero at all c_i. Its integral
 over the step is 0, and up to s = c_1, where it is largest, h d ∫ = ε h d with ε = c_1 − 9/2 c_1² + 6 c_1³ − 5/2 c_1⁴

@@ -46,6 +46,21 @@ def test_error_control():
     assert error(run) < 1e-5
 
 
+@pytest.mark.slow  # four programs
+def test_the_estimate_is_the_error_within_the_step():
+    """At the first stage, of one step that error control accepts as it is; against 20 steps of order 8 up to there."""
+    p, ratios = jnp.array(P), []
+    for h in (0.02, 0.005):
+        settings = {"t0": 0.2, "t1": 0.2 + h, "num_steps": 1}
+        integrator = lg.AdaptiveSteps(RADAU, tolerance=1.0, longest=1.0)
+        run = lg.simulate(make(p), integrator=integrator, **settings)
+        first = jax.tree.map(lambda leaf: leaf[0], run.stages)
+        explicit = lg.IndexReducedODE(diffrax.Dopri8())
+        true = lg.simulate(make(p), t0=0.2, t1=first.t, num_steps=20, integrator=explicit)
+        ratios.append(run.stats.error[0] / np.abs(first.states.q - true.states.q[-1]).max())
+    assert abs(ratios[1] - 1.0) < 0.1 and abs(ratios[1] - 1.0) < 0.5 * abs(ratios[0] - 1.0), ratios
+
+
 @pytest.mark.slow  # three programs
 def test_errors_follow_the_tolerance():
     """Over four decades: steps as its fourth to fifth root, errors as its power 1 to 5/4."""
