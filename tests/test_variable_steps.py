@@ -4,69 +4,20 @@ import functools
 import json
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from differences import central
+from driven_pendulum import P, make
 from helpers import says
-from jaxtyping import Array, Float
 
 import lgsens as lg
-from lgsens.dynamics import Tangents
 from lgsens.examples import PROBLEMS, spinning_top
-from lgsens.liegroups import Rn
 
 SCHEME = lg.GeneralizedAlpha(rho_inf=0.8)
 DATA = Path(__file__).parent / "data"
 CARS = [("quarter_car_linear", 1e-5, 250)]
-P = (1.3, 0.8, 40.0, 0.5)
-
-
-class Pendulum(lg.AbstractSystem):
-    """A mass point on a rod in the plane, Φ = (x² − l²)/2, on a spring to a point that moves: programs compile fast."""
-
-    mass: Float[Array, ""]
-    length: Float[Array, ""]
-    stiffness: Float[Array, ""]
-    damping: Float[Array, ""]
-    assembled: bool = eqx.field(static=True, default=True)
-
-    @property
-    def group(self):
-        return Rn(2)
-
-    @property
-    def constraint_names(self):
-        return ("rod",)
-
-    def reference(self):
-        return jnp.stack([self.length, jnp.zeros_like(self.length)]), jnp.array([0.0, 1.0])
-
-    def coordinate_scale(self):
-        return jnp.ones(2)
-
-    def mass_matrix(self):
-        return self.mass * jnp.eye(2)
-
-    def residual(self, q, v, vdot, lam, t):
-        away = q - jnp.stack([jnp.cos(3.0 * t), jnp.exp(-((5.0 * (t - 0.6)) ** 2))])
-        return self.mass * vdot + self.damping * v + self.stiffness * away + lam @ q[None]
-
-    def constraint(self, q, t):
-        return (q @ q - self.length**2)[None] / 2.0
-
-    def constraint_jacobian(self, q, t):
-        return q[None]
-
-    def tangents(self, q, v, vdot, lam, t):
-        eye = jnp.eye(2)
-        return Tangents((self.stiffness + lam[0]) * eye, self.damping * eye, q[None])
-
-
-def make(p):
-    return Pendulum(*p)
 
 
 def observed(trajectory):

@@ -13,32 +13,53 @@ for x, v, λ and μ, which vanishes with the error. Collocation at c_i h with th
 
 The last stage is the end of the step, q⁺ = q_3 and v⁺ = v_3, at which positions and velocities satisfy their
 constraints. Stage values of λ are of order 3 only; v̇⁺ and λ⁺ are those of the motion through (q⁺, v⁺), E = 0 of
-`equations_of_motion`, and of order 5 like it.
+`equations_of_motion`, and of order 5 like it. How the stages are solved: `_radau_newton`, `_radau_stages`.
 
-The stages are solved by Newton's iteration with the matrix of their equations, of 3 (2k + m + m_p) rows; what the
-sensitivities need follows from the equations (`AbstractScheme`): exact, and dense, for scenes that are not large.
+Linearization. With b the right-hand sides and E_p p' the loads of the rows of E, named like them, ℓ = b − E_p p', and
+F_n the variation of the stages' rows with (q_n, v_n),
 
-Sources: Hairer & Wanner, Solving Ordinary Differential Equations II (1996), §IV.5 (coefficients), §VII.4 (index 2:
-order 5 of the differential, 3 of the algebraic components); Gear, Gupta & Leimkuhler, J. Comput. Appl. Math. 12
-(1985) 77.
+    stages' = F⁻¹ (ℓ.inner − F_n (w_n, v'_n)),
+    w_{n+1} = Ad(exp(−x_3)) w_n + T(x_3) h Σ_j a_3j ξ'_j + ℓ.w,        v'_{n+1} = v'_n + h Σ_j a_3j w'_j + ℓ.v,
+    [[M, Jᵀ], [J, 0]] [v̇'; λ']_{n+1} = (ℓ.vdot, ℓ.lam) − E_q w_{n+1} − E_v v'_{n+1},        a' = v̇' + ℓ.a,
+
+exactly; backwards JAX transposes it.
+
+Error of a step. The polynomials of x and v through the stages satisfy the equations at c_i h. At its begin the step
+knows ẋ = v_n and v̇_n, and the polynomials, ξ and w continued to there, miss them by
+
+    d = (v_n − Σ_i ℓ_i(0) ξ_i,  v̇_n − Σ_i ℓ_i(0) w_i) = −h³/60 · (x⁗, v⁗) + …,     ℓ_i the Lagrange polynomials of c_i,
+
+of which the defect within the step follows, d · (1 − 9 s + 18 s² − 10 s³) at t_n + s h, zero at all c_i. Its integral
+over the step is 0, and up to s = c_1, where it is largest, h d ∫ = ε h d with ε = c_1 − 9/2 c_1² + 6 c_1³ − 5/2 c_1⁴
+= 0.068: so large is the error within a step, to leading order, O(h⁴). (Hairer's embedded formula of order 3 is the same
+difference with a factor of 0.27, the real eigenvalue of a.) At the end of the step that of order 5 is far smaller where
+the motion is smooth; where it is stiff, stages are what counts.
+
+Stiffness k magnifies in v̇_n by h² k/m what (q_n, v_n) are off the slow motion. So ε h d is taken as an error of
+(q_n, v_n) and carried through the step by its linearization, which multiplies it by R(hJ), of O(1/(hJ)) there, and
+projects it onto the constraints: e = w_{n+1} of (w_n, v'_n) = ε h d, at the price of one more solution with the factors
+at hand. Before the first step v‴ is unknown, and estimated from jerk: of a motion as large as the scene, s, |v̈| = s Ω³.
+
+Sources: Hairer & Wanner, Solving Ordinary Differential Equations II (1996), §IV.5 (coefficients), §IV.8 (embedded
+formula, filtered), §VII.4 (index 2: order 5 of the differential, 3 of the algebraic components); Gear, Gupta &
+Leimkuhler, J. Comput. Appl. Math. 12 (1985) 77; the estimate by the linearized step: here.
 """
 
 import dataclasses
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_count, require_setting
-from lgsens._xla import while_loop
 from lgsens.dynamics import (
+    AbstractSystem,
+    ConstrainedInertia,
     Inertia,
     State,
-    constraint_velocity,
     equations_of_motion,
     factorized_accelerations,
     finite,
@@ -46,26 +67,21 @@ from lgsens.dynamics import (
     require_linear,
 )
 from lgsens.integrate._grid import earlier, later
-from lgsens.integrate._scheme import AbstractScheme, Stages, Stats
+from lgsens.integrate._level_step import by_configuration
+from lgsens.integrate._linearized import AbstractLinearizedStep, Node, Variation
+from lgsens.integrate._radau_newton import no_memory, solved
+from lgsens.integrate._radau_stages import A, C, RadauStages, StageFactors, advanced, left
+from lgsens.integrate._scheme import AbstractScheme, Stages
 
-_R = np.sqrt(6.0)
-_C = np.array([(4.0 - _R) / 10.0, (4.0 + _R) / 10.0, 1.0])
-_A = np.array(
-    [
-        [(88.0 - 7.0 * _R) / 360.0, (296.0 - 169.0 * _R) / 1800.0, (-2.0 + 3.0 * _R) / 225.0],
-        [(296.0 + 169.0 * _R) / 1800.0, (88.0 + 7.0 * _R) / 360.0, (-2.0 - 3.0 * _R) / 225.0],
-        [(16.0 - _R) / 36.0, (16.0 + _R) / 36.0, 1.0 / 9.0],
-    ]
-)
+_TO_BEGIN = np.linalg.solve(np.vander(C, increasing=True).T, [1.0, 0.0, 0.0])  # ℓ_i(0)
+_WITHIN = C[0] - 4.5 * C[0] ** 2 + 6.0 * C[0] ** 3 - 2.5 * C[0] ** 4  # ε
 
 
-class RadauStages(NamedTuple):
-    """The unknowns of three stages, or what is left of their equations."""
+class Shared(NamedTuple):
+    """What all steps share."""
 
-    x: Float[Array, "3 k"]  # ξ = ẋ
-    v: Float[Array, "3 k"]  # w = v̇
-    lam: Float[Array, "3 m"]
-    mu: Float[Array, "3 p"]
+    system: AbstractSystem
+    inertia: Inertia
 
 
 class RadauIIA(AbstractScheme):
@@ -74,8 +90,8 @@ class RadauIIA(AbstractScheme):
         M T(x) ẋ = M v + Bᵀμ,     r(q, v, v̇, λ, t) = 0,     Φ(q, t) = 0,     B v + Φ_t = 0,     q = q_n exp(x̃)
 
     For few and large steps: smooth motions to many digits, and stiff scenes, whose fastest modes it damps out
-    (L-stable), slow ones then being of order 3. A step costs a Newton iteration with a dense matrix of 3 (2k + 2m)
-    rows, k coordinates and m constraints: for scenes of a few bodies.
+    (L-stable), slow ones then being of order 3. A step factorizes the constraints of three stages and a dense matrix of
+    6 (k − m) rows, k coordinates and m constraints: for scenes of few degrees of freedom.
 
     Arguments:
         tolerance: the last Newton increment of a configuration, relative to 1 rad or the length of the scene.
@@ -96,6 +112,7 @@ class RadauIIA(AbstractScheme):
     has_stages: ClassVar[bool] = True
     state_is_motion: ClassVar[bool] = True
     carries: ClassVar[tuple[str, ...]] = ("w", "v")
+    error_power: ClassVar[int] = 4
 
     def __check_init__(self):
         valid = isinstance(self.tolerance, int | float) and 0.0 < self.tolerance < 1e-2
@@ -130,11 +147,11 @@ class RadauIIA(AbstractScheme):
         nodes, begun, inner = jax.vmap(grid.node)(grid.places()), earlier(states), later(states).inner
 
         def of_step(node, begun, inner):
-            x, v = _advanced(node, begun, inner)
+            x, v = advanced(node.h, begun.v, inner)
             q = jax.vmap(system.group.retract, (None, 0))(begun.q, x)
             return State(q, v, inner.v, inner.lam, inner.v)
 
-        c, b = jnp.asarray(_C, states.v.dtype), jnp.asarray(_A[2], states.v.dtype)
+        c, b = jnp.asarray(C, states.v.dtype), jnp.asarray(A[2], states.v.dtype)
         flat = lambda leaf: leaf.reshape(leaf.shape[0] * 3, *leaf.shape[2:])
         return Stages(
             t=flat(nodes.begin[:, None] + nodes.h[:, None] * c[None]),
@@ -142,45 +159,26 @@ class RadauIIA(AbstractScheme):
             states=jax.tree.map(flat, jax.vmap(of_step)(nodes, begun, inner)),
         )
 
-    # The step, and its equations.
+    # The step, its equations and its error.
 
     def shared(self, system):
-        return Inertia.of(system)
+        return Shared(system, Inertia.of(system))
+
+    def memory(self, shared, state, node, *, uneven, exact=False):
+        return no_memory(shared.system, node, state)
 
     def take(self, system, shared, before, begun, memory, node, running):
-        scale = system.coordinate_scale()
-        tolerance = max(self.tolerance, 64 * float(jnp.finfo(scale.dtype).eps))
-        three = lambda leaf: jnp.broadcast_to(leaf, (3, *leaf.shape))
-        c = jnp.asarray(_C, scale.dtype)[:, None] * node.h
-        guess = RadauStages(
-            begun.v[None] + c * begun.vdot[None], three(begun.vdot), three(begun.lam), begun.inner.mu * 0.0
-        )
-        first, unravel = ravel_pytree(guess)
-        left = lambda z: ravel_pytree(self._left(system, node, begun, unravel(z)))[0]
-
-        def corrected(carry):
-            z, _, _, count, _ = carry
-            rest = left(z)
-            step = jnp.linalg.solve(jax.jacfwd(left)(z), rest)
-            x = _advanced(node, begun, unravel(step))[0]
-            size = jnp.max(jnp.abs(x) / scale[None])
-            going = (size > tolerance) & (count + 1 < self.max_iterations)
-            return z - step, size, jnp.max(jnp.abs(rest)), count + 1, going
-
-        infinite = jnp.inf * node.h
-        start = (first, infinite, infinite, jnp.zeros((), jnp.int32), running)
-        z, size, rest, count, _ = while_loop(lambda carry: carry[-1], corrected, start)
-        found = unravel(z)
-        x, v = _advanced(node, begun, found)
+        found, memory, stats = solved(self, system, node, begun, memory, running)
+        x, v = advanced(node.h, begun.v, found)
         q = system.group.retract(begun.q, x[-1])
-        vdot, lam = factorized_accelerations(shared, system, q, v[-1], node.t)
+        vdot, lam = factorized_accelerations(shared.inertia, system, q, v[-1], node.t)
         state = State(q, v[-1], vdot, lam, vdot, found)
-        converged = running & finite(state) & (size <= tolerance)
+        converged = stats.converged & finite(state)
         state = jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), state)
-        return state, memory, Stats(jnp.where(running, count, 0), size, rest, converged, jnp.full_like(node.h, jnp.inf))
+        return state, memory, stats._replace(converged=converged)
 
     def equations(self, system, node, previous, state):
-        x, v = _advanced(node, previous, state.inner)
+        x, v = advanced(node.h, previous.v, state.inner)
         force, rate = equations_of_motion(system, state.q, state.v, state.vdot, state.lam, node.t)
         return State(
             q=system.group.retract(previous.q, x[-1]),
@@ -188,34 +186,61 @@ class RadauIIA(AbstractScheme):
             vdot=force,
             lam=rate,
             a=state.a - state.vdot,
-            inner=self._left(system, node, previous, state.inner),
+            inner=left(system, node, previous, state.inner),
         )
 
-    def _left(self, system, node, previous, found: RadauStages) -> RadauStages:
-        """What is left of the equations of the stages."""
-        mass = system.mass_matrix()
+    def step_error(self, system, begun, state, memory, node):
+        factors, h = memory.matrix.factors, node.h
+        to_begin = h * _WITHIN * jnp.asarray(_TO_BEGIN, h.dtype)
+        w, v = (h * _WITHIN * at - to_begin @ stages for at, stages in zip((begun.v, begun.vdot), state.inner[:2]))
+        carried = factors.solve(h, jax.tree.map(jnp.negative, factors.by_start(h, w, v)))
+        return factors.end(h, w, v, carried)[0] / h**4
 
-        def stage(c, x, v, found: RadauStages):
-            q, t = system.group.retract(previous.q, x), node.begin + c * node.h
-            push = found.mu @ system.constraint_jacobian(q, t)
-            return RadauStages(
-                mass @ (system.group.tangent_mv(x, found.x) - v) - push,
-                system.residual(q, v, found.v, found.lam, t),
-                constraint_velocity(system, q, v, t),
-                system.constraint(q, t) / node.h,
-            )
+    def first_error(self, system, v, vdot, jerk):
+        scale = system.coordinate_scale()
+        cubed = jnp.max(jnp.abs(jerk + system.group.ad_mv(v, vdot)) / scale)
+        return (_WITHIN / 60.0) * scale * cubed ** (4.0 / 3.0)
 
-        return jax.vmap(stage)(jnp.asarray(_C, node.h.dtype), *_advanced(node, previous, found), found)
+    # Sensitivities.
+
+    def linearized(self, system, shared, node, previous, state):
+        return RadauLinearizedStep.of(shared, node, previous, state)
 
     def satisfies(self, system):
         return True, True
 
     def numbers(self, system):
         k, m = system.group.dim, len(system.constraint_names)
-        return 2 * (4 * k + m + 3 * (2 * k + 2 * m - system.num_velocity_rows)) ** 2
+        stages = 3 * (5 * k**2 + m * (k + m) + k * (k - m)) + 36 * (k - m) ** 2
+        return stages + (k + m) * (2 * k + m)
 
 
-def _advanced(node: Any, previous: State, found: RadauStages) -> tuple[Array, Array]:
-    """x_i and v_i."""
-    a = node.h * jnp.asarray(_A, node.h.dtype)
-    return a @ found.x, previous.v[None] + a @ found.v
+class RadauLinearizedStep(AbstractLinearizedStep):
+    """The equations above."""
+
+    stages: StageFactors
+    factors: tuple[Array, Array, Array]  # J, and the factors of [[M, Jᵀ], [J, 0]], at the end
+    by_q: Float[Array, "e k"]  # E_q
+    by_v: Float[Array, "e k"]  # E_v
+
+    @classmethod
+    def of(cls, shared: Shared, node: Node, previous: State, state: State) -> "RadauLinearizedStep":
+        system, q, v, t = shared.system, state.q, state.v, node.t
+        kkt = ConstrainedInertia.of(shared.inertia, system, q, t)
+        motion = lambda q, v: jnp.concatenate(equations_of_motion(system, q, v, state.vdot, state.lam, t))
+        return cls(
+            stages=StageFactors.of(system, node, previous, state.inner),
+            factors=(kkt.jacobian, kkt.factor, kkt.scale),
+            by_q=by_configuration(system, lambda q: motion(q, v), q),
+            by_v=jax.jacfwd(lambda v: motion(q, v))(v),
+        )
+
+    def forward(self, shared, node, previous, loads, row):
+        row = jax.tree.map(jnp.subtract, row, loads)
+        known = jax.tree.map(jnp.subtract, row.inner, self.stages.by_start(node.h, previous.w, previous.v))
+        inner = self.stages.solve(node.h, known)
+        w, v = map(jnp.add, self.stages.end(node.h, previous.w, previous.v, inner), (row.w, row.v))
+        missing = jnp.concatenate([row.vdot, row.lam]) - self.by_q @ w - self.by_v @ v
+        kkt = ConstrainedInertia(shared.inertia, *self.factors)
+        vdot, lam = kkt.solve(missing[: len(w)], missing[len(w) :])
+        return Variation(w, v, vdot, lam, vdot + row.a, inner)

@@ -158,6 +158,7 @@ class AbstractScheme(AbstractIntegrator):
         state_is_motion: whether the steps that follow a state depend on nothing of it but q and v.
         carries: the parts of δ_n that a linearized step reads; all, unless a scheme knows better. (v̇ may be one of them
             and the state a motion all the same, as that of q and v.)
+        error_power: p of `step_error`.
     """
 
     tolerance: eqx.AbstractVar[float]
@@ -167,6 +168,7 @@ class AbstractScheme(AbstractIntegrator):
     has_stages: ClassVar[bool] = False
     state_is_motion: ClassVar[bool] = False
     carries: ClassVar[tuple[str, ...]] = Variation._fields
+    error_power: ClassVar[int] = 3
 
     @property
     def scheme(self):
@@ -219,11 +221,18 @@ class AbstractScheme(AbstractIntegrator):
         """a of a state as a step begins with it that is `ratio` times as long as the one that led there."""
         return a
 
-    def missed_increment(self, system: AbstractSystem, v, vdot, jerk) -> Float[Array, " k"]:
-        """c, where the increment of a configuration misses the true one by h³ c: for the control of step sizes.
+    def step_error(self, system: AbstractSystem, begun: State, state: State, memory: Memory, node: Node) -> Array:
+        """c, shape (k,), of a step from `begun` to `state` that left that memory: the error of its configuration is
+        h^p c, p = `error_power`; for the control of step sizes. Here from v̈ ≈ (a_{n+1} − a_n)/h."""
+        return self.missed_increment(system, begun.v, begun.vdot, (state.a - begun.a) / node.h)
 
-        Here that of the trapezoidal rule, (v̈ + ad(v) v̇)/12, which a scheme of second order has or has less of.
-        """
+    def first_error(self, system: AbstractSystem, v, vdot, jerk) -> Array:
+        """The c that is expected of a first step."""
+        return self.missed_increment(system, v, vdot, jerk)
+
+    def missed_increment(self, system: AbstractSystem, v, vdot, jerk) -> Float[Array, " k"]:
+        """c, where the increment of a configuration misses the true one by h³ c. Here that of the trapezoidal rule,
+        (v̈ + ad(v) v̇)/12, which a scheme of second order has or has less of."""
         return (jerk + system.group.ad_mv(v, vdot)) / 12.0
 
     def defects(self, system: AbstractSystem, grid: AbstractGrid, states: State) -> Variation | None:

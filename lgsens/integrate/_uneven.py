@@ -1,19 +1,22 @@
 """Steps of different sizes: given ones, and those that error control finds.
 
-Error control. With v̈ ≈ (a_{n+1} − a_n)/h, a_n that of this step, the increment of eq. (27) misses the true one by
-e = h³ c (see `missed_increment`), at no cost. The error of a step is measured by the largest
+Error control. A scheme says what a step adds to the error of a configuration, e = h^p c (`step_error`, `error_power`).
+Generalized-α, p = 3: what the increment of eq. (27) misses of the true one, at no cost (`missed_increment`), with
+v̈ ≈ (a_{n+1} − a_n)/h, a_n that of this step. Radau IIA, p = 4: the error of its polynomial within the step (`_radau`).
+It is measured by the largest
 
     |e_i|/s_i,     s = 1 rad or the length of the scene,
 
-and kept below the tolerance. It is that of a step and not of a unit of time: local errors add up to ∫ h² |c| dt, in
-∫ dt/h steps, and for a given sum the steps are fewest where h³ |c| is the same in all. The size of the next one follows
-from the errors of the last two, E = |e|/tolerance, by the filter
+and kept below the tolerance. It is that of a step and not of a unit of time: local errors add up to ∫ h^{p−1} |c| dt,
+in ∫ dt/h steps, and for a given sum the steps are fewest where h^p |c| is the same in all. The size of the next one
+follows from the errors of the last two, E = |e|/tolerance, by the filter
 
-    ρ = (θ/E_n)^{1/(4·3)} (θ/E_{n−1})^{1/(4·3)} (h_n/h_{n−1})^{−1/4},      h_{n+1} = h_n (1 + κ arctan((ρ − 1)/κ)).
+    ρ = (θ/E_n)^{1/(4p)} (θ/E_{n−1})^{1/(4p)} (h_n/h_{n−1})^{−1/4},      h_{n+1} = h_n (1 + κ arctan((ρ − 1)/κ)).
 
 It does not answer to what alternates from step to step, as accelerations do after a change, with (−ρ∞)ⁿ.
-Sizes so chosen change smoothly, which matters: in the constraint directions the velocity carries an error of O(h²) that
-belongs to the step size (see `_start.py`), and where this changes by a factor r multipliers are off by O(r² − 1) h.
+Sizes so chosen change smoothly, which matters to index 3: in the constraint directions its velocity carries an error of
+O(h²) that belongs to the step size (see `_start.py`), and where this changes by a factor r multipliers are off by
+O(r² − 1) h.
 
 The derivative is that of the scheme on the grid found, so nothing here is differentiated.
 
@@ -113,17 +116,20 @@ class GivenSteps(AbstractIntegrator):
 class AdaptiveSteps(AbstractIntegrator):
     """Steps under error control: an integrator of `simulate`.
 
-        h³ |c_i| ≤ tolerance s_i,     c = (1/6 − β − Δ/2) v̈ + ad(v) v̇/12,  Δ = α_m − α_f
+        |e_i| ≤ tolerance s_i,     s = 1 rad or the length of the scene
 
-    with c the part of the increment (27) that the scheme misses, v̈ ≈ (a_{n+1} − a_n)/h, s = 1 rad or the length of the
-    scene.
+    with e = h^p c as the scheme estimates it: of generalized-α, and of schemes that say nothing else, the part of the
+    increment (27) that it misses, p = 3, c = (1/6 − β − Δ/2) v̈ + ad(v) v̇/12, Δ = α_m − α_f, v̈ ≈ (a_{n+1} − a_n)/h;
+    of Radau IIA the largest error within the step, p = 4.
 
     Arguments:
         integrator: the scheme, `GeneralizedAlpha` or another one.
         tolerance: the error that a step may add to a configuration, relative to 1 rad or the length of the scene.
-            Global errors fall as tolerance^(2/3): a thousandth of it, a hundredth of them, in ten times the steps.
-        longest: the longest step, as a fraction of the interval t1 − t0. A system at rest does not see ahead: no longer
-            than half the shortest event that comes then, the bump of a road.
+            Global errors of generalized-α fall as tolerance^(2/3): a thousandth of it, a hundredth of them, in ten
+            times the steps. Those of Radau IIA fall as tolerance^(5/4), in stiff scenes as tolerance^(3/4).
+        longest: the longest step, as a fraction of the interval t1 − t0; for Radau IIA, whose steps are few, 1. A
+            system at rest does not see ahead: no longer than half the shortest event that comes then, the bump of a
+            road.
 
     `num_steps` of `simulate` is the largest number of steps. The trajectory has so many rows; those after the last step
     repeat t1 and the state there, so that integrals and `state(-1)` are right, and its `stats` are `ControlledStats`.
@@ -207,15 +213,14 @@ def _controlled_steps(
 ) -> tuple[Float[Array, " n"], State, ControlledStats, Bool[Array, ""]]:
     """Sizes, states and statistics of at most `num_steps` steps from t0 on, and whether they reach t0 + num_steps h.
 
-    Those not needed have size 0 and repeat the last state. The first size is taken from v̈ at t0.
+    Those not needed have size 0 and repeat the last state. The first size is taken from v̈ at t0 (`first_error`).
     """
     scheme, total = settings.integrator, num_steps * h
-    walk, scale = Walk.of(scheme, system), system.coordinate_scale()
+    walk, scale, power = Walk.of(scheme, system), system.coordinate_scale(), scheme.error_power
     tolerance = max(settings.tolerance, 16 * float(jnp.finfo(h.dtype).eps))
 
-    def relative(v, vdot, jerk, h):
-        missed = scheme.missed_increment(system, v, vdot, jerk)
-        return h**3 * jnp.max(jnp.abs(missed) / scale) / tolerance
+    def relative(c, h):
+        return h**power * jnp.max(jnp.abs(c) / scale) / tolerance
 
     def fitted(h, remaining):
         """A whole number of such steps for what remains: none at the end that differs from those before."""
@@ -238,10 +243,11 @@ def _controlled_steps(
             start, size = begins(trial)
             state, h = start.state, trial.h
             begun = eqx.tree_at(lambda s: s.a, state, scheme.resized(state.vdot, state.a, h / size))
-            done, stats = walk.take(start, begun, Node(t0 + elapsed, t0 + (elapsed + h), h), trial.trying)
-            error = relative(begun.v, begun.vdot, (done.state.a - begun.a) / h, h)
+            node = Node(t0 + elapsed, t0 + (elapsed + h), h)
+            done, stats = walk.take(start, begun, node, trial.trying)
+            error = relative(scheme.step_error(system, begun, done.state, done.memory, node), h)
             accepted = stats.converged & (error <= 1.0)
-            shorter = jnp.where(stats.converged, jnp.clip(0.8 * error ** (-1.0 / 3.0), 0.1, 0.8), 0.25)
+            shorter = jnp.where(stats.converged, jnp.clip(0.8 * error ** (-1.0 / power), 0.1, 0.8), 0.25)
             rejected = trial.rejected + (~accepted).astype(jnp.int32)
             again = ~accepted & (rejected < _ATTEMPTS)
             given_up = ~accepted & ~again
@@ -263,7 +269,7 @@ def _controlled_steps(
         _, size = begins(trial)
         progress = trial.done.where(active, progress)
         error = jnp.maximum(trial.error, _LEAST)
-        rho = (_AIM / error * _AIM / before) ** (1.0 / 12.0) * (size / trial.h) ** 0.25
+        rho = (_AIM / error * _AIM / before) ** (1.0 / (4 * power)) * (size / trial.h) ** 0.25
         grown = trial.h * (1.0 + _LIMIT * jnp.arctan((rho - 1.0) / _LIMIT))
         elapsed = jnp.where(active, jnp.where(trial.h >= remaining, total, elapsed + trial.h), elapsed)
         h_taken = jnp.where(active | ~progress.running, trial.h, 0.0)
@@ -271,8 +277,9 @@ def _controlled_steps(
         return carry, (h_taken, progress.state, trial.stats, trial.error * tolerance, trial.rejected)
 
     q, v = first.state.q, first.state.v
-    expected = relative(v, first.state.vdot, acceleration_and_jerk(system, q, v, t0)[2], h)
-    guess = h * jnp.minimum(1.0, (_AIM / jnp.maximum(expected, _LEAST)) ** (1.0 / 3.0))
+    jerk = acceleration_and_jerk(system, q, v, t0)[2]
+    expected = relative(scheme.first_error(system, v, first.state.vdot, jerk), h)
+    guess = h * jnp.minimum(1.0, (_AIM / jnp.maximum(expected, _LEAST)) ** (1.0 / power))
     begun = first.at(system, guess)
     memory = scheme.memory(walk.shared, begun, Node(t0, t0 + guess, guess), uneven=True)
     running = jnp.all(jnp.isfinite(begun.a))

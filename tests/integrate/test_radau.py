@@ -6,10 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from differences import central
-from helpers import says
+from helpers import random_like, says
+from jax.flatten_util import ravel_pytree
+from rolling_disc import scene as rolling_disc
 
 import lgsens as lg
+from lgsens.dynamics import State
 from lgsens.examples import heavy_top, spinning_top
+from lgsens.integrate._linearized import Node
+from lgsens.integrate._radau_stages import RadauStages, StageFactors, left
 
 RADAU = lg.RadauIIA()
 SQUARE = lg.Criterion(integrand=lambda s, p: s.body("top").position[0] ** 2)
@@ -109,6 +114,36 @@ def test_criteria_are_of_its_order():
     coarse, fine = np.array(off(of(25, RADAU))), np.array(off(of(50, RADAU)))
     assert np.log2(coarse / fine).min() > 4.5
     assert fine.max() < 1e-6
+
+
+@pytest.mark.parametrize("scene", [lambda: spinning_top(0.7), pytest.param(rolling_disc, marks=pytest.mark.slow)])
+def test_factors_are_those_of_the_equations(scene):
+    """Anywhere, with μ of the size of λ: F_z times the solution, and F_n, by forward-mode autodiff of the equations."""
+    model, rng = scene(), np.random.default_rng(0)
+    system, state = model.system(), lg.initial_state(model)
+    positions = len(state.lam) - system.num_velocity_rows
+    node = Node(*(jnp.asarray(x) for x in (0.3, 0.34, 0.04)))
+    at = (state.v, state.vdot, state.lam, state.lam[:positions])
+    found = RadauStages(*(one[None] + random_like(jnp.zeros((3, *one.shape)), rng) for one in at))
+
+    @jax.jit
+    def solved(rows, w, v):
+        factors = StageFactors.of(system, node, state, found)
+        return factors.solve(node.h, rows), factors.by_start(node.h, w, v)
+
+    def equations(found, w, v):
+        begun = State(system.group.retract(state.q, w), state.v + v, state.vdot, state.lam, state.a)
+        return left(system, node, begun, found)
+
+    rows, w, v = random_like(found, rng), *random_like((state.v, state.v), rng)
+    change, by_start = solved(rows, w, v)
+    none = jnp.zeros_like(w)
+    derivative = jax.jit(lambda *tangent: jax.jvp(equations, (found, none, none), tangent)[1])
+    flat = lambda tree: ravel_pytree(tree)[0]
+    # 1e-16 of numbers of 1e4, which is what positions of 1 m and multipliers of 1e2 N make of rows of size 1, × 1e2
+    np.testing.assert_allclose(flat(derivative(change, none, none)), flat(rows), rtol=0, atol=1e-10)
+    resting = jax.tree.map(jnp.zeros_like, found)
+    np.testing.assert_allclose(flat(derivative(resting, w, v)), flat(by_start), rtol=0, atol=1e-11)
 
 
 def test_what_it_cannot():
