@@ -141,6 +141,7 @@ def test_error_estimate():
         assert np.abs(remaining[start:]).max() < part * np.abs(getattr(rough.error, name)[start:]).max(), name
 
 
+@pytest.mark.slow
 def test_configurations_stay_on_the_group_and_near_the_constraints():
     trajectory = top_run(50, RICHARDSON)[2]
     orientation = trajectory.body("top").orientation

@@ -81,6 +81,7 @@ def test_values_and_gradients_are_those_of_the_closed_form(accuracy):
     assert found.reached.extrapolated == (accuracy < 1e-4)
 
 
+@pytest.mark.slow  # gradients to an accuracy are in the quick run
 def test_motions_have_it_and_their_derivatives_follow():
     run = lg.simulate(build(P), t1=T1, accuracy=1e-5)
     n = run.t.shape[0] - 1

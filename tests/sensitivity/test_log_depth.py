@@ -80,7 +80,7 @@ def both_modes(function, x, *settings):
 
 @pytest.mark.parametrize(
     "name",
-    [name if name == "index 3" else pytest.param(name, marks=pytest.mark.slow) for name in INTEGRATORS],
+    [pytest.param(name, marks=pytest.mark.slow) for name in INTEGRATORS],
 )
 def test_the_top(name):
     """12 steps × condition 5e2 × round-off."""
