@@ -146,6 +146,7 @@ TABLES: dict[str, tuple[str, tuple[str, ...], Callable[..., str]]] = {
     "heavy top": ("verification", ("heavy_top",), lambda found: f"```\n{of('heavy_top', 'table')(found)}\n```"),
     "methods": ("results/methods", ("methods",), methods),
     "work against precision": ("results/work_precision", ("work_precision",), of("precision_tables", "markdown")),
+    "schemes": ("results/work_precision", ("schemes",), of("precision_tables", "markdown")),
     "compile time": ("results/compile_time", ("compile_time",), of("compile_time", "markdown")),
     "loops": ("results/loops", ("loops",), of("loops", "markdown")),
     "chains": ("results/chains", ("chain",), of("chain", "table")),
