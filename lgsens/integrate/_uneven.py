@@ -126,7 +126,7 @@ class AdaptiveSteps(AbstractIntegrator):
         integrator: the scheme, `GeneralizedAlpha` or another one.
         tolerance: the error that a step may add to a configuration, relative to 1 rad or the length of the scene.
             Global errors of generalized-α fall as tolerance^(2/3): a thousandth of it, a hundredth of them, in ten
-            times the steps. Those of Radau IIA fall as tolerance^(5/4), in stiff scenes as tolerance^(3/4).
+            times the steps. Those of Radau IIA fall as its power 1 to 5/4, in stiff scenes 3/4.
         longest: the longest step, as a fraction of the interval t1 − t0; for Radau IIA, whose steps are few, 1. A
             system at rest does not see ahead: no longer than half the shortest event that comes then, the bump of a
             road.
