@@ -48,10 +48,6 @@ class AxleJob(NamedTuple):
         acceleration = run.body("chassis").acceleration[:, 2]
         return self.problem.objective(run), Response(run.t, acceleration, self.problem.outputs(x)), run.result
 
-    def scene(self, x):
-        """The half that runs over the bump, of a design."""
-        return self.problem.with_design(x).half()
-
     @property
     def scale(self) -> dict[str, Any]:
         """Half of what is between the bounds is a large change of the design."""

@@ -107,10 +107,6 @@ class QuarterCarJob(NamedTuple):
         on_road = road.response(self.problem.with_design(x))
         return on_road.acceleration, Responses(bump, on_road), trajectory.result
 
-    def scene(self, x):
-        """What runs over the bump, of a design."""
-        return self.problem.with_design(x).model(wheel=self.problem.wheel)
-
     @property
     def scale(self) -> dict[str, Any]:
         """A move of one box or one magnitude is a large change of the design."""

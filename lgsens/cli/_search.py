@@ -4,6 +4,7 @@ import dataclasses
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -72,8 +73,8 @@ def at_accuracy(job: Any, accuracy: float, progress: bool) -> tuple[Any, Reached
     """The job in as many steps as Ψ₀ over the bump and its gradient at the start take to have a relative error."""
     problem, fewest = job.problem, max(1, round(FEWEST * float(job.problem.t1)))
     order = check_accuracy(accuracy, fewest, GeneralizedAlpha(), problem.start)
-    at = {"t1": problem.t1}
-    run = lambda n, throw: differentiate(COMFORT, job.scene, problem.start, num_steps=n, throw=throw, **at)
+    gradient = partial(differentiate, COMFORT, problem.scene, problem.start, t1=problem.t1)
+    run = lambda n, throw: gradient(num_steps=n, throw=throw)
     with compiling("the gradient for the number of steps", progress):
         reached = differentiate_to(run, accuracy, order, fewest, extrapolate=False).reached
     if progress:

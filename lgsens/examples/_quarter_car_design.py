@@ -13,6 +13,7 @@ from lgsens.examples._curve_bounds import CurveBounds
 from lgsens.examples._hardpoint_file import Reader, read
 from lgsens.examples._quarter_car import GRAVITY, QuarterCar
 from lgsens.examples._road_limits import RoadLimits
+from lgsens.model import Model
 from lgsens.simulation import Trajectory, simulate
 
 # What the user may ask for, and the members of the design that it frees.
@@ -182,10 +183,13 @@ class SuspensionDesign(eqx.Module):
         """The car with the values of a design."""
         return self.car.with_values(**design)
 
+    def scene(self, design: dict[str, Array]) -> Model:
+        """What runs over the bump."""
+        return self.with_design(design).model(wheel=self.wheel)
+
     def simulate(self, design: dict[str, Array], throw: bool = True) -> Trajectory:
         """The motion of a design over the bump; `throw` as in `lgsens.simulate`."""
-        model = self.with_design(design).model(wheel=self.wheel)
-        return simulate(model, t1=self.t1, num_steps=self.num_steps, throw=throw)
+        return simulate(self.scene(design), t1=self.t1, num_steps=self.num_steps, throw=throw)
 
     def response(self, trajectory: Trajectory) -> Response:
         """The objective and the path constraints of a motion."""

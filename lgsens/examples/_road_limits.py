@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, number_field, require, require_positive
 from lgsens.examples._quarter_car import QuarterCar, RoadResponse
-from lgsens.model import ISO_8608
+from lgsens.model import road_roughness
 
 
 class RoadLimits(eqx.Module):
@@ -48,8 +48,7 @@ class RoadLimits(eqx.Module):
             require(lambda value: 0.0 < value < np.inf, f"`{name}` must be positive, got {value}.", value)
         own = car.random_road(roughness=roughness, speed=speed)
         limits = {name: factor * getattr(own, name) for name, factor in factors.items()}
-        number = as_float(ISO_8608[roughness] if isinstance(roughness, str) else roughness, (), "`roughness`")
-        return RoadLimits(roughness=number, speed=speed, **limits)
+        return RoadLimits(roughness=road_roughness(roughness), speed=speed, **limits)
 
     def response(self, car: QuarterCar) -> RoadResponse:
         """What the road does to a car; the acceleration weighted by ISO 2631, Wk."""

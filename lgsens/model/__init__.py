@@ -97,6 +97,7 @@ from lgsens.model._roads import (
     FlatRoad as FlatRoad,
     SampledRoad as SampledRoad,
     rate_intensity as rate_intensity,
+    road_roughness as road_roughness,
 )
 from lgsens.model._rolling import Rolling as Rolling
 from lgsens.model._screws import RackAndPinionJoint as RackAndPinionJoint, ScrewJoint as ScrewJoint

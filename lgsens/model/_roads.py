@@ -23,20 +23,31 @@ from lgsens.model._signals import AbstractSignal, samples
 ISO_8608 = {name: 16e-6 * 4.0**i for i, name in enumerate("ABCDEFGH")}
 
 
-def rate_intensity(roughness, speed, wave_number) -> Float[Array, ""]:
-    """S = (2π n_0)² G_d(n_0) V/2 [m²/s] of the rate of a random road.
+def road_roughness(roughness) -> Float[Array, ""]:
+    """G_d(n_0) [m³], given as a number or as the class of the road.
 
-    Raises `ValueError` for a class that is not one of ISO 8608, and numbers of another shape or not positive.
+    Raises `ValueError` for a class that is not one of ISO 8608, and a number of another shape or not positive.
     """
     if isinstance(roughness, str):
         if roughness not in ISO_8608:
             raise ValueError(f"`roughness`: {suggestion(roughness, ISO_8608)}, the classes of ISO 8608.")
         roughness = ISO_8608[roughness]
-    given = {"roughness": roughness, "speed": speed, "wave_number": wave_number}
-    numbers = {name: as_float(value, (), f"`{name}`") for name, value in given.items()}
-    for name, value in numbers.items():
-        require(lambda value: 0.0 < value < jnp.inf, f"`{name}` must be positive, got {value}.", value)
-    roughness, speed, wave_number = numbers.values()
+    return _positive("roughness", roughness)
+
+
+def _positive(name: str, value) -> Float[Array, ""]:
+    value = as_float(value, (), f"`{name}`")
+    require(lambda value: 0.0 < value < jnp.inf, f"`{name}` must be positive, got {value}.", value)
+    return value
+
+
+def rate_intensity(roughness, speed, wave_number) -> Float[Array, ""]:
+    """S = (2π n_0)² G_d(n_0) V/2 [m²/s] of the rate of a random road.
+
+    Raises `ValueError` for a class that is not one of ISO 8608, and numbers of another shape or not positive.
+    """
+    roughness, speed = road_roughness(roughness), _positive("speed", speed)
+    wave_number = _positive("wave_number", wave_number)
     return (2.0 * jnp.pi * wave_number) ** 2 * roughness * speed / 2.0
 
 

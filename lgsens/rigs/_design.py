@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from lgsens._validate import as_count, as_float, suggestion
 from lgsens.criteria import time_integral
 from lgsens.examples import Axle, AxleNumbers, Band
+from lgsens.model import Model
 from lgsens.rigs._characteristics import CHARACTERISTICS
 from lgsens.rigs._kc import KC, kc
 from lgsens.rigs._sweeps import Sweep, standard_sweeps
@@ -109,9 +110,13 @@ class AxleDesign(eqx.Module):
         axle = self.with_design(x)
         return kc(axle.model(links="rods"), axle.wheel_centres, dict(self.sweeps), points=self.points, throw=throw)
 
+    def scene(self, x: Design) -> Model:
+        """The left half, which runs over the bump."""
+        return self.with_design(x).half()
+
     def bump(self, x: Design, *, throw: bool = True) -> Trajectory:
         """The run of the left half over the bump."""
-        return simulate(self.with_design(x).half(), t1=self.t1, num_steps=self.num_steps, throw=throw)
+        return simulate(self.scene(x), t1=self.t1, num_steps=self.num_steps, throw=throw)
 
     def outputs(self, x: Design) -> dict[str, Float[Array, " n"]]:
         """What is kept in bands, SI units; NaN where the rig finds no equilibrium."""
