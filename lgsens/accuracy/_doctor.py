@@ -20,7 +20,7 @@ from lgsens.analysis import constraint_rank, sensitivity_growth
 from lgsens.criteria import kinks, roughness
 from lgsens.dynamics import RESULTS, full_jacobian
 from lgsens.integrate import AbstractIntegrator, GeneralizedAlpha, singular_steps
-from lgsens.model import Model, MultibodySystem
+from lgsens.model import Model
 from lgsens.simulation import Trajectory, check_integrator, interval, simulate
 
 
@@ -215,8 +215,7 @@ def _of_run(trajectory: Trajectory, h: float, singular: bool):
         "",
         "Stiff: an implicit scheme (GeneralizedAlpha, RadauIIA), and what is fast as rigid.",
     )
-    system = trajectory.system
-    assert isinstance(system, MultibodySystem)
+    system = trajectory.of_bodies()[0]
     spins = {
         name: float(jnp.nanmax(jnp.linalg.norm(trajectory.body(name).angular_velocity, axis=1)))
         for name in system.body_names

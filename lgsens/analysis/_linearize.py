@@ -234,7 +234,7 @@ def _linearize_jit(model, given: State | None, t0, rotation, names: tuple[str, .
     system = as_system(model)
 
     def built(inputs) -> AbstractSystem:
-        return with_inputs(model, names, inputs, t0).system() if names else system
+        return as_system(with_inputs(model, names, inputs, t0)) if names else system
 
     def measured(system: AbstractSystem, state: State) -> Float[Array, " o"]:
         instant = Instant(t=t0, state=state, system=system)

@@ -7,7 +7,7 @@ import numpy as np
 
 from lgsens._validate import as_float
 from lgsens.dynamics import AbstractSystem, assemble, full_jacobian
-from lgsens.model import Model, MultibodySystem
+from lgsens.model import Model, scene_of
 from lgsens.simulation import as_system, left_null_space, redundant_names
 
 _DIRECTIONS = 4  # of motion, in which the neighbourhood of the reference is looked at
@@ -80,8 +80,9 @@ def constraint_rank(model: Model | AbstractSystem, *, t0=0.0) -> ConstraintRank:
     equations would seem redundant that are not.
     """
     system = as_system(model)
-    if isinstance(system, MultibodySystem):
-        system = dataclasses.replace(system, minimum_norm=True)  # which can be assembled whatever its rank
+    scene = scene_of(system)
+    if scene is not None:
+        system = dataclasses.replace(scene, minimum_norm=True)  # which can be assembled whatever its rank
     t = as_float(t0, (), "`t0`")
     q, _ = _assembled(system, t)
     _, jacobian = _evaluated(system, q, t)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from lgsens.model import MultibodySystem, element_forces
+from lgsens.model import element_forces, scene_of
 from lgsens.simulation import Trajectory
 
 _SPIKE = 8.0  # second differences beside a smooth change differ by less
@@ -52,12 +52,12 @@ def roughness(trajectory: Trajectory) -> Roughness:
     """Of a motion in equal steps."""
     system = trajectory.system
     scale = system.coordinate_scale()
-    if isinstance(system, MultibodySystem):
+    if scene_of(system) is not None:
+        system, states, t = trajectory.of_bodies()
         length = jnp.max(scale)
         motions = [trajectory.body(name) for name in system.body_names]
         a = jnp.stack([jnp.concatenate([m.acceleration / length, m.angular_acceleration], axis=1) for m in motions], 1)
-        states = trajectory.states
-        found = element_forces(system, states.q, states.v, states.lam, trajectory.t, length)
+        found = element_forces(system, states.q, states.v, states.lam, t, length)
         forces = [_spikes(force, jnp.max(jnp.abs(force), axis=(0, 2))) for _, force in found]
     else:
         a, forces = (trajectory.states.vdot / scale[None])[:, :, None], []
@@ -84,10 +84,10 @@ def _spikes(values: Float[Array, "n+1 items parts"], size: Float[Array, " items"
 
 def kinks(trajectory: Trajectory, found: Roughness) -> tuple[Kink, ...]:
     """What was found, by name."""
-    system = trajectory.system
+    system = scene_of(trajectory.system)
     bodies, forces = np.asarray(found.bodies), np.asarray(found.forces)
     names, owners = [f"coordinate {i}" for i in range(bodies.shape[1])], []
-    if isinstance(system, MultibodySystem):
+    if system is not None:
         names, owners = system.body_names, [owner for stack in system.loads for owner in stack.owners]
 
     def at(n: int, i: int) -> Kink:

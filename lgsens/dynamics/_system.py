@@ -125,6 +125,11 @@ class AbstractSystem(eqx.Module):
         """A(q, t)."""
         return jnp.zeros_like(self.reference()[1], shape=(0, self.group.dim))
 
+    def angular_velocities(self, v) -> Float[Array, "*n N 3"]:
+        """Ω of each body, body frame, from v along leading axes, or Ω̇ from v̇; zero about axes that it does not have.
+        Of equations that do not know their bodies, of none."""
+        return jnp.zeros((*v.shape[:-1], 0, 3), v.dtype)
+
     # Forces that depend on the multipliers, as friction of joints does: f(q, v, λ, t).
 
     @property
@@ -186,10 +191,6 @@ class AbstractSparseSystem(AbstractSystem):
     @abc.abstractmethod
     def body_blocks(self, matrix: Float[Array, "k k"]) -> Float[Array, "N 6 6"]:
         """The rows and columns of each body in a matrix; zero where the body does not have the coordinate."""
-
-    @abc.abstractmethod
-    def angular_velocities(self, v) -> Float[Array, "*n N 3"]:
-        """Ω of each body, body frame, from v along leading axes, or Ω̇ from v̇; zero about axes that it does not have."""
 
     @abc.abstractmethod
     def tangent_operators(self, x) -> Float[Array, "N 3 3"]:

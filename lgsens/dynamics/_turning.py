@@ -18,13 +18,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem
+from lgsens.dynamics._system import AbstractSystem
 
 
 def unsteady_rate(system: AbstractSystem, v: Float[Array, "*n k"], vdot: Float[Array, "*n k"]) -> Float[Array, "*n"]:
     """The largest |Ω| of an unsteady body [rad/s], along leading axes, without derivative; 0 if bodies are unknown."""
-    if not isinstance(system, AbstractSparseSystem):
-        return jnp.zeros(v.shape[:-1], v.dtype)
     v, vdot = lax.stop_gradient((v, vdot))
     square, change = (jnp.sum(system.angular_velocities(each) ** 2, axis=-1) for each in (v, vdot))
     unsteady = change > (jnp.finfo(v.dtype).eps ** (2.0 / 3.0) * square) ** 2

@@ -7,6 +7,7 @@ from ._base import AbstractLieGroup as AbstractLieGroup
 from ._groups import Pose as Pose, R3xSO3 as R3xSO3, Rn as Rn
 from ._poses import Poses as Poses
 from ._products import Power as Power, Product as Product
+from ._rigid_motions import RigidMotions as RigidMotions
 from ._rotation import (
     SO3 as SO3,
     cross as cross,

@@ -101,6 +101,7 @@ from lgsens.model._roads import (
 )
 from lgsens.model._rolling import Rolling as Rolling
 from lgsens.model._screws import RackAndPinionJoint as RackAndPinionJoint, ScrewJoint as ScrewJoint
+from lgsens.model._se3_system import SE3System as SE3System, scene_of as scene_of
 from lgsens.model._shafts import ConstantVelocityJoint as ConstantVelocityJoint, GearJoint as GearJoint
 from lgsens.model._signals import (
     AbstractSignal as AbstractSignal,

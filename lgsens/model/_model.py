@@ -12,7 +12,7 @@ import numpy as np
 from lgsens._brief import listed, roster
 from lgsens._validate import is_concrete, require
 from lgsens.liegroups import nearest_rotation
-from lgsens.linear import AbstractLinearSolver
+from lgsens.linear import AbstractLinearSolver, BlockSparse
 from lgsens.model._assemble import assemble, assemble_merged
 from lgsens.model._beam_sections import BeamSection
 from lgsens.model._body import RigidBody
@@ -24,10 +24,13 @@ from lgsens.model._frames import Frame
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._merge import Group, groups
 from lgsens.model._reductions import AbstractReduction, Scene, reduced
+from lgsens.model._se3_system import SE3System
 from lgsens.model._summary import Summary, summarize
 from lgsens.model._system import MultibodySystem
 
 _REDUNDANT = ("refuse", "minimum_norm")
+_FORMULATIONS = ("R3xSO3", "SE3")
+_OPTIONS = ("linear_solver", "merge_fixed", "redundant", "formulation")
 
 
 class Model(eqx.Module):
@@ -47,6 +50,10 @@ class Model(eqx.Module):
             bodies): the forces in joints that are all equally stiff, in the limit of rigid ones. Derivatives are exact
             for changes that leave the equations redundant (both hinges of a door off their axis, and not one of
             them). `constraint_rank` says which joints are redundant.
+        formulation: "R3xSO3", velocities of centres of mass in the inertial frame, or "SE3", in the frame of each body,
+            whose steps move it along a screw: another solution of second order, with dense linear algebra. Bodies with
+            some of their degrees of freedom are as before. States are in these velocities; what `Trajectory` answers
+            by name is the same in both.
 
     The constructors can be traced, so a function that builds a model from design parameters is the
     general parametrization; the gradient with respect to a model is again a model.
@@ -70,6 +77,7 @@ class Model(eqx.Module):
     linear_solver: AbstractLinearSolver | None = eqx.field(static=True)
     merge_fixed: bool = eqx.field(static=True)
     redundant: str = eqx.field(static=True)
+    formulation: str = eqx.field(static=True)
 
     def __init__(
         self,
@@ -80,6 +88,7 @@ class Model(eqx.Module):
         linear_solver: AbstractLinearSolver | None = None,
         merge_fixed: bool = False,
         redundant: str = "refuse",
+        formulation: str = "R3xSO3",
     ):
         if not isinstance(linear_solver, AbstractLinearSolver | None):
             raise ValueError(f"Model: `linear_solver` must be DenseLU(), BlockSparse() or None, got {linear_solver!r}.")
@@ -101,6 +110,13 @@ class Model(eqx.Module):
         self.redundant = redundant
         if redundant not in _REDUNDANT:
             raise ValueError(f"Model: `redundant` must be one of {_REDUNDANT}, got {redundant!r}.")
+        self.formulation = formulation
+        if formulation not in _FORMULATIONS:
+            raise ValueError(f"Model: `formulation` must be one of {_FORMULATIONS}, got {formulation!r}.")
+        if formulation == "SE3" and isinstance(linear_solver, BlockSparse):
+            raise ValueError(
+                "Model: `linear_solver` = BlockSparse() is for formulation='R3xSO3'; leave it out on SE(3)."
+            )
         if not self.bodies:
             raise ValueError("Model: `bodies` is empty; a scene needs at least one RigidBody.")
         for what, kind, members in (
@@ -129,7 +145,7 @@ class Model(eqx.Module):
 
     def __repr__(self) -> str:
         fields = {name: roster(getattr(self, name)) for name in ("bodies", "joints", "forces")}
-        options = {name: getattr(self, name) for name in ("linear_solver", "merge_fixed", "redundant")}
+        options = {name: getattr(self, name) for name in _OPTIONS}
         return listed("Model", fields | {name: repr(value) for name, value in options.items()})
 
     def _check_connection(self, what: str, ends: tuple[str | None, ...]) -> None:
@@ -153,8 +169,13 @@ class Model(eqx.Module):
                         f"{one.a!r} and {one.b!r} at the same place; remove one of them."
                     )
 
+    def equations(self) -> MultibodySystem | SE3System:
+        """The equations of motion in the formulation of the model: what is integrated. Raises as `system`."""
+        system = self.system()
+        return SE3System(bodies=system, assembled=system.assembled) if self.formulation == "SE3" else system
+
     def system(self) -> MultibodySystem:
-        """The equations of motion, elements stacked by type.
+        """The equations of motion on R³ × SO(3), elements stacked by type.
 
         Raises `ValueError` for numbers that have come in since construction and that no scene has, if they are known.
         """
@@ -259,8 +280,8 @@ class Model(eqx.Module):
         return Scene(self.bodies, self.joints, self.forces, self.merge_fixed)
 
     def _of(self, scene: Scene) -> "Model":
-        members, merge = scene[:3], scene.merge_fixed
-        return Model(*members, linear_solver=self.linear_solver, merge_fixed=merge, redundant=self.redundant)
+        options: dict[str, Any] = {name: getattr(self, name) for name in _OPTIONS} | {"merge_fixed": scene.merge_fixed}
+        return Model(*scene[:3], **options)
 
     def toward(self, paths: Sequence[Sequence[AbstractReduction]], s, rate) -> "Model":
         """The scene of this structure at s on the way to some reductions (`_reductions.py`); `rate`: [1/s]."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from lgsens._validate import as_count
 from lgsens.analysis import Kinematics
-from lgsens.model import MultibodySystem
+from lgsens.model import scene_of
 from lgsens.plotting._mechanism import draw, frame, view_of
 from lgsens.plotting._shapes import Shapes, corners, placed, shapes
 from lgsens.plotting._style import ROAD, ROLES, figure
@@ -105,7 +105,8 @@ def animate(
 def film(motion: Trajectory | Kinematics, speed: float, max_frames: int) -> Film:
     """The frames of a motion."""
     system = getattr(motion, "system", None)
-    if not isinstance(motion, Trajectory | Kinematics) or not isinstance(system, MultibodySystem):
+    scene = scene_of(system)
+    if not isinstance(motion, Trajectory | Kinematics) or scene is None:
         raise ValueError(
             f"`motion` must be a Trajectory or a Kinematics of a Model, got {type(motion).__name__} of "
             f"{type(system).__name__}; what `simulate(…, save=…)` returns has no positions."
@@ -116,7 +117,7 @@ def film(motion: Trajectory | Kinematics, speed: float, max_frames: int) -> Film
         (label, values), *_ = motion.values.items()
         values = np.asarray(values)
         clock = np.linspace(0.0, SWEEP, len(values)) / speed
-        turns = all(stack.elements.turning for stack in system.constraints if label in stack.owners)
+        turns = all(stack.elements.turning for stack in scene.constraints if label in stack.owners)
         unit = "rad" if turns else "m"
     else:
         label, unit, values = "t", "s", np.asarray(motion.t)
@@ -124,7 +125,7 @@ def film(motion: Trajectory | Kinematics, speed: float, max_frames: int) -> Film
     count = min(len(clock), max_frames, max(2, 1 + round(PER_SECOND * clock[-1])))
     frames = np.unique(np.abs(clock[:, None] - np.linspace(0.0, clock[-1], count)[None]).argmin(axis=0))
     position, orientation = (np.asarray(array)[frames] for array in motion.states.q)
-    drawn = shapes(system)
+    drawn = shapes(scene)
     if isinstance(motion, Kinematics):  # a rig has no road
         drawn = drawn._replace(tyres=[])
     t = jnp.asarray(motion.t)[frames]

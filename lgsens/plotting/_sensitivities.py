@@ -1,5 +1,6 @@
 """Sensitivities along a trajectory: how each body and each joint force answers to a parameter."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -8,7 +9,7 @@ import numpy as np
 
 from lgsens._validate import suggestion
 from lgsens.dynamics import State
-from lgsens.model import MultibodySystem
+from lgsens.model import scene_of
 from lgsens.plotting._style import CURVES, figure, plain
 from lgsens.simulation import Trajectory
 
@@ -51,9 +52,11 @@ def sensitivities(
     Raises `ValueError` for unknown names, a motion without bodies, or nothing to draw, `ImportError` without
     matplotlib.
     """
-    system = trajectory.system
-    if not isinstance(system, MultibodySystem):
-        raise ValueError(f"`trajectory` is one of a {type(system).__name__}, which has no named bodies and joints.")
+    system = scene_of(trajectory.system)
+    if system is None:
+        raise ValueError(
+            f"`trajectory` is one of a {type(trajectory.system).__name__}, which has no named bodies and joints."
+        )
     known = list(dict.fromkeys(system.constraint_names))
     bodies = list(system.body_names) if bodies is None else list(bodies)
     joints = known if joints is None else list(joints)
@@ -65,7 +68,9 @@ def sensitivities(
     if rows == 0:
         raise ValueError("`bodies` and `joints` are empty; name something to draw.")
     change = derivative.states if isinstance(derivative, Trajectory) else derivative
-    w = jax.vmap(system.group.from_ambient)(trajectory.states.q, change.q)
+    in_bodies = lambda states: dataclasses.replace(trajectory, states=states).of_bodies()[1]
+    states, change = jax.jvp(in_bodies, (trajectory.states,), (change,))
+    w = jax.vmap(system.group.from_ambient)(states.q, change.q)
     by_body = {"w": np.asarray(system.twists(w)), "v": np.asarray(system.twists(change.v))}
     t = np.asarray(trajectory.t)
 

@@ -11,7 +11,7 @@ from jax.core import Tracer
 from lgsens.dynamics import RESULTS, full_jacobian, initial_state
 from lgsens.integrate import singular_steps
 from lgsens.linear import Matrix, SparseMatrix
-from lgsens.model import MultibodySystem, invalid_numbers
+from lgsens.model import invalid_numbers, scene_of
 
 # Whether a failure inside `jit` calls back. JAX keys its caches on it: both are traced.
 _by_callback = jax.make_user_context(False)
@@ -193,7 +193,8 @@ def raise_if_failed(found: Any) -> Any:
         jacobian = full_jacobian(system, initial.state.q, t[0])
         details = {"violation": np.asarray(initial.violation), "jacobian": np.asarray(jacobian)}
     elif code == RESULTS.invalid_numbers:
-        known = invalid_numbers(system) if isinstance(system, MultibodySystem) else []
+        scene = None if system is None else scene_of(system)
+        known = [] if scene is None else invalid_numbers(scene)
         details = (
             {"numbers": known or [f"t0 = {float(t[0]) + 0.0:.6g} s, t1 = {float(t[-1]):.6g} s"]}
             if system is not None

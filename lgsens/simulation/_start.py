@@ -29,7 +29,7 @@ from lgsens.simulation._errors import throw_if_failed
 
 def as_system(model: Model | AbstractSystem) -> AbstractSystem:
     if isinstance(model, Model):
-        return alike(model.system())
+        return alike(model.equations())
     if isinstance(model, AbstractSystem):
         return alike(model)
     raise ValueError(f"`model` must be a Model or an AbstractSystem, got {type(model).__name__}.")

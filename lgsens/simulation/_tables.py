@@ -44,7 +44,7 @@ class Quantity(NamedTuple):
 
 def quantities(run: Any, what: str) -> dict[str, Quantity]:
     """Everything of a motion by name, "top.position"; `what` asks, for messages."""
-    system, (states, t) = run._multibody(), run._kinematics()
+    system, states, t = run.of_bodies()
     if not is_concrete(t, states):
         raise ValueError(f"`{what}`: the motion is traced; return it from `jit`, `grad` or `vmap`, and write it there.")
     if t.ndim != 1:

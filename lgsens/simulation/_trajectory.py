@@ -16,7 +16,7 @@ from lgsens._brief import brief, listed, roster, shown
 from lgsens._validate import as_float, is_concrete, suggestion
 from lgsens.dynamics import RESULTS, AbstractSystem, State
 from lgsens.integrate import Stages
-from lgsens.model import AbstractJoint, Frame, MultibodySystem, joint_wrenches, measured, motion_at
+from lgsens.model import AbstractJoint, Frame, MultibodySystem, SE3System, joint_wrenches, measured, motion_at, scene_of
 from lgsens.simulation._joint_motion import JointMotion, joint_motion
 from lgsens.simulation._reached import Reached
 from lgsens.simulation._tables import to_csv, to_pandas, to_xarray
@@ -118,26 +118,33 @@ class AbstractMotion(eqx.Module):
         reached = getattr(self, "reached", None)
         if reached is not None:
             fields["reached"] = reached.brief
-        if isinstance(system, MultibodySystem):
-            whole = system if system.parts is None else system.parts.system
+        scene = scene_of(system)
+        if scene is not None:
+            whole = scene if scene.parts is None else scene.parts.system
             own = dict.fromkeys(whole.constraint_names) if joints is None else joints
             fields |= {"bodies": roster(whole.body_names), "joints": roster(own)}
             fields["forces"] = roster(dict.fromkeys(owner for stack in whole.loads for owner in stack.owners))
         unknowns = f"{sizes[0]} coordinates, {sizes[1]} multipliers of"
         return listed(type(self).__name__, fields | {"states": f"{unknowns} {type(system).__name__}"})
 
-    def _multibody(self) -> MultibodySystem:
-        if not isinstance(self.system, MultibodySystem):
+    def of_bodies(self) -> tuple[MultibodySystem, State, Any]:
+        """The motion on R³ × SO(3), whatever the formulation of the model: equations, states and times.
+
+        Raises `ValueError` for the motion of equations that are not those of a `Model`.
+        """
+        system, (states, t) = self.system, self._kinematics()
+        scene = scene_of(system)
+        if scene is None:
             raise ValueError(
-                f"This is the motion of a {type(self.system).__name__}, which has no named bodies, joints or forces; "
+                f"This is the motion of a {type(system).__name__}, which has no named bodies, joints or forces; "
                 "use `states` of a trajectory, `state` of an instant."
             )
-        return self.system
+        return scene, system.state_of_bodies(states) if isinstance(system, SE3System) else states, t
 
     def body(self, name: str) -> BodyMotion:
         """The motion of the body `name`. Raises `ValueError` for an unknown name."""
-        states, _ = self._kinematics()
-        system, *motion = self._multibody().of_parts(states.q, states.v, states.vdot)
+        system, states, _ = self.of_bodies()
+        system, *motion = system.of_parts(states.q, states.v, states.vdot)
         if name not in system.body_names:
             raise ValueError(f"`body`: {suggestion(name, system.body_names)}.")
         return BodyMotion(*system.motion(system.body_names.index(name), *motion))
@@ -161,7 +168,7 @@ class AbstractMotion(eqx.Module):
 
     def _reference(self, body: str) -> Frame:
         """The frame at a body's centre of mass in the reference configuration."""
-        system = self._multibody()
+        system = self.of_bodies()[0]
         system = system if system.parts is None else system.parts.system
         still = jnp.zeros_like(system.velocity)
         return Frame(*system.motion(system.body_names.index(body), system.pose, still, still)[:2])
@@ -172,7 +179,7 @@ class AbstractMotion(eqx.Module):
         Those of a merged `FixedJoint` (`Model.merge_fixed`) are what its bodies need to move as they do.
         Raises `ValueError` for an unknown name.
         """
-        system, (states, t) = self._multibody(), self._kinematics()
+        system, states, t = self.of_bodies()
         return system.multiplier(joint, states.q, states.v, states.vdot, states.lam, t)
 
     def states_of(self, force: str) -> dict[str, Float[Array, "*n"]]:
@@ -180,10 +187,11 @@ class AbstractMotion(eqx.Module):
 
         Raises `ValueError` for an unknown name, or an element without states.
         """
-        places, v = self._multibody().places_of_states(), self._kinematics()[0].v
+        system, states, _ = self.of_bodies()
+        places = system.places_of_states()
         if force not in places:
             raise ValueError(f"`states_of`: {suggestion(force, places)}, the force elements with states.")
-        return {name: v[..., place] for name, place in places[force].items()}
+        return {name: states.v[..., place] for name, place in places[force].items()}
 
     def force(self, name: str) -> Any:
         """What a force element measures, every array with a leading axis n + 1 if this is a trajectory.
@@ -193,9 +201,9 @@ class AbstractMotion(eqx.Module):
         other elements the generalized force [F_a, M_a, F_b, M_b] that they apply.
         Raises `ValueError` for an unknown name, or one of several loads (gravity).
         """
-        states, t = self._kinematics()
+        system, states, t = self.of_bodies()
         at = states.q, states.v, states.vdot, states.lam, t
-        measure = partial(measured, self._multibody(), name)
+        measure = partial(measured, system, name)
         if jnp.ndim(t) == 0:
             stacked = measure(*jax.tree.map(lambda leaf: leaf[None], at))
             return jax.tree.map(lambda leaf: leaf[0], stacked)
@@ -222,7 +230,7 @@ class AbstractRun(AbstractMotion):
         return self._joint_motions((name,))[name]
 
     def _joint_motions(self, names: Iterable[str]) -> dict[str, JointMotion]:
-        system, (states, t) = self._multibody(), self._kinematics()
+        system, states, t = self.of_bodies()
         joints = self.joints
         if joints is None:
             raise ValueError(

@@ -1,0 +1,152 @@
+"""One scene on R³ × SO(3) and on SE(3): the same equations, another solution of second order, the same derivatives."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from free_scenes import mixed
+from helpers import close, everything, says
+
+import lgsens as lg
+from lgsens.dynamics import State, autodiff_constraint_jacobian, autodiff_tangents
+from lgsens.examples import four_bar, heavy_top
+from lgsens.liegroups import RigidMotions
+from lgsens.model import SE3System
+
+
+def on_se3(model):
+    return dataclasses.replace(model, formulation="SE3")
+
+
+def controlled():
+    """A body, one on a rail, friction from the forces of a joint, and an actuator, whose lag is a state."""
+    bodies = {
+        "arm": lg.RigidBody(2.0, (0.1, 0.2, 0.3), position=(0.3, 0.1, 0.2), angular_velocity=(0.0, 0.0, 1.0)),
+        "cart": lg.RigidBody(1.0, (0.1, 0.1, 0.1), position=(0.5, 0.0, 0.2), free="x"),
+    }
+    joints = {"hinge": lg.RevoluteJoint("cart", "arm", at=(0.5, 0.0, 0.2), axis=(0, 0, 1))}
+    along = lg.TranslationDriver(None, "cart", at=(0, 0, 0), axis=(1.0, 0, 0), value=0.0)
+    command = lg.Harmonic(amplitude=1.0, frequency=2.0)
+    forces = {
+        "friction": lg.JointFriction("hinge", coefficient=0.3, slip_speed=0.1, radius=0.02),
+        "motor": lg.Actuator(along, command=command, time_constant=0.1),
+    }
+    return lg.Model(bodies, joints, forces)
+
+
+@pytest.mark.parametrize("scene", [everything, lambda: mixed()[0]], ids=["whole bodies", "partly free bodies"])
+def test_tangents_and_jacobians_equal_autodiff(scene):
+    system = on_se3(scene()).equations()
+    rng, k, m = np.random.default_rng(1), system.group.dim, len(system.constraint_names)
+    draw = lambda size, scale=1.0: jnp.asarray(rng.normal(scale=scale, size=size))
+    q = system.group.retract(system.bodies.pose, draw(k, 0.3))
+    point = q, draw(k), draw(k), draw(m), jnp.asarray(0.17)
+    found = eqx.filter_jit(lambda system, point: system.tangents(*point))(system, point)
+    expected = eqx.filter_jit(lambda system, point: autodiff_tangents(system, *point))(system, point)
+    assert isinstance(system.group, RigidMotions) == (scene is not everything)
+    # sums of some ten terms of some ten products, as on R³ × SO(3), turned twice
+    jax.tree.map(lambda x, y: close(x, y, 1000), found, expected)
+    close(autodiff_constraint_jacobian(system, q, point[-1]), system.constraint_jacobian(q, point[-1]), 1000)
+
+
+def test_mass_and_gyroscopic_forces_are_those_of_the_kinetic_energy():
+    """Poincaré's equations of T = ½ vᵀM v on the group: M v̇ − ad(v)ᵀ M v, for a body without forces."""
+    model = lg.Model({"b": lg.RigidBody(1.3, (0.2, 0.3, 0.4), position=(0.1, 0.2, 0.3))}, formulation="SE3")
+    system = model.equations()
+    rng = np.random.default_rng(0)
+    q = system.group.retract(system.bodies.pose, jnp.asarray(rng.normal(size=6)))
+    v, vdot = jnp.asarray(rng.normal(size=(2, 6)))
+    mass = system.mass_matrix()
+    close(mass, np.diag([1.3, 1.3, 1.3, 0.2, 0.3, 0.4]), 1)
+    expected = mass @ vdot - system.group.ad(v).T @ (mass @ v)
+    close(system.residual(q, v, vdot, jnp.zeros(0), jnp.asarray(0.0)), expected, 20)
+
+
+def test_a_screw_is_exact_in_any_step():
+    """A body on a cylindrical joint, which turns and slides at constant rates: q exp(h v) is its motion."""
+    rates = {"velocity": (-0.8, 0.0, 0.3), "angular_velocity": (0.0, 0.0, 2.0)}
+    body = lg.RigidBody(1.0, (0.1, 0.2, 0.3), position=(0.0, 0.4, 0.0), **rates)
+    joint = lg.CylindricalJoint(None, "b", at=(0, 0, 0), axis=(0, 0, 1.0))
+    model = lg.Model({"b": body}, {"bearing": joint})
+    run = lambda model: lg.simulate(model, t1=1.0, num_steps=8).body("b").position[-1]
+    expected = [-0.4 * np.sin(2.0), 0.4 * np.cos(2.0), 0.3]
+    np.testing.assert_allclose(run(on_se3(model)), expected, rtol=0, atol=1e-10)  # Newton's tolerance
+    assert np.abs(run(model) - np.asarray(expected)).max() > 1e-3  # (Ω h)²/12 of the angle, on R³ × SO(3)
+
+
+DAMPED = lg.GeneralizedAlpha(rho_inf=0.2)  # the start's transient in accelerations is over after a few steps
+
+
+def test_both_are_solutions_of_second_order_of_the_same_scene():
+    """All that a trajectory answers by name: positions to accelerations, forces of joints, multipliers."""
+    model = four_bar()
+
+    def ends(model, n):
+        run = lg.simulate(model, t1=0.2, num_steps=n, integrator=DAMPED)
+        moved = [np.concatenate([np.ravel(of[-1]) for of in run.body(name)]) for name in model.bodies]
+        return [*moved, run.joint("B").force[-1], run.multiplier("C")[-1]]
+
+    coarse, fine = ([np.abs(a - b).max() for a, b in zip(ends(on_se3(model), n), ends(model, n))] for n in (40, 80))
+    assert min(coarse) > 1e-6  # they are not the same solution
+    np.testing.assert_allclose(np.log2(np.divide(coarse, fine)), 2.0, atol=0.1)  # h³ beside h², in 40 steps
+
+
+def test_partly_free_bodies_with_states_and_friction():
+    """A trajectory of partly free bodies, a lag and friction by the forces of its joint answers as on R³ × SO(3)."""
+    model = controlled()
+    runs = [lg.simulate(each, t1=0.2, num_steps=40, integrator=DAMPED) for each in (model, on_se3(model))]
+    assert isinstance(runs[1].system, SE3System)
+    answers = lambda r: (r.body("arm").velocity, r.joint("hinge").force, *r.states_of("motor").values())
+    for found, expected in zip(*(map(np.asarray, answers(r)) for r in reversed(runs))):
+        size = np.abs(expected).max()
+        # seen: 1.4e-4 of the force, a quarter of it with twice the steps
+        assert np.abs(found - expected)[10:].max() < 1e-3 * size
+
+
+def test_derivatives():
+    """DDM and AVM of a top by its numbers and its start, to round-off; differences."""
+    exact = lg.GeneralizedAlpha(tolerance=1e-13)  # differences see what Newton leaves
+
+    def value(p, sensitivity):
+        model = on_se3(heavy_top(m=p[0], l=p[1], Om2=p[2]))
+        run = lg.simulate(model, t1=0.02, num_steps=20, integrator=exact, sensitivity=sensitivity)
+        last = jnp.concatenate([leaf[-1].ravel() for leaf in run.body("top")])
+        return last @ jnp.linspace(1.0, 2.0, 24) + 1e-3 * jnp.sum(run.states.lam[-1])
+
+    p = jnp.asarray([15.0, 1.0, 150.0])
+    run = jax.jit(jax.value_and_grad(lambda p: value(p, lg.AdjointVariable())))
+    direct = jax.jit(jax.jacfwd(lambda p: value(p, lg.DirectDifferentiation())))(p)
+    _, adjoint = run(p)
+    size = np.asarray(p * direct)
+    np.testing.assert_allclose(p * adjoint, size, rtol=0, atol=1e-10 * np.abs(size).max())  # round-off over h²
+    for i, along in enumerate(np.diag(1e-3 * np.asarray(p))):
+        first, second = (float(run(p + s * along)[0] - run(p - s * along)[0]) for s in (1, 2))
+        difference = (8 * first - second) / 12e-3
+        # fourth order of 1e-3, spin × time = 3 rad: 1e-10; round-off of accelerations of 1e4, over h² and the step
+        assert abs(difference - size[i]) < 1e-6 * np.abs(size).max()
+
+
+def test_states_of_both_say_the_same():
+    """`Trajectory.of_bodies` of a motion, and of a start: consistent in velocities and accelerations."""
+    model = four_bar()
+    mixed_state, state = lg.initial_state(model), lg.initial_state(on_se3(model))
+    found = on_se3(model).equations().state_of_bodies(state)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(mixed_state)):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-10 * max(1.0, np.abs(b).max()))  # two linear solves
+    assert isinstance(found, State)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"formulation": "SE(3)"}, says("`formulation`", "'R3xSO3', 'SE3'", "'SE(3)'")),
+        ({"formulation": "SE3", "linear_solver": lg.BlockSparse()}, says("BlockSparse()", "R3xSO3", "leave it out")),
+    ],
+    ids=["unknown", "sparse"],
+)
+def test_bad_input(options, message):
+    with pytest.raises(ValueError, match=message):
+        lg.Model({"b": lg.RigidBody(1.0, (1.0, 1.0, 1.0))}, **options)
