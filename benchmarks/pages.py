@@ -131,6 +131,7 @@ def of(module: str, function: str, key: str | None = None) -> Callable[[dict], s
 
 # By name of the marks: the page, the files of results, and the table.
 TABLES: dict[str, tuple[str, tuple[str, ...], Callable[..., str]]] = {
+    "formulations": ("concepts", ("formulations",), of("formulations", "table")),
     "fidelity": ("scenes", ("routes",), fidelity),
     "routes": ("choosing", ("routes",), routes),
     "recommendations": (

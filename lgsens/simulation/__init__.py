@@ -1,5 +1,6 @@
 """A model in, a trajectory out: `simulate`, how it starts, what it returns, failures as data."""
 
+from lgsens.simulation._body_motion import BodyMotion as BodyMotion, PointMotion as PointMotion
 from lgsens.simulation._errors import (
     SimulationError as SimulationError,
     failures_by_callback as failures_by_callback,
@@ -39,9 +40,7 @@ from lgsens.simulation._to_accuracy import to_accuracy as to_accuracy
 from lgsens.simulation._trajectory import (
     AbstractMotion as AbstractMotion,
     AbstractRun as AbstractRun,
-    BodyMotion as BodyMotion,
     Instant as Instant,
-    PointMotion as PointMotion,
     Saved as Saved,
     StateError as StateError,
     Trajectory as Trajectory,

@@ -17,55 +17,10 @@ from lgsens._validate import as_float, is_concrete, suggestion
 from lgsens.dynamics import RESULTS, AbstractSystem, State
 from lgsens.integrate import Stages
 from lgsens.model import AbstractJoint, Frame, MultibodySystem, SE3System, joint_wrenches, measured, motion_at, scene_of
+from lgsens.simulation._body_motion import BodyMotion, PointMotion
 from lgsens.simulation._joint_motion import JointMotion, joint_motion
 from lgsens.simulation._reached import Reached
 from lgsens.simulation._tables import to_csv, to_pandas, to_xarray
-
-
-class BodyMotion(NamedTuple):
-    """The motion of one body; every array has a leading axis over the n + 1 times, at an `Instant` none.
-
-    Attributes:
-        position: centre of mass [m], inertial frame, shape (n+1, 3).
-        orientation: rotation matrix, body to inertial frame, shape (n+1, 3, 3).
-        velocity: velocity of the centre of mass [m/s], inertial frame, shape (n+1, 3).
-        angular_velocity: Ω [rad/s], body frame, shape (n+1, 3).
-        acceleration: acceleration of the centre of mass [m/s²], inertial frame, shape (n+1, 3).
-        angular_acceleration: Ω̇ [rad/s²], body frame, shape (n+1, 3).
-    """
-
-    position: Float[Array, "*n 3"]
-    orientation: Float[Array, "*n 3 3"]
-    velocity: Float[Array, "*n 3"]
-    angular_velocity: Float[Array, "*n 3"]
-    acceleration: Float[Array, "*n 3"]
-    angular_acceleration: Float[Array, "*n 3"]
-
-    __repr__ = brief
-
-    def point(self, at) -> Float[Array, "n 3"]:
-        """The path [m], inertial frame, of the body's point that is at `at` (inertial frame, shape (3,)) at first.
-
-        Needs a motion with times: that of a `Trajectory`.
-        """
-        local = self.orientation[0].T @ (jnp.asarray(at, self.position.dtype) - self.position[0])
-        return self.position + self.orientation @ local
-
-
-class PointMotion(NamedTuple):
-    """The motion of a point fixed to a body, inertial frame; arrays have a leading axis n + 1, at an `Instant` none.
-
-    Attributes:
-        position: where it is [m], shape (n+1, 3).
-        velocity: its velocity [m/s], shape (n+1, 3).
-        acceleration: its acceleration [m/s²], shape (n+1, 3).
-    """
-
-    position: Float[Array, "*n 3"]
-    velocity: Float[Array, "*n 3"]
-    acceleration: Float[Array, "*n 3"]
-
-    __repr__ = brief
 
 
 class StateError(NamedTuple):
@@ -118,8 +73,7 @@ class AbstractMotion(eqx.Module):
         reached = getattr(self, "reached", None)
         if reached is not None:
             fields["reached"] = reached.brief
-        scene = scene_of(system)
-        if scene is not None:
+        if (scene := scene_of(system)) is not None:
             whole = scene if scene.parts is None else scene.parts.system
             own = dict.fromkeys(whole.constraint_names) if joints is None else joints
             fields |= {"bodies": roster(whole.body_names), "joints": roster(own)}

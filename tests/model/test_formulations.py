@@ -37,7 +37,10 @@ def controlled():
     return lg.Model(bodies, joints, forces)
 
 
-@pytest.mark.parametrize("scene", [everything, lambda: mixed()[0]], ids=["whole bodies", "partly free bodies"])
+SCENES = [pytest.param(everything, marks=pytest.mark.slow), lambda: mixed()[0]]  # the other one has whole bodies, too
+
+
+@pytest.mark.parametrize("scene", SCENES, ids=["whole bodies", "partly free bodies"])
 def test_tangents_and_jacobians_equal_autodiff(scene):
     system = on_se3(scene()).equations()
     rng, k, m = np.random.default_rng(1), system.group.dim, len(system.constraint_names)
@@ -77,9 +80,23 @@ def test_a_screw_is_exact_in_any_step():
     assert np.abs(run(model) - np.asarray(expected)).max() > 1e-3  # (Ω h)²/12 of the angle, on R³ × SO(3)
 
 
+def test_a_top_moves_on_se3_as_about_its_fixed_point():
+    """u + Ω × X = 0 is linear there, so that each increment has it, and what is left is the scheme on SO(3) with the
+    moment of inertia about the point: `RigidBody(pivot=…)`, step by step, the start's transient included."""
+    model = heavy_top()
+    body = model.bodies["top"]
+    numbers = {name: getattr(body, name) for name in ("mass", "inertia", "position", "orientation", "angular_velocity")}
+    about = lg.Model({"top": lg.RigidBody(**numbers, free="rx ry rz", pivot=(0, 0, 0))}, {}, model.forces)
+    exact = lg.GeneralizedAlpha(tolerance=1e-13)
+    runs = [lg.simulate(each, t1=0.05, num_steps=25, integrator=exact).body("top") for each in (on_se3(model), about)]
+    for found, expected, rounded in zip(*runs, (1e-12, 1e-12, 1e-10, 1e-10, 1e-7, 1e-7)):  # over h²
+        assert np.abs(found - expected).max() <= rounded * max(1.0, np.abs(expected).max())
+
+
 DAMPED = lg.GeneralizedAlpha(rho_inf=0.2)  # the start's transient in accelerations is over after a few steps
 
 
+@pytest.mark.slow  # two programs; the top about its fixed point is in the quick run
 def test_both_are_solutions_of_second_order_of_the_same_scene():
     """All that a trajectory answers by name: positions to accelerations, forces of joints, multipliers."""
     model = four_bar()
@@ -94,6 +111,7 @@ def test_both_are_solutions_of_second_order_of_the_same_scene():
     np.testing.assert_allclose(np.log2(np.divide(coarse, fine)), 2.0, atol=0.1)  # h³ beside h², in 40 steps
 
 
+@pytest.mark.slow  # two programs
 def test_partly_free_bodies_with_states_and_friction():
     """A trajectory of partly free bodies, a lag and friction by the forces of its joint answers as on R³ × SO(3)."""
     model = controlled()
