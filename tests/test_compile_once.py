@@ -59,6 +59,7 @@ def test_eager_gradients_share_their_programs(compiled):
     np.testing.assert_allclose(run.t, np.linspace(0.0, 0.1, 31), rtol=0, atol=1e-16)
 
 
+@pytest.mark.slow  # as the gradients above
 def test_the_same_derivative_by_parts(compiled):
     """`differentiate`, whose programs know the numbers of the call as data, against `jit`, where they are constants."""
 

@@ -16,7 +16,7 @@ RUNS = {
 }
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n == "radau")) for n in RUNS])
 def test_no_nan_on_the_way(name):
     def last_height(mass):
         run = lg.simulate(spinning_top(jnp.asarray(0.7), mass=mass), t1=0.02, num_steps=4, **RUNS[name])

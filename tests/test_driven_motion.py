@@ -190,7 +190,8 @@ def by_height(x):
     return np.array([*y[:, -1], load(BEGUN + END, y[:, -1]), load(BEGUN, start)])
 
 
-@pytest.mark.parametrize("name", ["index 3", *(pytest.param(n, marks=pytest.mark.slow) for n in list(INTEGRATORS)[1:])])
+@pytest.mark.slow  # a program each; the start of a driven slider-crank: `model/test_drivers.py`
+@pytest.mark.parametrize("name", INTEGRATORS)
 def test_motion_begins_from_an_equilibrium_with_the_rate_of_its_driver(name):
     x, exact = np.array([0.1, 1.3, 3.0]), by_height(np.array([0.1, 1.3, 3.0]))
     run = jax.jit(partial(from_equilibrium, integrator=INTEGRATORS[name]), static_argnums=1)
@@ -200,6 +201,7 @@ def test_motion_begins_from_an_equilibrium_with_the_rate_of_its_driver(name):
     assert np.all(fine[:3] < np.maximum(coarse[:3] / 3.5, 1e-9)) and fine.max() < 1e-3 * np.abs(exact).max()
 
 
+@pytest.mark.slow  # others of an equilibrium: `test_statics.py`
 def test_gradients_of_an_equilibrium_with_a_moving_driver():
     def state(x):
         found = lg.equilibrium(hung(x), t0=x[3])

@@ -20,8 +20,8 @@ def blocks(text, language="python"):
 
 PAGES = [path for path in sorted((ROOT / "notebooks").rglob("*.md")) if blocks(path.read_text(encoding="utf-8"))]
 # How many blocks the quick run takes; where it is 0 `test_fidelity.py`, `test_step_jacobians.py`, `test_linearize.py`
-# and `test_certify.py` are small versions.
-LONG = {"control": 0, "flexible": 1, "fidelity": 0, "small_motions": 0, "suspension": 1, "trust": 0}
+# `test_certify.py`, `test_flexible.py` and `test_suspension_files.py` are small versions.
+LONG = dict.fromkeys(("control", "flexible", "fidelity", "small_motions", "suspension", "trust"), 0)
 WHOLE = [pytest.param(path, None, marks=[pytest.mark.slow] * (path.stem in LONG), id=path.stem) for path in PAGES]
 BEGUN = [pytest.param(path, LONG[path.stem], id=f"begun-{path.stem}") for path in PAGES if LONG.get(path.stem)]
 

@@ -265,7 +265,7 @@ def linkage(angle, coupler=0.9, rocker=0.3):
     return lg.Model(bodies, joints)
 
 
-@pytest.mark.parametrize("factor_every", [20, 0])
+@pytest.mark.parametrize("factor_every", [20, pytest.param(0, marks=pytest.mark.slow)])
 def test_a_parallelogram_through_its_dead_centre_is_said_to_be_singular(factor_every):
     scheme = lg.GeneralizedAlpha(0.8, factor_every=factor_every)
     with pytest.raises(lg.SimulationError, match=says("passes a singular configuration", "of 100, t = 0.0")):
@@ -290,9 +290,8 @@ OTHERS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", ["adaptive", *(pytest.param(n, marks=pytest.mark.slow) for n in OTHERS if n != "adaptive")]
-)
+@pytest.mark.slow  # a program each; equal steps are above
+@pytest.mark.parametrize("name", OTHERS)
 def test_other_steps_are_watched_too(name):
     run = lambda model, t1: lg.simulate(model, t1=t1, num_steps=100, integrator=OTHERS[name], throw=False)
     found = run(linkage(2.8), 0.1)

@@ -49,6 +49,7 @@ def test_derivatives(derivative):
     same(derivative(lambda alpha: saved(alpha).values)(0.7), derivative(of_trajectory)(0.7))
 
 
+@pytest.mark.slow  # as reverse mode above
 def test_adjoint_variable_method():
     total = lambda values: jnp.sum(values["side"] ** 2) + jnp.sum(values["force"])
     method = {"sensitivity": lg.AdjointVariable()}

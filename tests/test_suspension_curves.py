@@ -170,6 +170,7 @@ def test_gradients_agree_with_differences_of_the_closure(car):
         np.testing.assert_allclose(forward[4, :, link, axis], expected[4], rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow  # two programs; both against the closure and the files' curves are in the quick run
 def test_links_as_bodies_or_rods_move_alike(car):
     rods, bodies = (car.travel(TRAVEL[::4], links=links) for links in ("rods", "bodies"))
     for quantity in ("position", "orientation", "velocity", "angular_velocity"):

@@ -71,6 +71,7 @@ def test_order():
     assert np.all(np.abs(orders[-1] - 2.0) < 0.1), orders  # the next term of the error is a step of 3e-3 smaller
 
 
+@pytest.mark.slow  # on the grid that error control has found: below
 def test_derivatives_on_a_given_grid():
     """By parameters, times and sizes, with empty steps in the middle and at the end: both modes, differences."""
     sizes = uneven(24)

@@ -110,7 +110,8 @@ OTHERS = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n == "given" else pytest.mark.slow) for n in OTHERS])
+@pytest.mark.slow  # two programs each; an oscillator is above
+@pytest.mark.parametrize("name", OTHERS)
 def test_other_steps_and_schemes(name):
     """By a second run that divides each step: what is left is O(h) of the error, from explicit steps of order 8.
 

@@ -275,6 +275,7 @@ def cantilever(load, elements):
     return section, lg.Model(beam.bodies, {"clamp": clamp}, beam.forces | {"push": push}, merge_fixed=True)
 
 
+@pytest.mark.slow  # a program of statics
 def test_a_stiff_element_bends():
     """The moment in the middle is F L/2: z = F L³/(4 EI) + F L/GA; the rest is of third order, 1e-9."""
     section, model = cantilever(1.0, 1)

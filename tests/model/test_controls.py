@@ -69,6 +69,7 @@ def exact():
     return np.array([spin, z, u, target(0.5)[0] - angle])
 
 
+@pytest.mark.slow  # a lag, a relaxation and states of one's own are in the quick run
 def test_controlled_pendulum_is_that_of_its_ode():
     run = jax.jit(controlled, static_argnums=1)
     coarse, fine = (np.abs(run(GAINS, n) - exact()) for n in (50, 100))

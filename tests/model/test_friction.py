@@ -136,6 +136,7 @@ def swing(solver=None):
     return lg.Model({"bar": bar}, {"hinge": hinge}, forces, linear_solver=solver)
 
 
+@pytest.mark.slow  # its partial derivatives are in the quick run
 def test_gradient_of_what_is_carried():
     """AVM against differences of a program of one joint, by numbers of the friction, of the body and of the joint."""
 

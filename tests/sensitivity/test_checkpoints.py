@@ -47,7 +47,7 @@ def all_states():
 
 @pytest.mark.parametrize(
     "method",
-    [DIRECT(checkpoints="sqrt"), ADJOINT(checkpoints=2)],
+    [pytest.param(DIRECT(checkpoints="sqrt"), marks=pytest.mark.slow), ADJOINT(checkpoints=2)],
     ids=str,
 )
 def test_reverse_mode(method, all_states):

@@ -118,7 +118,7 @@ def linear_problem(scheme, num_steps, uneven=False):
     ("scheme", "uneven"),
     [
         (ALPHA, True),
-        (STABILIZED, False),
+        pytest.param(STABILIZED, False, marks=pytest.mark.slow),
         pytest.param(ALPHA, False, marks=pytest.mark.slow),
         pytest.param(lg.RadauIIA(), False, marks=pytest.mark.slow),
         pytest.param(lg.RadauIIA(), True, marks=pytest.mark.slow),
@@ -142,7 +142,14 @@ def test_the_linear_equations_with_rows_everywhere(scheme, uneven):
             np.testing.assert_allclose(one, other, rtol=0, atol=1e-11 * max(scale, 1e2))  # of 1/βh², in matvec
 
 
-@pytest.mark.parametrize(("scheme", "size"), [(ALPHA, 3 * 6 + 3), (STABILIZED, 2 * 6 + 2 * 3), (lg.RadauIIA(), 2 * 3)])
+@pytest.mark.parametrize(
+    ("scheme", "size"),
+    [
+        (ALPHA, 3 * 6 + 3),
+        pytest.param(STABILIZED, 2 * 6 + 2 * 3, marks=pytest.mark.slow),
+        pytest.param(lg.RadauIIA(), 2 * 3, marks=pytest.mark.slow),
+    ],
+)
 def test_a_step_hands_on_what_its_coordinates_hold(scheme, size):
     """R E = 1 and E R A = A: nothing is lost, and no matrix is larger than it need be. A has entries of 1/βh² = 1e4."""
     scheme, states, parameters, (delta, _), _ = linear_problem(scheme, 3)
