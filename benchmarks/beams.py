@@ -1,9 +1,11 @@
 """Beams: what elements cost, how fast they converge, and which links of a suspension have to bend.
 
-    python benchmarks/beams.py [--elements 8 32 128] [--repeats 5] [--out benchmarks/results]
+    python benchmarks/beams.py [--elements 8 32 128 256] [--repeats 5] [--exudyn] [--out benchmarks/results]
 
 Cost: a beam on a hinge falls, h = 1 ms; the gradient is that of the height of its tip by the stiffnesses of its
-section, in reverse mode. Time per step as in chain.py, the difference of two runs. Convergence: the Princeton beam,
+section, in reverse mode. Time per step as in chain.py, the difference of two runs. With `--exudyn`, where it is
+installed, beside the fastest program of Exudyn's geometrically exact beam (`rival_beams.py`), timed in the same rounds
+on the same beam without damping, which changes no operation of lgsens's. Convergence: the Princeton beam,
 loaded at 45° by 8.896 N, its tip against that of 16 and 32 elements extrapolated. Links: the five-link quarter-car with
 its strut, which carries spring and damper, and its trailing arm as steel tubes of 30 × 3 mm in four elements each; what
 bending changes of its comfort and the gradient, predicted by one program of the rich scene and run. Writes beams.json
@@ -17,20 +19,21 @@ import os
 import statistics
 import time
 
+import rival_beams
 from benchmark import SINGLE_THREAD, circumstances, environment, interleaved, options, write
 
-STEPS, H = (20, 100), 1e-3
+STEPS, H, DAMPING = (20, 100), 1e-3, 1e-4
 STEEL = {"young": 2.1e11, "poisson": 0.3, "density": 7850.0}
 
 
-def cost(elements: int, repeats: int) -> dict:
+def cost(elements: int, repeats: int, exudyn: bool) -> dict:
     import jax
     import jax.numpy as jnp
 
     import lgsens as lg
 
-    def height(stiffness, steps):
-        section = lg.BeamSection(stiffness, 1.0, [0.02, 0.01, 0.01], damping=1e-4)
+    def height(stiffness, damping, steps):
+        section = lg.BeamSection(stiffness, 1.0, [0.02, 0.01, 0.01], damping=damping)
         beam = lg.Beam("b", section, [[0, 0, 0], [10.0, 0, 0]], elements=elements)
         hinge = {"hinge": lg.RevoluteJoint(None, "b.0", at=[0, 0, 0], axis=[0, 0, 1.0])}
         model = lg.Model(beam.bodies, hinge, beam.forces | {"gravity": lg.Gravity([0, -9.81, 0])})
@@ -39,15 +42,30 @@ def cost(elements: int, repeats: int) -> dict:
     stiffness, found, calls = jnp.array([1e6, 5e5, 5e5, 1e3, 1e3, 1e3]), {"elements": elements}, {}
     for steps, (name, function) in itertools.product(STEPS, (("simulate", height), ("gradient", jax.grad(height)))):
         started = time.perf_counter()
-        compiled = jax.jit(function, static_argnums=1).lower(stiffness, steps).compile()
+        cpu_started = time.process_time()
+        compiled = jax.jit(function, static_argnums=2).lower(stiffness, DAMPING, steps).compile()
         found[f"{name}_compile_s"] = time.perf_counter() - started
-        calls[name, steps] = lambda compiled=compiled: jax.block_until_ready(compiled(stiffness))
+        found[f"{name}_compile_cpu_s"] = time.process_time() - cpu_started
+        calls[name, steps] = lambda compiled=compiled: jax.block_until_ready(compiled(stiffness, DAMPING))
         calls[name, steps]()
+        if exudyn and name == "simulate":
+            calls["undamped", steps] = lambda compiled=compiled: jax.block_until_ready(compiled(stiffness, 0.0))
+    if exudyn:
+        beam, choice, found["exudyn"] = rival_beams.fastest(elements, STEPS[1], H)
+        ours = float(calls["undamped", STEPS[1]]())
+        for steps in STEPS:
+            settings = beam.settings(steps, H, *choice)
+            calls["exudyn", steps] = lambda settings=settings: beam.solve(settings)
+        for key in ("tip", "tip_lumped"):
+            theirs = found["exudyn"][key]
+            found["exudyn"][f"{key}_difference"] = None if theirs is None else theirs - ours
+        found["exudyn"]["tip_lgsens"] = ours
     times = interleaved(calls, repeats, seconds=3.0)
-    for name in ("simulate", "gradient"):
-        few, many = (times[name, steps].wall for steps in STEPS)
-        taken = statistics.median(long - short for short, long in zip(few, many))
-        found[f"{name}_us_per_step"] = taken / (STEPS[1] - STEPS[0]) * 1e6
+    for name in dict.fromkeys(name for name, _ in calls):
+        few, many = (times[name, steps] for steps in STEPS)
+        for suffix, short, long in (("", few.wall, many.wall), ("_cpu", few.cpu, many.cpu)):
+            taken = statistics.median(b - a for a, b in zip(short, long))
+            found[f"{name}_us_per_step{suffix}"] = taken / (STEPS[1] - STEPS[0]) * 1e6
     return found
 
 
@@ -104,6 +122,18 @@ def table(document: dict) -> str:
         f"| {row['simulate_compile_s']:.1f}, {row['gradient_compile_s']:.1f} |"
         for row in document["cost"]
     ]
+    if rivals := [row for row in document["cost"] if "exudyn" in row]:
+        lines += ["", "| elements | lgsens [µs/step] | Exudyn [µs/step] | ratio | Exudyn's program "]
+        lines[-1] += "| tip: difference [m] | with masses on the nodes |"
+        lines += ["|---" * 7 + "|"]
+        difference = lambda number: "–" if number is None else f"{abs(number):.0e}"
+        for row in rivals:
+            of, numbers = row["exudyn"], [row[f"{name}_us_per_step_cpu"] for name in ("undamped", "exudyn")]
+            tips = " | ".join(difference(of[f"{key}_difference"]) for key in ("tip", "tip_lumped"))
+            lines.append(
+                f"| {row['elements']} | {numbers[0]:.0f} | {numbers[1]:.0f} | {numbers[0] / numbers[1]:.2f} "
+                f"| {of['program']} | {tips} |"
+            )
     for short, long in itertools.pairwise(document["cost"]):
         ratio = math.log(long["elements"] / short["elements"])
         slopes = [
@@ -127,15 +157,19 @@ def table(document: dict) -> str:
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--elements", nargs="+", type=int, default=[8, 32, 128])
+    parser.add_argument("--elements", nargs="+", type=int, default=[8, 32, 128, 256])
+    parser.add_argument("--exudyn", action="store_true", help="beside Exudyn, where it is installed")
     arguments = parser.parse_args()
+    if arguments.exudyn and not rival_beams.available():
+        print("Exudyn is not installed; lgsens alone.")
+        arguments.exudyn = False
     path = arguments.out / "beams.json"
     os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
     import jax
 
     jax.config.update("jax_enable_x64", True)
     document: dict = {"environment": environment(SINGLE_THREAD)}
-    document["cost"] = [cost(elements, arguments.repeats) for elements in arguments.elements]
+    document["cost"] = [cost(elements, arguments.repeats, arguments.exudyn) for elements in arguments.elements]
     document |= {"convergence": convergence(), "links": links()}
     write(path, document)
     print(table(json.loads(path.read_text(encoding="utf-8"))))
