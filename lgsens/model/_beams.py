@@ -154,7 +154,7 @@ class Beam(eqx.Module):
         lengths = _norm(points[1:] - points[:-1])[:, 0]
         none, xp = 0.0 * lengths[:1], _module(points)
         carried = (xp.concatenate([none, lengths]) + xp.concatenate([lengths, none])) / 2.0
-        numbers = zip(*map(list, (carried * mass, carried[:, None] * inertia, points, axes)))
+        numbers = zip(*map(list, (carried * mass, carried[:, None] * inertia[None], points, axes)))
         with jax.ensure_compile_time_eval():
             return {node: RigidBody(*own) for node, own in zip(self.nodes, numbers)}
 
@@ -188,7 +188,7 @@ def _tangents(chords: Float[Array, "n 3"]) -> Float[Array, "m 3"]:
 
 def _triads(tangents: Float[Array, "m 3"], up: Float[Array, "3"]) -> Float[Array, "m 3 3"]:
     xp = np if isinstance(tangents, np.ndarray) and isinstance(up, np.ndarray) else jnp
-    across = xp.cross(up, tangents)
+    across = xp.cross(up[None], tangents)
     with np.errstate(invalid="ignore"):  # `up` along the beam
         across = across / _norm(across)
     return xp.stack([tangents, across, xp.cross(tangents, across)], axis=2)
