@@ -187,7 +187,7 @@ def _tangents(chords: Float[Array, "n 3"]) -> Float[Array, "m 3"]:
 
 
 def _triads(tangents: Float[Array, "m 3"], up: Float[Array, "3"]) -> Float[Array, "m 3 3"]:
-    xp = np if isinstance(tangents, np.ndarray) and isinstance(up, np.ndarray) else jnp
+    xp: Any = np if isinstance(tangents, np.ndarray) and isinstance(up, np.ndarray) else jnp
     across = xp.cross(up[None], tangents)
     with np.errstate(invalid="ignore"):  # `up` along the beam
         across = across / _norm(across)

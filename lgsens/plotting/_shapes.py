@@ -89,8 +89,8 @@ def shapes(system: MultibodySystem) -> Shapes:
                 line = _world(position, orientation, b, at_b) - _world(position, orientation, a, at_a)
                 struts.append(StrutShape(role, a, at_a, b, at_b, _RADIUS * float(np.linalg.norm(line))))
                 if role == "beam":
-                    along = (np.asarray(element.fixed("axes", end)[0])[:, 0] for end in ends)
-                    struts[-1] = StrutShape(*struts[-1][:6], *along)
+                    along_a, along_b = (np.asarray(element.fixed("axes", end)[0])[:, 0] for end in ends)
+                    struts[-1] = struts[-1]._replace(along_a=along_a, along_b=along_b)
             if role == "wheel":
                 tyres.append(Tyre(marks[-1], element.road))
     if system.centre is not None:  # a body with a pivot has it in place of a joint
