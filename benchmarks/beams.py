@@ -1,6 +1,6 @@
 """Beams: what elements cost, how fast they converge, and which links of a suspension have to bend.
 
-    python benchmarks/beams.py [--elements 8 32 128] [--repeats 5] [--out benchmarks/results]
+    python benchmarks/beams.py [--elements 8 32 128] [--repeats 5] [--exudyn] [--out benchmarks/results]
 
 Cost: a beam on a hinge falls, h = 1 ms; the gradient is that of the height of its tip by the stiffnesses of its
 section, in reverse mode. Time per step as in chain.py, the difference of two runs. Convergence: the Princeton beam,
@@ -8,6 +8,9 @@ loaded at 45° by 8.896 N, its tip against that of 16 and 32 elements extrapolat
 its strut, which carries spring and damper, and its trailing arm as steel tubes of 30 × 3 mm in four elements each; what
 bending changes of its comfort and the gradient, predicted by one program of the rich scene and run. Writes beams.json
 and prints tables.
+
+With `--exudyn` this alone: the simulation beside the fastest program of Exudyn's geometrically exact beam
+(`rival_beams.py`), timed in the same rounds on the same beam without damping. It joins what beams.json has already.
 """
 
 import itertools
@@ -17,29 +20,33 @@ import os
 import statistics
 import time
 
+import rival_beams
 from benchmark import SINGLE_THREAD, circumstances, environment, interleaved, options, write
 
 STEPS, H = (20, 100), 1e-3
+STIFFNESS = (1e6, 5e5, 5e5, 1e3, 1e3, 1e3)
 STEEL = {"young": 2.1e11, "poisson": 0.3, "density": 7850.0}
+
+
+def height(stiffness, elements: int, steps: int, damping: float):
+    """Of the tip [m], after so many steps."""
+    import lgsens as lg
+
+    section = lg.BeamSection(stiffness, 1.0, [0.02, 0.01, 0.01], damping=damping)
+    beam = lg.Beam("b", section, [[0, 0, 0], [10.0, 0, 0]], elements=elements)
+    hinge = {"hinge": lg.RevoluteJoint(None, "b.0", at=[0, 0, 0], axis=[0, 0, 1.0])}
+    model = lg.Model(beam.bodies, hinge, beam.forces | {"gravity": lg.Gravity([0, -9.81, 0])})
+    return lg.simulate(model, t1=steps * H, num_steps=steps).body(beam.nodes[-1]).position[-1, 1]
 
 
 def cost(elements: int, repeats: int) -> dict:
     import jax
     import jax.numpy as jnp
 
-    import lgsens as lg
-
-    def height(stiffness, steps):
-        section = lg.BeamSection(stiffness, 1.0, [0.02, 0.01, 0.01], damping=1e-4)
-        beam = lg.Beam("b", section, [[0, 0, 0], [10.0, 0, 0]], elements=elements)
-        hinge = {"hinge": lg.RevoluteJoint(None, "b.0", at=[0, 0, 0], axis=[0, 0, 1.0])}
-        model = lg.Model(beam.bodies, hinge, beam.forces | {"gravity": lg.Gravity([0, -9.81, 0])})
-        return lg.simulate(model, t1=steps * H, num_steps=steps).body(beam.nodes[-1]).position[-1, 1]
-
-    stiffness, found, calls = jnp.array([1e6, 5e5, 5e5, 1e3, 1e3, 1e3]), {"elements": elements}, {}
+    stiffness, found, calls = jnp.array(STIFFNESS), {"elements": elements}, {}
     for steps, (name, function) in itertools.product(STEPS, (("simulate", height), ("gradient", jax.grad(height)))):
         started = time.perf_counter()
-        compiled = jax.jit(function, static_argnums=1).lower(stiffness, steps).compile()
+        compiled = jax.jit(function, static_argnums=(1, 2, 3)).lower(stiffness, elements, steps, 1e-4).compile()
         found[f"{name}_compile_s"] = time.perf_counter() - started
         calls[name, steps] = lambda compiled=compiled: jax.block_until_ready(compiled(stiffness))
         calls[name, steps]()
@@ -49,6 +56,31 @@ def cost(elements: int, repeats: int) -> dict:
         taken = statistics.median(long - short for short, long in zip(few, many))
         found[f"{name}_us_per_step"] = taken / (STEPS[1] - STEPS[0]) * 1e6
     return found
+
+
+def beside_exudyn(elements: int, repeats: int) -> dict:
+    import jax
+    import jax.numpy as jnp
+
+    stiffness, calls = jnp.array(STIFFNESS), {}
+    beam, choice, found = rival_beams.fastest(elements, STEPS[1], H)
+    for steps in STEPS:
+        started = time.process_time()
+        compiled = jax.jit(height, static_argnums=(1, 2, 3)).lower(stiffness, elements, steps, 0.0).compile()
+        found["compile_cpu_s"] = time.process_time() - started
+        settings = beam.settings(steps, H, *choice)
+        calls["lgsens", steps] = lambda compiled=compiled: compiled(stiffness).block_until_ready()
+        calls["exudyn", steps] = lambda settings=settings: beam.solve(settings)
+        found["tip_lgsens"] = float(calls["lgsens", steps]())
+        calls["exudyn", steps]()
+    times = interleaved(calls, repeats, seconds=5.0)
+    for name in ("lgsens", "exudyn"):
+        few, many = (times[name, steps] for steps in STEPS)
+        for suffix, short, long in (("", few.wall, many.wall), ("_cpu", few.cpu, many.cpu)):
+            taken = statistics.median(b - a for a, b in zip(short, long))
+            found[f"{name}_us_per_step{suffix}"] = taken / (STEPS[1] - STEPS[0]) * 1e6
+    print(found, flush=True)
+    return {"elements": elements, **found}
 
 
 def convergence() -> list[dict]:
@@ -122,19 +154,46 @@ def table(document: dict) -> str:
         f"| {row['gradient_run']:.2e} |"
         for row in document["links"]
     ]
-    return "\n".join(lines)
+    return "\n".join(lines + (rival_table(document["exudyn"]) if "exudyn" in document else []))
+
+
+def rival_table(found: dict) -> list[str]:
+    """Processor time, which other load changes least; the tip of lgsens beside those of both beams of Exudyn's."""
+    lines = ["", circumstances(found["environment"]), ""]
+    lines += ["| elements | lgsens [µs/step] | Exudyn [µs/step] | ratio | Exudyn's program | tips differ [m] by "]
+    lines[-1] += "| with masses on nodes by |"
+    lines += ["|---" * 7 + "|"]
+    for row in found["rows"]:
+        ours, theirs = (row[f"{name}_us_per_step_cpu"] for name in ("lgsens", "exudyn"))
+        tips = (row[key] for key in ("tip", "tip_lumped"))
+        tips = " | ".join("–" if tip is None else f"{abs(tip - row['tip_lgsens']):.0e}" for tip in tips)
+        cells = f"{row['elements']} | {ours:.0f} | {theirs:.0f} | {ours / theirs:.2f} | {row['program']} | {tips}"
+        lines.append(f"| {cells} |")
+    return lines
 
 
 def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--elements", nargs="+", type=int, default=[8, 32, 128])
+    parser.add_argument("--exudyn", action="store_true", help="beside Exudyn, nothing else; skipped without it")
     arguments = parser.parse_args()
     path = arguments.out / "beams.json"
     os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    document: dict = {"environment": environment(SINGLE_THREAD)}
+    document: dict = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    if arguments.exudyn:
+        if not rival_beams.available():
+            print("Exudyn is not installed (benchmarks/requirements.txt); skipped.")
+            return
+        document["exudyn"] = {"environment": environment(SINGLE_THREAD), "rows": []}
+        for elements in arguments.elements:
+            document["exudyn"]["rows"].append(beside_exudyn(elements, arguments.repeats))
+            write(path, document)
+        print("\n".join(rival_table(document["exudyn"])))
+        return
+    document["environment"] = environment(SINGLE_THREAD)
     document["cost"] = [cost(elements, arguments.repeats) for elements in arguments.elements]
     document |= {"convergence": convergence(), "links": links()}
     write(path, document)

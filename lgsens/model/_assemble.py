@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lgsens._validate import is_concrete
 from lgsens.liegroups import Pose
 from lgsens.model._body import RigidBody
 from lgsens.model._evaluate_by_kind import StackRow, evaluated, joined, stacked
@@ -136,7 +137,8 @@ def _assemble(
     if moving is not bodies:
         frames = joined([body.frame for body in ordered])
     mass = stacked([body.mass for body in ordered])
-    velocity = jnp.concatenate([part for body in ordered for part in body.free_velocity])
+    pieces = [part for body in ordered for part in body.free_velocity]
+    velocity = jnp.asarray(np.concatenate(pieces)) if is_concrete(pieces) else jnp.concatenate(pieces)
     if more := len(free) - len(ordered):
         add = lambda of, value: jnp.concatenate([of, jnp.broadcast_to(value, (more, *of.shape[1:])).astype(of.dtype)])
         mass, inertia, centre = add(mass, 1.0), add(inertia, 0.0), add(centre, 0.0)

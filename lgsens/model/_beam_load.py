@@ -89,7 +89,7 @@ class BeamLoad(AbstractClosedFormLoad):
     preload: Float[Array, "6"]  # σ₀
 
     balanced = True
-    drawn = "link"
+    drawn = "beam"
 
     def screw(self, a: Frame, b: Frame) -> Float[Array, "6"]:
         """d."""

@@ -10,6 +10,7 @@ Theory of Elasticity, §109.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -39,12 +40,13 @@ class BeamSection(eqx.Module):
     damping: Float[Array, ""]
 
     def __init__(self, stiffness, mass, inertia, damping=0.0):
-        self.stiffness = as_float(stiffness, None, "BeamSection: `stiffness`")
+        with jax.ensure_compile_time_eval():  # of numbers that are known, inside of `jit` too
+            self.stiffness = as_float(stiffness, None, "BeamSection: `stiffness`")
+            self.mass = as_float(mass, (), "BeamSection: `mass`")
+            self.inertia = as_float(inertia, (3,), "BeamSection: `inertia`")
+            self.damping = as_float(damping, (), "BeamSection: `damping`")
         if self.stiffness.shape not in ((6,), (6, 6)):
             raise ValueError(f"BeamSection: `stiffness` must have shape (6,) or (6, 6), got {self.stiffness.shape}.")
-        self.mass = as_float(mass, (), "BeamSection: `mass`")
-        self.inertia = as_float(inertia, (3,), "BeamSection: `inertia`")
-        self.damping = as_float(damping, (), "BeamSection: `damping`")
         for name, value in (("mass", self.mass), ("inertia", self.inertia)):
             require(lambda value: np.all(value > 0), f"BeamSection: `{name}` must be positive, got {value}.", value)
         require(

@@ -2,6 +2,7 @@
 
 import dataclasses
 from itertools import pairwise
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_count, as_float, point_field, require
-from lgsens.liegroups import cross
+from lgsens._validate import as_count, as_float, is_concrete, point_field, require
 from lgsens.model._beam_load import element
 from lgsens.model._beam_sections import BeamSection
 from lgsens.model._body import RigidBody
@@ -54,9 +54,10 @@ class BeamElement(AbstractConnection):
         if not isinstance(self.section, BeamSection):
             raise ValueError(f"BeamElement: `section` must be a BeamSection, got {self.section!r}.")
         require(
-            lambda length: length > 0,
+            lambda a, b: np.any(a != b),
             f"BeamElement: `at_a` and `at_b` are the same point, {self.at_a}; an element has a length.",
-            jnp.linalg.norm(self.at_b - self.at_a),
+            self.at_a,
+            self.at_b,
         )
 
     def as_joint(self, kind, what):
@@ -104,14 +105,15 @@ class Beam(eqx.Module):
     def __init__(self, name: str, section: BeamSection, points, *, elements: int | None = None, up=(0.0, 0.0, 1.0)):
         if not isinstance(section, BeamSection):
             raise ValueError(f"Beam: `section` must be a BeamSection, got {section!r}.")
-        points, up = as_float(points, None, "Beam: `points`"), as_float(up, (3,), "Beam: `up`")
+        with jax.ensure_compile_time_eval():  # of numbers that are known, inside of `jit` too
+            points, up = _known(as_float(points, None, "Beam: `points`"), as_float(up, (3,), "Beam: `up`"))
         if points.ndim != 2 or points.shape[1] != 3 or points.shape[0] < 2:
             raise ValueError(f"Beam: `points` must have shape (m, 3) with m of at least 2, got {points.shape}.")
         if points.shape[0] > 2 and elements is not None:
             raise ValueError("Beam: `elements` is for a straight beam, between two points; a curved one has m - 1.")
         if points.shape[0] == 2:
             count = as_count(1 if elements is None else elements, "elements", " (it is static)")
-            along = jnp.asarray(np.arange(count + 1)[:, None] / count, points.dtype)
+            along = (np.arange(count + 1)[:, None] / count).astype(points.dtype)
             points = points[:1] + along * (points[1:] - points[:1])
         chords = points[1:] - points[:-1]
         require(
@@ -119,13 +121,15 @@ class Beam(eqx.Module):
             f"Beam: `points` {points} has two after each other that coincide.",
             chords,
         )
-        axes = jax.vmap(lambda tangent: _triad(tangent, up))(_tangents(chords))
+        axes = _triads(_tangents(chords), up)
         require(
             lambda axes: np.all(np.isfinite(axes)) and np.all(np.abs(np.linalg.det(axes) - 1.0) < 1e-6),
             f"Beam: `up` {up} lies along the beam; give a direction across it.",
             axes,
         )
-        self.name, self.section, self.points, self.axes = name, section, points, axes
+        self.name, self.section = name, section
+        with jax.ensure_compile_time_eval():
+            self.points, self.axes = jnp.asarray(points), jnp.asarray(axes)
 
     @property
     def nodes(self) -> tuple[str, ...]:
@@ -135,43 +139,56 @@ class Beam(eqx.Module):
     @property
     def forces(self) -> dict[str, BeamElement]:
         """Its elements by name: that from node i to node i + 1 has the name of node i."""
-        place = lambda i, end: {f"at_{end}": self.points[i], f"axes_{end}": self.axes[i]}
-        return {
-            a: BeamElement(a, b, **place(i, "a"), **place(i + 1, "b"), section=self.section)
-            for i, (a, b) in enumerate(pairwise(self.nodes))
-        }
+        points, axes = map(list, _known(self.points, self.axes))
+        place = lambda i, end: {f"at_{end}": points[i], f"axes_{end}": axes[i]}
+        with jax.ensure_compile_time_eval():
+            return {
+                a: BeamElement(a, b, **place(i, "a"), **place(i + 1, "b"), section=self.section)
+                for i, (a, b) in enumerate(pairwise(self.nodes))
+            }
 
     @property
     def bodies(self) -> dict[str, RigidBody]:
         """Its nodes by name."""
-        lengths = jnp.linalg.norm(self.points[1:] - self.points[:-1], axis=1)
-        none = jnp.zeros_like(lengths[:1])
-        carried = (jnp.concatenate([none, lengths]) + jnp.concatenate([lengths, none])) / 2.0
-        return {
-            node: RigidBody(
-                mass=carried[i] * self.section.mass,
-                inertia=carried[i] * self.section.inertia,
-                position=self.points[i],
-                orientation=self.axes[i],
-            )
-            for i, node in enumerate(self.nodes)
-        }
+        points, axes, mass, inertia = _known(self.points, self.axes, self.section.mass, self.section.inertia)
+        lengths = _norm(points[1:] - points[:-1])[:, 0]
+        none, xp = 0.0 * lengths[:1], _module(points)
+        carried = (xp.concatenate([none, lengths]) + xp.concatenate([lengths, none])) / 2.0
+        numbers = zip(*map(list, (carried * mass, carried[:, None] * inertia[None], points, axes)))
+        with jax.ensure_compile_time_eval():
+            return {node: RigidBody(*own) for node, own in zip(self.nodes, numbers)}
+
+
+def _known(*arrays) -> tuple[Any, ...]:
+    """Arrays, those whose numbers are known as NumPy's: inside of `jit` JAX traces what is made of its own, and of each
+    node and element compiles it."""
+    return tuple(np.asarray(array) if is_concrete(array) else array for array in arrays)
+
+
+def _module(array) -> Any:
+    return np if isinstance(array, np.ndarray) else jnp
+
+
+def _norm(vectors: Float[Array, "n 3"]) -> Float[Array, "n 1"]:
+    return _module(vectors).sqrt((vectors**2).sum(axis=1, keepdims=True))
 
 
 def _tangents(chords: Float[Array, "n 3"]) -> Float[Array, "m 3"]:
     """Unit tangents at nodes: with the circle through a node and its neighbours c₁/|c₁|² + c₂/|c₂|², and at an end,
     where chord and both tangents are symmetric, 2 (ĉ·t) ĉ − t."""
-    unit = chords / jnp.linalg.norm(chords, axis=1, keepdims=True)
+    unit, xp = chords / _norm(chords), _module(chords)
     if chords.shape[0] == 1:
-        return jnp.concatenate([unit, unit])
-    slopes = chords / jnp.sum(chords**2, axis=1, keepdims=True)
+        return xp.concatenate([unit, unit])
+    slopes = chords / (chords**2).sum(axis=1, keepdims=True)
     inner = slopes[:-1] + slopes[1:]
-    inner = inner / jnp.linalg.norm(inner, axis=1, keepdims=True)
-    end = lambda c, t: 2.0 * jnp.sum(c * t) * c - t
-    return jnp.concatenate([end(unit[0], inner[0])[None], inner, end(unit[-1], inner[-1])[None]])
+    inner = inner / _norm(inner)
+    end = lambda c, t: 2.0 * (c * t).sum() * c - t
+    return xp.concatenate([end(unit[0], inner[0])[None], inner, end(unit[-1], inner[-1])[None]])
 
 
-def _triad(tangent: Float[Array, "3"], up: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    across = cross(up, tangent)
-    across = across / jnp.sqrt(jnp.sum(across**2))
-    return jnp.stack([tangent, across, cross(tangent, across)], axis=1)
+def _triads(tangents: Float[Array, "m 3"], up: Float[Array, "3"]) -> Float[Array, "m 3 3"]:
+    xp: Any = np if isinstance(tangents, np.ndarray) and isinstance(up, np.ndarray) else jnp
+    across = xp.cross(up[None], tangents)
+    with np.errstate(invalid="ignore"):  # `up` along the beam
+        across = across / _norm(across)
+    return xp.stack([tangents, across, xp.cross(tangents, across)], axis=2)

@@ -25,8 +25,9 @@ def body_fixed(kind: str, body: str) -> dict[str, Any]:
 class AbstractElement(eqx.Module):
     """A law between the frames of two bodies a and b, and numbers for it; no names, so that elements can be stacked.
 
-    `drawn` is what is drawn from its first point to its last: a "joint" or "link" that holds bodies, a "spring", a
-    "damper", or a "wheel" on its `road`; None: nothing.
+    `drawn` is what is drawn from its first point to its last: a "joint" or "link" that holds bodies, a "beam"
+    (bent, its axes at both ends with the first along it), a "spring", a "damper", or a "wheel" on its `road`; None:
+    nothing.
     """
 
     drawn: ClassVar[Any] = "joint"

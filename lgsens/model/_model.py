@@ -135,10 +135,10 @@ class Model(eqx.Module):
         if not any(body.free for body in self.bodies.values()):
             raise ValueError("Model: no body has a degree of freedom; let at least one of them have a `free` one.")
         for name, joint in self.joints.items():
-            self._check_connection(f"Joint {name!r}", (joint.a, joint.b))
-            self._check_connection(f"Joint {name!r}", joint.others)
+            _check_connection(f"Joint {name!r}", (joint.a, joint.b), self.bodies)
+            _check_connection(f"Joint {name!r}", joint.others, self.bodies)
         for name, force in self.forces.items():
-            self._check_connection(f"Force {name!r}", force.on(self.joints).bodies)
+            _check_connection(f"Force {name!r}", force.on(self.joints).bodies, self.bodies)
         self._check_duplicates()
         if self._groups is not None and all(group.name is None for group in self._groups):
             raise ValueError("Model: fixed joints hold all bodies on the ground; let at least one of them move.")
@@ -147,14 +147,6 @@ class Model(eqx.Module):
         fields = {name: roster(getattr(self, name)) for name in ("bodies", "joints", "forces")}
         options = {name: getattr(self, name) for name in _OPTIONS}
         return listed("Model", fields | {name: repr(value) for name, value in options.items()})
-
-    def _check_connection(self, what: str, ends: tuple[str | None, ...]) -> None:
-        for end in ends:
-            if end is not None and end not in self.bodies:
-                raise ValueError(f"{what} refers to body {end!r}; the bodies are {sorted(self.bodies)}.")
-        if len(ends) == 2 and ends[0] == ends[1]:
-            where = "the ground" if ends[0] is None else f"body {ends[0]!r}"
-            raise ValueError(f"{what} connects {where} to itself; name two different bodies.")
 
     def _check_duplicates(self) -> None:
         alike: dict[Any, list[str]] = {}
@@ -298,6 +290,16 @@ class Model(eqx.Module):
         """
         system = eqx.filter_eval_shape(Model.system, self)
         return summarize(self.bodies, self.joints, self.forces, system, self._groups or ())
+
+
+# Not a method: at each call of one Equinox goes through all leaves of the model.
+def _check_connection(what: str, ends: tuple[str | None, ...], bodies: Mapping[str, RigidBody]) -> None:
+    for end in ends:
+        if end is not None and end not in bodies:
+            raise ValueError(f"{what} refers to body {end!r}; the bodies are {sorted(bodies)}.")
+    if len(ends) == 2 and ends[0] == ends[1]:
+        where = "the ground" if ends[0] is None else f"body {ends[0]!r}"
+        raise ValueError(f"{what} connects {where} to itself; name two different bodies.")
 
 
 def _is_same_connection(one: AbstractJoint, other: AbstractJoint) -> bool:

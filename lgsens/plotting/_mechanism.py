@@ -27,7 +27,7 @@ def mechanism(
 
     A body is drawn from the points at which joints hold it: two make a bar, more a solid; one with a tyre is a wheel;
     with fewer points it is a box of its inertia. The axes are equal. Springs are coils, dampers tubes with a rod,
-    massless rods lines.
+    massless rods lines, elements of beams bent lines.
 
     Arguments:
         models: scenes by name, drawn over each other.
@@ -115,7 +115,7 @@ def draw(axes: Any, scene: Shapes, position, orientation, coloured: bool = True)
     for strut in scene.struts:
         lines = stretched(strut, position, orientation)
         drawn += lines
-        widths = {"spring": (1.8,), "damper": (1.8, 6.0), "link": (3.0,)}[strut.role]
+        widths = {"spring": (1.8,), "damper": (1.8, 6.0), "link": (3.0,), "beam": (3.5,)}[strut.role]
         for line, width in zip(lines, widths):
             axes.plot(*line.T, color=colours[strut.role], linewidth=width, alpha=0.45 if width > 5 else 1.0)
     joints = np.array([placed(mark, position, orientation) for mark in scene.joints]).reshape(-1, 3)

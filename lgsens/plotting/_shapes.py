@@ -4,7 +4,7 @@ Elements say what they are drawn as, and where (`AbstractElement`). A body is dr
 hold it: two make a bar, more a solid. With one point (a pendulum, a top) it is a bar to the centre of mass and a box,
 with none a box: the homogeneous cuboid of its mass and inertia, a small cube of a point mass, and of a body on a joint
 where that would be larger than the scene. A body with a tyre is a wheel. Springs are coils, dampers tubes with a rod,
-massless rods lines.
+massless rods lines, elements of beams bent lines.
 """
 
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ from lgsens.model import MultibodySystem
 
 GROUND = -1
 _TURNS, _RADIUS = 6, 0.12  # of a coil; the radius as a fraction of its length in the reference configuration
+_PIECES = 8  # of a bent line; a straight one has as many
 _POINT = 0.06  # side of the cube that stands for a point mass, as a fraction of the length of the scene
 
 
@@ -29,7 +30,8 @@ class Outline(NamedTuple):
 
 
 class StrutShape(NamedTuple):
-    """What stretches between two bodies: a coil ("spring"), a tube ("damper") or a rod ("link"); points [m]."""
+    """What stretches between two bodies: a coil ("spring"), a tube ("damper"), a rod ("link") or what bends ("beam");
+    points [m], and of a beam its directions there, in the frames of the bodies."""
 
     role: str
     a: int
@@ -37,6 +39,8 @@ class StrutShape(NamedTuple):
     b: int
     at_b: np.ndarray
     radius: float  # of the coil [m]
+    along_a: np.ndarray | None = None
+    along_b: np.ndarray | None = None
 
 
 class CentreMark(NamedTuple):
@@ -75,15 +79,18 @@ def shapes(system: MultibodySystem) -> Shapes:
             role = element.drawn if marks else None
             if not marks and element.fixed("axis", "b"):
                 axes.setdefault(owner, []).append((*ends.values(), np.asarray(element.fixed("axis", "b")[0])))
-            if role in ("joint", "link"):
-                joints += marks[:1] if role == "joint" else marks
+            if role in ("joint", "link", "beam"):
+                joints += {"joint": marks[:1], "link": marks, "beam": []}[role]
                 for mark in marks:
                     if mark.body != GROUND:
                         held[mark.body].append(mark.at)
-            if role in ("link", "spring", "damper") and len(marks) > 1:
+            if role in ("link", "beam", "spring", "damper") and len(marks) > 1:
                 (a, at_a), (b, at_b) = marks[0], marks[-1]
                 line = _world(position, orientation, b, at_b) - _world(position, orientation, a, at_a)
                 struts.append(StrutShape(role, a, at_a, b, at_b, _RADIUS * float(np.linalg.norm(line))))
+                if role == "beam":
+                    along_a, along_b = (np.asarray(element.fixed("axes", end)[0])[:, 0] for end in ends)
+                    struts[-1] = struts[-1]._replace(along_a=along_a, along_b=along_b)
             if role == "wheel":
                 tyres.append(Tyre(marks[-1], element.road))
     if system.centre is not None:  # a body with a pivot has it in place of a joint
@@ -113,18 +120,22 @@ def placed(shape: Outline | CentreMark, position, orientation) -> np.ndarray:
 
 
 def stretched(strut: StrutShape, position, orientation) -> list[np.ndarray]:
-    """The lines that a strut is drawn with, in the inertial frame: a coil; a rod and its tube; a line."""
+    """The lines that a strut is drawn with, in the inertial frame: a coil; a rod and its tube; a line, bent or not."""
     a = _world(position, orientation, strut.a, strut.at_a)
     b = _world(position, orientation, strut.b, strut.at_b)
     if strut.role == "spring":
         return [coil(a, b, strut.radius)]
+    if strut.along_a is not None and strut.along_b is not None:
+        directions = ((strut.a, strut.along_a), (strut.b, strut.along_b))
+        return [bent(a, b, *(at if of == GROUND else orientation[of] @ at for of, at in directions))]
     line = np.stack([a, b])
     return [line, np.stack([a, a + 0.6 * (b - a)])] if strut.role == "damper" else [line]
 
 
 def corners(scene: Shapes, position, orientation) -> np.ndarray:
     """The points of a scene that must be in sight, in the inertial frame, shape (n, 3); coils are their axes."""
-    ends = [stretched(strut, position, orientation)[0][[0, -1]] for strut in scene.struts]
+    lines = ((strut.role, stretched(strut, position, orientation)[0]) for strut in scene.struts)
+    ends = [line[[0, -1]] if role == "spring" else line for role, line in lines]
     return np.concatenate(
         [*(placed(shape, position, orientation).reshape(-1, 3) for shape in (*scene.outlines, *scene.joints)), *ends]
     )
@@ -143,6 +154,16 @@ def coil(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
     wave = 2 * np.pi * _TURNS * s
     turns = a + (0.1 + 0.8 * s) * (b - a) + radius * (np.cos(wave) * first + np.sin(wave) * second)
     return np.concatenate([[a, a + 0.1 * (b - a)], turns, [b - 0.1 * (b - a), b]])
+
+
+def bent(a: np.ndarray, b: np.ndarray, along_a: np.ndarray, along_b: np.ndarray) -> np.ndarray:
+    """A curve between two points with these unit tangents, shape (n, 3): the cubic that of an arc has the middle too,
+    and of a quarter of a circle is off by 3e-4 of the radius."""
+    cosine = float(np.clip(along_a @ along_b, -1.0, 1.0))
+    speed = 2.0 * np.linalg.norm(b - a) / (1.0 + np.sqrt((1.0 + cosine) / 2.0))
+    s = np.linspace(0.0, 1.0, _PIECES + 1)[:, None]
+    ends = (1.0 + 2.0 * s) * (1.0 - s) ** 2 * a + s**2 * (3.0 - 2.0 * s) * b
+    return ends + speed * (s * (1.0 - s) ** 2 * along_a - s**2 * (1.0 - s) * along_b)
 
 
 def _distinct(points: list[np.ndarray]) -> np.ndarray:

@@ -27,7 +27,14 @@ ROAD = "#b8a58c"
 READABLE: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.0}
 IN_AXES: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "framealpha": 0.85}
 NOTEBOOK_DPI = 80
-ROLES = {"link": "#1b62a5", "body": "#3a8a4d", "wheel": "#3c3c3c", "spring": "#d9822b", "damper": "#7a4b9a"}
+ROLES = {
+    "link": "#1b62a5",
+    "beam": "#23858f",
+    "body": "#3a8a4d",
+    "wheel": "#3c3c3c",
+    "spring": "#d9822b",
+    "damper": "#7a4b9a",
+}
 
 
 def figure(width: float = 7.0, height: float = 4.5, title: str = "") -> "Figure":

@@ -322,3 +322,17 @@ def test_sections():
 def test_bad_input(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_what_is_known_is_no_operation_of_the_program():
+    """A beam whose stiffness alone is traced: no operation for each of its nodes but the turn of its axes."""
+
+    def operations(elements):
+        def reference(stiffness):
+            section = lg.BeamSection(stiffness, 1.0, [0.02, 0.01, 0.01])
+            beam = lg.Beam("b", section, [[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]], elements=elements)
+            return lg.Model(beam.bodies, {}, beam.forces).system()
+
+        return len(jax.make_jaxpr(reference)(jnp.ones(6)).eqns)
+
+    assert operations(24) - operations(8) <= 2 * 16

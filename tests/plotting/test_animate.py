@@ -14,6 +14,7 @@ from PIL import Image
 import lgsens as lg
 from lgsens import plotting
 from lgsens.examples import QuarterCar, four_bar, free_rigid_body, spinning_top
+from lgsens.liegroups import SE3, Pose
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +89,25 @@ def test_a_top_is_a_bar_with_a_box(tmp_path):
     bars = [o for o in data["outlines"] if o["role"] == "link"]
     np.testing.assert_allclose(world(data, 3, 0, bars[0]["points"])[0], np.zeros(3), atol=2e-6)  # at the pivot
     assert data["clock"][-1] == 0.4 and data["values"][-1] == 0.2  # at half speed
+
+
+def test_elements_of_a_beam_are_bent_as_they_are(swinging, tmp_path):
+    """Each on the helix between its sections, to 2e-3 of its length where it turns by less than a quarter."""
+    data = Page(plotting.animate(swinging, tmp_path / "a.html")).data
+    beams = [strut for strut in data["struts"] if strut["role"] == "beam"]
+    assert len(beams) == 3 and len(data["joints"]) == 1  # the clamp
+    drawn, group = plotting._shapes.shapes(swinging.system), SE3()
+    position, orientation = (np.asarray(array[-1]) for array in swinging.states.q)
+    bends = []
+    for strut in drawn.struts:
+        a, b = (Pose(jnp.asarray(position[body]), jnp.asarray(orientation[body])) for body in (strut.a, strut.b))
+        screw = group.log(group.compose(group.inverse(a), b))
+        pieces = jnp.linspace(0.0, 1.0, 9)[:, None] * screw[None]
+        helix = jax.vmap(lambda piece, a=a: group.compose(a, group.exp(piece)).position)(pieces)
+        (line,) = plotting._shapes.stretched(strut, position, orientation)
+        np.testing.assert_allclose(line, helix, rtol=0, atol=2e-3 * np.linalg.norm(screw[:3]))
+        bends.append(np.linalg.norm(screw[3:]))
+    assert 0.2 < max(bends) < np.pi / 2
 
 
 def test_a_rig_is_swept_through(rig, tmp_path):

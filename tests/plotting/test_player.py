@@ -90,6 +90,28 @@ if NODE:
         )
         np.testing.assert_allclose(coil, look(inner), rtol=0, atol=1e-9)
 
+    def test_the_script_bends_beams_as_numpy_does(swinging, tmp_path):
+        page = plotting.animate(swinging, tmp_path / "a.html")
+        data = Page(page).data
+        camera = {
+            "elevation": 20.0,
+            "azimuth": -70.0,
+            "centre": [0.5, 0.0, -0.2],
+            "scale": 600.0,
+            "x": 450.0,
+            "y": 320.0,
+        }
+        last = len(data["clock"]) - 1
+        items = run_script(page, f"Player.scene(data, {last}, {json.dumps(camera)})", tmp_path)
+        found = [np.array(item["points"]) for item in items if item["role"] == "beam"]
+        assert len(found) == len(data["struts"]) == 3
+        for strut in data["struts"]:
+            ends = [world(data, last, strut[s], strut[f"at_{s}"]) for s in "ab"]
+            frames = [np.reshape(data["orientation"][last][strut[s]], (3, 3)) for s in "ab"]
+            along = [frame @ strut[f"along_{s}"] for frame, s in zip(frames, "ab")]
+            expected = projected(plotting._shapes.bent(*map(np.asarray, ends), *along), **camera)
+            assert min(np.abs(points - expected).max() for points in found) < 1e-6
+
     def test_the_slider_moves_the_bodies_and_the_time(linkage, tmp_path):
         page = plotting.animate(linkage, tmp_path / "a.html")
         data = Page(page).data
