@@ -258,7 +258,7 @@ class QuarterCar(eqx.Module):
         called = {f"{name}_knuckle": f"{name}_bushing" for name in bushings}
         forces = {called.get(name, name): force for name, force in forces.items()}
         if free_length is not None:
-            forces["spring"] = self.spring.element("spring", free_length)
+            forces["spring"] = self.spring.element("spring", free_length, lambda body: self.scene_name(body, "spring"))
         model = Model(bodies, joints, forces)
         if free_length is not None:
             return model
