@@ -16,12 +16,10 @@ from scipy.optimize import brentq
 from suspension_closures import changed
 
 import lgsens as lg
-from lgsens.dynamics import full_jacobian
 from lgsens.examples import Axle, QuarterCar, SectionShape
 from lgsens.examples._axle_numbers import places
 from lgsens.examples._axle_parts import Bar
 from lgsens.examples._corner_scene import corner_scene
-from lgsens.examples._link_beam import LinkBeam
 from lgsens.model import BeamElement, lumped
 
 DATA = resources.files("lgsens.examples") / "data"
@@ -152,8 +150,9 @@ BARS = {
         ("key 'anti_roll_bar.diameter'", "follows from the section of `beam`"),
     ),
     "bar of another shape": (
-        {"anti_roll_bar.beam": STEEL | {"rectangle": {"width": 0.01, "height": 0.02}}},
-        ("key 'anti_roll_bar.", "follows from"),
+        {f"anti_roll_bar.{key}": None for key in ("mass", "diameter", "length")}
+        | {"anti_roll_bar.beam": STEEL | {"rectangle": {"width": 0.01, "height": 0.02}}},
+        ("key 'anti_roll_bar.beam.rectangle'", "is no key of this table", "'round'", "'tube'"),
     ),
     "bushing of a hinge": (
         {"anti_roll_bar.bushing": {"stiffness": [1e7] * 3, "rotational_stiffness": [10.0] * 3}},
@@ -169,6 +168,19 @@ def test_what_no_beam_is(mistake, file):
         Axle.load(file("mcpherson" if mistake in BARS else "five_link_suspension", changes))
 
 
+@eqx.filter_jit
+def displacement(model, bodies):
+    """Of bodies, small: K x + Bᵀλ = −r₀, B x = 0 in the reference configuration."""
+    system = model.system()
+    q, v = system.reference()
+    none = jnp.zeros(system.constraint(q, jnp.zeros(())).shape)
+    stiffness, _, jacobian = system.tangents(q, v, v, none, jnp.zeros(()))
+    matrix = jnp.block([[stiffness, jacobian.T], [jacobian, jnp.zeros((none.size,) * 2)]])
+    force = -system.residual(q, v, v, none, jnp.zeros(()))
+    x = jnp.linalg.solve(matrix, jnp.concatenate([force, none]))[: v.size]
+    return x.reshape(-1, 6)[np.array([system.body_names.index(body) for body in bodies]), :3]
+
+
 def softness(d, a, r2, b2, length, lever=1.0, middle=1.0):
     """C of `Bar`: what either lever's end moves by per force, of round steel; shares of the bending of elements."""
     E, G, nu = 2.1e11, 2.1e11 / 2.6, 0.3
@@ -182,8 +194,8 @@ def test_an_anti_roll_bar_bends_and_twists_as_closed_forms_say():
     grow along them, at their middles: a lever's bending less by 1/4n², that of the middle by 1/n². Timoshenko."""
     n = 2
     points = {"bearing": [0.1, 0.45, 0.2], "lever": [-0.1, 0.6, 0.25]}
-    beam = LinkBeam(SectionShape({"round": {"diameter": 0.02}}, STEEL), n)
-    left = Bar(*map(jnp.array, points.values()), {}, None, {}, "chassis", beam)
+    left = Bar(*map(jnp.array, points.values()), {}, jnp.ones(()), {}, "chassis")
+    left = left.bending(SectionShape({"round": {"diameter": 0.02}}, STEEL), elements=n)
     bar = left.bent(dataclasses.replace(left, **{k: jnp.array(p) * jnp.array([1, -1.0, 1]) for k, p in points.items()}))
     along = np.array([0.05, 0.0, 0.2]) / np.hypot(0.05, 0.2)  # y × lever
     end, other = left.lever, left.lever * jnp.array([1, -1.0, 1])
@@ -196,20 +208,7 @@ def test_an_anti_roll_bar_bends_and_twists_as_closed_forms_say():
     push = {"push": lg.AppliedForce(tip, at=end, force=along)}
     model = lg.Model(bar.bodies, joints, bar.forces | push)
 
-    @jax.jit
-    def linear(model):
-        """K x + Bᵀλ = −r₀, B x = 0 in the reference configuration."""
-        system = model.system()
-        q, v = system.reference()
-        t, jacobian = jnp.zeros(()), full_jacobian(system, q, jnp.zeros(()))
-        none = jnp.zeros(jacobian.shape[0])
-        at = lambda x: system.residual(system.group.retract(q, x), v, jnp.zeros_like(v), none, t)
-        matrix = jnp.block([[jax.jacfwd(at)(v), jacobian.T], [jacobian, jnp.zeros((none.size,) * 2)]])
-        x = jnp.linalg.solve(matrix, jnp.concatenate([-at(v), none]))[: v.size]
-        moved = system.group.retract(q, 1e-3 * x)  # small: what is moved by is linear in x
-        return moved.position[0] - q.position[0]
-
-    moved = 1e3 * float(linear(model) @ along)
+    moved = float(displacement(model, (tip,))[0] @ along)
 
     a, r2, b2 = np.sqrt(0.0425 + 0.0225), 0.0425, 0.0225
     closed = lambda lever, middle: softness(0.02, a, r2, b2, 0.9, lever, middle)
@@ -221,6 +220,49 @@ def test_an_anti_roll_bar_bends_and_twists_as_closed_forms_say():
     mass, centre, _ = lumped(jnp.stack(masses), jnp.stack(places))
     assert float(mass) == pytest.approx(float(left.own_mass), rel=1e-13)
     np.testing.assert_allclose(centre[1], 0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("corners", "sections", "message"),
+    [
+        ([[0, 0, 0], [1, 0, 0]], 1, r"`corners` must have shape \(m, 3\) with m of at least 3, got \(2, 3\)"),
+        (np.eye(3), 3, "`section` must be one or one of each of 2 pieces, got 3"),
+    ],
+)
+def test_what_no_beam_with_corners_is(corners, sections, message):
+    section = lg.BeamSection.round(0.02, **STEEL)
+    with pytest.raises(ValueError, match=message):
+        lg.BentBeam("it", section if sections == 1 else [section] * sections, corners)
+
+
+def test_a_leaf_spring_and_a_twist_beam_axle():
+    """A leaf on its eye and its shackle: F L³/48EI, and shear. Two trailing arms with a beam between them, c behind
+    their pivots, one wheel held, the other pushed up by 2 l φ: G J (2φ)²/2L of twist and, as ends of the beam do not
+    tilt, 6 E I (2cφ)²/L³ of bending, and shear."""
+    leaf = lg.Beam("leaf", lg.BeamSection.rectangle(0.06, 0.02, **STEEL), [[0, 0, 0.5], [1.2, 0, 0.5]], elements=4)
+    bodies, forces = dict(leaf.bodies), leaf.forces | {"axle": lg.AppliedForce("leaf.2", force=[0, 0, 1.0])}
+    joints: dict = {
+        "eye": lg.RevoluteJoint(None, "leaf.0", at=[0, 0, 0.5], axis=[0, 1.0, 0]),
+        "shackle": lg.DistanceJoint(None, "leaf.4", at_a=[1.2, 0, 0.6], at_b=[1.2, 0, 0.5]),
+    }
+    open_section = lg.BeamSection([2e8, 6e7, 6e7, 150.0, 4e4, 4e4], 5.0, [0.01, 0.005, 0.005])  # a V: G J is small
+    across = lg.Beam("beam", open_section, [[-0.1, 0.5, 0], [-0.1, -0.5, 0]], elements=4)
+    bodies, forces = bodies | across.bodies, forces | across.forces
+    left, right = across.nodes[0], across.nodes[-1]  # and the arms, which are rigid
+    for node, y in ((left, 0.6), (right, -0.6)):
+        joints[node] = lg.RevoluteJoint(None, node, at=[0, y, 0], axis=[0, 1.0, 0])
+    forces["push"] = lg.AppliedForce(left, at=[-0.4, 0.6, 0], force=[0, 0, 1.0])
+    joints["held"] = lg.DistanceJoint(None, right, at_a=[-0.4, -0.6, 1.0], at_b=[-0.4, -0.6, 0])
+    moved = displacement(lg.Model(bodies, joints, forces), ("leaf.2", left))
+
+    section, half = leaf.section.stiffness, 2  # elements in either half of the leaf, whose bending they lack 1/4n² of
+    expected = 1.2**3 / (48 * section[4]) * (1 - 1 / (4 * half**2)) + 1.2 / (4 * section[2])
+    np.testing.assert_allclose(moved[0], [0.0, 0.0, expected], rtol=1e-8, atol=1e-8 * float(expected))
+    arm, c, n = 0.4, 0.1, 4
+    s_shape = 1 / (12 * 4e4) * (1 - 1 / n**2) + 1 / 6e7  # what ends of the beam move apart by per force
+    roll = 4 * 150.0 + 4 * c**2 / s_shape  # of both wheels [N m/rad]
+    # F l φ is half of φ² roll/2, of both ends; linear equations of 1e8 and 1e2
+    np.testing.assert_allclose(moved[1, 2], c * 2 * (2 * arm / roll), rtol=1e-6)
 
 
 def test_the_lightest_tube_that_bears_a_load():

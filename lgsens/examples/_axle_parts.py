@@ -1,5 +1,6 @@
 """What an axle has beside rigid links: bushings, stops, a rack, an anti-roll bar, and the elements that they become."""
 
+import dataclasses
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -7,12 +8,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens.examples._link_beam import LinkBeam
+from lgsens.examples._link_beam import ELEMENTS, LinkBeam, SectionShape
 from lgsens.examples._suspension_parts import Part
 from lgsens.model import (
     AbstractForce,
     AbstractJoint,
     AntiRollBar,
+    BeamSection,
     BentBeam,
     BumpStop,
     Bushing,
@@ -143,6 +145,10 @@ class Bar(eqx.Module):
     def link(self) -> str:
         """The body at the other end of the drop link."""
         return next(iter(self.ends))
+
+    def bending(self, section: SectionShape | BeamSection, *, elements: int = ELEMENTS) -> "Bar":
+        """The bar as a beam of this section, round or a tube, with so many elements for each lever and the middle."""
+        return dataclasses.replace(self, mass=None, section={}, beam=LinkBeam(section, elements))
 
     @property
     def own_mass(self) -> Array:
