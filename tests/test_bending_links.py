@@ -89,6 +89,18 @@ def test_a_file_says_what_bends(file):
     assert {*scene.forces["left_spring"].bodies} == {"left_rollover_strut.3", "chassis"}
 
 
+def test_the_mirror_image_of_a_beam():
+    """Its section stands upright as in a mirror, by principal axes of the same stiffness."""
+    flat = lg.BeamSection.rectangle(0.02, 0.03, **STEEL)
+    car = QuarterCar.load().bending({"trailing_arm": flat}, up=(0.1, 0.2, 1.0))
+    one, other = (of.links["trailing_arm"].bent("arm") for of in (car, car.mirrored()))
+    flip = np.array([1.0, -1.0, 1.0])
+    np.testing.assert_allclose(other.points, np.asarray(one.points) * flip, rtol=0, atol=1e-15)
+    # axes 1 and 3 are mirrored, axis 2 closes a right-handed triad: round-off of unit vectors
+    np.testing.assert_allclose(other.axes, np.asarray(one.axes) * flip[:, None] * flip, rtol=0, atol=1e-14)
+    jax.tree.map(np.testing.assert_array_equal, car.mirrored().mirrored(), car)
+
+
 def test_what_holds_on_to_beams_when_numbers_are_traced():
     car = QuarterCar.load()
     with pytest.raises(ValueError, match=says("nodes of 'rollover_strut'", "not known here", "let it bend")):
