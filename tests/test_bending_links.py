@@ -20,6 +20,7 @@ from lgsens.examples import Axle, QuarterCar, SectionShape
 from lgsens.examples._axle_numbers import places
 from lgsens.examples._axle_parts import Bar
 from lgsens.examples._corner_scene import corner_scene
+from lgsens.examples._suspension_parts import reflected
 from lgsens.model import BeamElement, lumped
 
 DATA = resources.files("lgsens.examples") / "data"
@@ -180,17 +181,25 @@ def test_what_no_beam_is(mistake, file):
         Axle.load(file("mcpherson" if mistake in BARS else "five_link_suspension", changes))
 
 
-@eqx.filter_jit
-def displacement(model, bodies):
-    """Of bodies, small: K x + Bᵀλ = −r₀, B x = 0 in the reference configuration."""
-    system = model.system()
-    q, v = system.reference()
-    none = jnp.zeros(system.constraint(q, jnp.zeros(())).shape)
-    stiffness, _, jacobian = system.tangents(q, v, v, none, jnp.zeros(()))
-    matrix = jnp.block([[stiffness, jacobian.T], [jacobian, jnp.zeros((none.size,) * 2)]])
-    force = -system.residual(q, v, v, none, jnp.zeros(()))
-    x = jnp.linalg.solve(matrix, jnp.concatenate([force, none]))[: v.size]
-    return x.reshape(-1, 6)[np.array([system.body_names.index(body) for body in bodies]), :3]
+def displaced(build):
+    """What bodies move by, small: K x + Bᵀλ = −r₀, B x = 0 in the reference configuration; one program with the scene.
+
+    `build`: gives the model, names of bodies, and what else is asked for of it.
+    """
+
+    @jax.jit
+    def solved():
+        model, bodies, more = build()
+        system = model.system()
+        q, v = system.reference()
+        none = jnp.zeros(system.constraint(q, jnp.zeros(())).shape)
+        stiffness, _, jacobian = system.tangents(q, v, v, none, jnp.zeros(()))
+        matrix = jnp.block([[stiffness, jacobian.T], [jacobian, jnp.zeros((none.size,) * 2)]])
+        force = -system.residual(q, v, v, none, jnp.zeros(()))
+        x = jnp.linalg.solve(matrix, jnp.concatenate([force, none]))[: v.size]
+        return x.reshape(-1, 6)[np.array([system.body_names.index(body) for body in bodies]), :3], more
+
+    return jax.tree.map(np.asarray, solved())
 
 
 def softness(d, a, r2, b2, length, lever=1.0, middle=1.0):
@@ -204,33 +213,32 @@ def softness(d, a, r2, b2, length, lever=1.0, middle=1.0):
 def test_an_anti_roll_bar_bends_and_twists_as_closed_forms_say():
     """Its right lever held, its left one pushed: 2 C of `Bar` per force, of elements that take bending moments, which
     grow along them, at their middles: a lever's bending less by 1/4n², that of the middle by 1/n². Timoshenko."""
-    n = 2
-    points = {"bearing": [0.1, 0.45, 0.2], "lever": [-0.1, 0.6, 0.25]}
-    left = Bar(*map(jnp.array, points.values()), {}, jnp.ones(()), {}, "chassis")
-    left = left.bending(SectionShape({"round": {"diameter": 0.02}}, STEEL), elements=n)
-    bar = left.bent(dataclasses.replace(left, **{k: jnp.array(p) * jnp.array([1, -1.0, 1]) for k, p in points.items()}))
-    along = np.array([0.05, 0.0, 0.2]) / np.hypot(0.05, 0.2)  # y × lever
-    end, other = left.lever, left.lever * jnp.array([1, -1.0, 1])
-    tip, first, second, last = bar.corners
-    joints = {
-        "left": lg.SphericalJoint(None, first, at=left.bearing),
-        "right": lg.SphericalJoint(None, second, at=left.bearing * jnp.array([1, -1.0, 1])),
-        "held": lg.DistanceJoint(None, last, at_a=other + along, at_b=other),
-    }
-    push = {"push": lg.AppliedForce(tip, at=end, force=along)}
-    model = lg.Model(bar.bodies, joints, bar.forces | push)
+    n, along = 2, np.array([0.05, 0.0, 0.2]) / np.hypot(0.05, 0.2)  # y × lever
 
-    moved = float(displacement(model, (tip,))[0] @ along)
+    def build():
+        points = jnp.array([0.1, 0.45, 0.2]), jnp.array([-0.1, 0.6, 0.25])
+        left = Bar(*points, {}, jnp.ones(()), {}, "chassis")
+        left = left.bending(SectionShape({"round": {"diameter": 0.02}}, STEEL), elements=n)
+        right = reflected(left)
+        bar = left.bent(right)
+        tip, first, second, last = bar.corners
+        joints = {
+            "left": lg.SphericalJoint(None, first, at=left.bearing),
+            "right": lg.SphericalJoint(None, second, at=right.bearing),
+            "held": lg.DistanceJoint(None, last, at_a=right.lever + along, at_b=right.lever),
+        }
+        push = {"push": lg.AppliedForce(tip, at=left.lever, force=along)}
+        masses, places = zip(*((body.mass, body.position) for body in bar.bodies.values()))
+        more = left.rate, left.own_mass, lumped(jnp.stack(masses), jnp.stack(places))[:2]
+        return lg.Model(bar.bodies, joints, bar.forces | push), (tip,), more
 
+    moved, (rate, own_mass, (mass, centre)) = displaced(build)
     a, r2, b2 = np.sqrt(0.0425 + 0.0225), 0.0425, 0.0225
     closed = lambda lever, middle: softness(0.02, a, r2, b2, 0.9, lever, middle)
     # of the linear equations, condition 1e9 or so of N/m along and N m across
-    assert moved == pytest.approx(2 * closed(1 - 1 / (4 * n**2), 1 - 1 / n**2), rel=1e-7)
-    assert float(left.rate) == pytest.approx(r2 / (2 * closed(1.0, 1.0)), rel=1e-13)
-    assert float(left.own_mass) == pytest.approx(7850 * np.pi * 0.01**2 * (0.9 + 2 * a), rel=1e-13)
-    masses, places = zip(*((body.mass, body.position) for body in bar.bodies.values()))
-    mass, centre, _ = lumped(jnp.stack(masses), jnp.stack(places))
-    assert float(mass) == pytest.approx(float(left.own_mass), rel=1e-13)
+    assert moved[0] @ along == pytest.approx(2 * closed(1 - 1 / (4 * n**2), 1 - 1 / n**2), rel=1e-7)
+    assert rate == pytest.approx(r2 / (2 * closed(1.0, 1.0)), rel=1e-13)
+    np.testing.assert_allclose([own_mass, mass], 7850 * np.pi * 0.01**2 * (0.9 + 2 * a), rtol=1e-13)
     np.testing.assert_allclose(centre[1], 0.0, atol=1e-15)
 
 
@@ -251,25 +259,29 @@ def test_a_leaf_spring_and_a_twist_beam_axle():
     """A leaf on its eye and its shackle: F L³/48EI, and shear. Two trailing arms with a beam between them, c behind
     their pivots, one wheel held, the other pushed up by 2 l φ: G J (2φ)²/2L of twist and, as ends of the beam do not
     tilt, 6 E I (2cφ)²/L³ of bending, and shear."""
-    leaf = lg.Beam("leaf", lg.BeamSection.rectangle(0.06, 0.02, **STEEL), [[0, 0, 0.5], [1.2, 0, 0.5]], elements=4)
-    bodies, forces = dict(leaf.bodies), leaf.forces | {"axle": lg.AppliedForce("leaf.2", force=[0, 0, 1.0])}
-    joints: dict = {
-        "eye": lg.RevoluteJoint(None, "leaf.0", at=[0, 0, 0.5], axis=[0, 1.0, 0]),
-        "shackle": lg.DistanceJoint(None, "leaf.4", at_a=[1.2, 0, 0.6], at_b=[1.2, 0, 0.5]),
-    }
-    open_section = lg.BeamSection([2e8, 6e7, 6e7, 150.0, 4e4, 4e4], 5.0, [0.01, 0.005, 0.005])  # a V: G J is small
-    across = lg.Beam("beam", open_section, [[-0.1, 0.5, 0], [-0.1, -0.5, 0]], elements=4)
-    bodies, forces = bodies | across.bodies, forces | across.forces
-    left, right = across.nodes[0], across.nodes[-1]  # and the arms, which are rigid
-    for node, y in ((left, 0.6), (right, -0.6)):
-        joints[node] = lg.RevoluteJoint(None, node, at=[0, y, 0], axis=[0, 1.0, 0])
-    forces["push"] = lg.AppliedForce(left, at=[-0.4, 0.6, 0], force=[0, 0, 1.0])
-    joints["held"] = lg.DistanceJoint(None, right, at_a=[-0.4, -0.6, 1.0], at_b=[-0.4, -0.6, 0])
-    moved = displacement(lg.Model(bodies, joints, forces), ("leaf.2", left))
 
-    section, half = leaf.section.stiffness, 2  # elements in either half of the leaf, whose bending they lack 1/4n² of
+    def build():
+        leaf = lg.Beam("leaf", lg.BeamSection.rectangle(0.06, 0.02, **STEEL), [[0, 0, 0.5], [1.2, 0, 0.5]], elements=4)
+        open_section = lg.BeamSection([2e8, 6e7, 6e7, 150.0, 4e4, 4e4], 5.0, [0.01, 0.005, 0.005])  # a V: G J is small
+        across = lg.Beam("beam", open_section, [[-0.1, 0.5, 0], [-0.1, -0.5, 0]], elements=4)
+        joints: dict = {
+            "eye": lg.RevoluteJoint(None, "leaf.0", at=[0, 0, 0.5], axis=[0, 1.0, 0]),
+            "shackle": lg.DistanceJoint(None, "leaf.4", at_a=[1.2, 0, 0.6], at_b=[1.2, 0, 0.5]),
+            "held": lg.DistanceJoint(None, "beam.4", at_a=[-0.4, -0.6, 1.0], at_b=[-0.4, -0.6, 0]),
+        }
+        for node, y in (("beam.0", 0.6), ("beam.4", -0.6)):  # and the arms, which are rigid
+            joints[node] = lg.RevoluteJoint(None, node, at=[0, y, 0], axis=[0, 1.0, 0])
+        forces = {
+            "axle": lg.AppliedForce("leaf.2", at=[0.6, 0, 0.5], force=[0, 0, 1.0]),
+            "push": lg.AppliedForce("beam.0", at=[-0.4, 0.6, 0], force=[0, 0, 1.0]),
+        }
+        model = lg.Model(leaf.bodies | across.bodies, joints, leaf.forces | across.forces | forces)
+        return model, ("leaf.2", "beam.0"), leaf.section.stiffness
+
+    moved, section = displaced(build)
+    half = 2  # elements in either half of the leaf, whose bending they lack 1/4n² of
     expected = 1.2**3 / (48 * section[4]) * (1 - 1 / (4 * half**2)) + 1.2 / (4 * section[2])
-    np.testing.assert_allclose(moved[0], [0.0, 0.0, expected], rtol=1e-8, atol=1e-8 * float(expected))
+    np.testing.assert_allclose(moved[0], [0.0, 0.0, expected], rtol=1e-8, atol=1e-8 * expected)
     arm, c, n = 0.4, 0.1, 4
     s_shape = 1 / (12 * 4e4) * (1 - 1 / n**2) + 1 / 6e7  # what ends of the beam move apart by per force
     roll = 4 * 150.0 + 4 * c**2 / s_shape  # of both wheels [N m/rad]
