@@ -308,8 +308,9 @@ class QuarterCar(eqx.Module):
             speed: V [m/s], shape (), positive.
             weighting: of the acceleration, by the name of a `FrequencyWeighting`; None: none.
 
-        The wheel is locked: one that turns freely does not settle. Differentiable by every number of the car, by the
-        adjoint Lyapunov equation. Raises `ValueError` as `lgsens.random_road`. Source: `lgsens.random_road`.
+        The wheel is locked: one that turns freely does not settle, nor do beams without `damping`. Differentiable by
+        every number of the car, by the adjoint Lyapunov equation. Raises `ValueError` as `lgsens.random_road`. Source:
+        `lgsens.random_road`.
         """
         linear = linearize(self.model(wheel="locked", chassis="heave"), inputs=("tyre",), outputs=_ON_ROAD)
         weighted = {} if weighting is None else {"acceleration": FrequencyWeighting(weighting)}
