@@ -61,6 +61,7 @@ from lgsens.model import (
     Beam as Beam,
     BeamElement as BeamElement,
     BeamSection as BeamSection,
+    BentBeam as BentBeam,
     BumpRoad as BumpRoad,
     BumpStop as BumpStop,
     Bushing as Bushing,

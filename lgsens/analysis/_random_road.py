@@ -109,7 +109,7 @@ def random_road(
     require(
         lambda values: np.max(values.real) < 0.0,
         "`linear` must settle, all eigenvalues with Re λ < 0, and has one that does not. Lock what turns freely (a "
-        "wheel on its hinge), hold what floats.",
+        "wheel on its hinge), hold what floats, give beams `damping`.",
         linear.eigenvalues,
     )
     weightings = tuple(weighting.get(name) for name in linear.outputs)

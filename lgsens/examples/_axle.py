@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from lgsens.examples._axle_file import axle_members
 from lgsens.examples._axle_parts import Bar, Rack
+from lgsens.examples._bending import with_nodes
 from lgsens.examples._corner_scene import CornerScene, corner_scene
 from lgsens.examples._hardpoint_file import read
 from lgsens.examples._quarter_car import GRAVITY, QuarterCar, check_choice
@@ -62,7 +63,8 @@ class Axle(eqx.Module):
         with jax.ensure_compile_time_eval():
             corner = QuarterCar.load(path)
             root, kilogram = reader(*read(path))
-            axle = Axle(corner, **axle_members(root, kilogram, [*corner.links]))
+            between = axle_members(root, kilogram, [*corner.links])
+            axle = Axle(with_nodes(corner, between["bar"].ends) if "bar" in between else corner, **between)
             return axle if corner.wheel.centre[1] > 0 else reflected(axle)
 
     @property
@@ -83,9 +85,9 @@ class Axle(eqx.Module):
     @property
     def mass(self) -> Float[Array, ""]:
         """Of all bodies [kg]: of two quarters of a car, and what is between them."""
-        between = [self.subframe, None if self.rack is None else self.rack.part, self.bar]
-        every = [self.left, self.right, *(part for part in between if part is not None)]
-        return jnp.sum(jnp.stack([part.mass for part in every]))
+        between = [self.subframe, None if self.rack is None else self.rack.part]
+        every = [part.mass for part in (self.left, self.right, *between) if part is not None]
+        return jnp.sum(jnp.stack([*every, *([] if self.bar is None else [self.bar.own_mass])]))
 
     def two_sided(self) -> "Axle":
         """The same axle with numbers of its own on each side."""
@@ -100,17 +102,18 @@ class Axle(eqx.Module):
         `left_anti_roll_bar`, and `left_LINK` of every link. Joints are `left_hub`, `left_LINK_BODY`, those of the file
         (`left_NAME`), `left_drop_link`, and `steering`, which holds the rack at its design position; forces `gravity`,
         `left_spring`, `left_damper`, `left_NAME` of bushings (of a hinge `left_NAME_1` and `_2`), `left_subframe_NAME`,
-        `left_bump_stop`, `anti_roll_bar`, `left_tyre`.
+        `left_bump_stop`, `anti_roll_bar`, `left_tyre`. Of beams there are nodes and elements in their places,
+        `left_LINK.0`, `anti_roll_bar.0`, …, the first on the left, and `left_anti_roll_bar_BODY`, what carries the bar.
 
         Arguments:
             chassis: "held", or "guided": it heaves, and rolls about its centre of mass.
             links: "bodies", or "rods" as in `QuarterCar.model`; a link with a bushing remains a body.
-            compliant: whether there are bushings. False: each is the joint that it replaces, the subframe is fixed to
-                the chassis.
+            compliant: whether there are bushings and beams. False: each is the joint that it replaces, the subframe is
+                fixed to the chassis, no link bends, and a bar has halves and the stiffness of its beam (`Bar`).
             tyres: whether the wheels stand on a road, on `TyreSpring`s at their centres.
 
-        The preloads of springs, tyres and bushings are those with which the whole car, guided and on tyres, rests:
-        of those that do, the bushings' are of least energy (`static_preload`). Bushings with preloads of their own then
+        The preloads of springs, tyres, bushings and beams are those with which the whole car, guided and on tyres,
+        rests: of those that do, they are of least energy (`static_preload`). Bushings with preloads of their own then
         take these, and where they are others, the car rests elsewhere. Raises `ValueError` for an unknown kind of
         chassis or links, and as `QuarterCar.model`.
         """
@@ -130,7 +133,8 @@ class Axle(eqx.Module):
         """The left half of the axle over the bump of its file, which both wheels meet at once: as the whole axle moves.
 
         A motion of both sides alike turns or moves nothing across the plane y = 0: half of the chassis heaves, half of
-        the subframe moves in x and z and pitches, half of the rack is fixed to what carries it, the bar does not twist.
+        the subframe moves in x and z and pitches, half of the rack is fixed to what carries it, the bar does not twist,
+        nor does it bend.
         Names, preloads and joints are those of `model(chassis="guided", tyres=True)` on the left.
 
         Arguments:
@@ -163,6 +167,7 @@ class Axle(eqx.Module):
         check_choice("links", links, ("bodies", "rods"))
         forces: dict[str, Any] = {"gravity": Gravity((0.0, 0.0, -GRAVITY))}
         bodies, ends, sought, given = {}, {}, [], {}
+        cars = cars if compliant else {side: car.rigid() for side, car in cars.items()}
         held = () if self.bar is None else (self.bar.link,)
         for side, car in cars.items():
             if side == "left" or self.other is not None:
@@ -175,13 +180,30 @@ class Axle(eqx.Module):
             tyre = {"at": car.wheel.centre, "stiffness": car.tyre_stiffness, "road": road}
             forces[f"{side}_tyre"] = TyreSpring(f"{side}_wheel", **tyre)
             sought, given = [*sought, f"{side}_tyre", *scene.sought], given | scene.given
-            if self.bar is not None:
-                bar = self.bar if side == "left" else reflected(self.bar)
-                bodies[f"{side}_anti_roll_bar"] = bar.half().body()
-                joints |= bar.joints(side)
-        if self.bar is not None and len(cars) == 2:
-            forces["anti_roll_bar"] = self.bar.element("left_anti_roll_bar", "right_anti_roll_bar")
+        if self.bar is not None:
+            bent = compliant and self.bar.beam is not None and len(cars) == 2
+            more, bound, acting = self._bar(self.bar, cars, bent)
+            bodies, joints, forces = bodies | more, joints | bound, forces | acting
+            sought += [*acting] if bent else []
         return CornerScene(bodies, joints, forces, ends, sought, given)
+
+    def _bar(self, bar: Bar, cars: dict[str, QuarterCar], bent: bool) -> tuple[dict, dict, dict]:
+        """Bodies, joints and forces of the anti-roll bar: of a beam, or of halves."""
+        bars = {side: bar if side == "left" else reflected(bar) for side in cars}
+        held = {side: car.scene_name(bar.link, "drop_link", f"{side}_") for side, car in cars.items()}
+        if not bent:
+            bodies = {f"{side}_anti_roll_bar": of.half().body() for side, of in bars.items()}
+            joints = {name: joint for side, of in bars.items() for name, joint in of.joints(side, held[side]).items()}
+            twisted = {"anti_roll_bar": bar.element(*bodies)} if len(bodies) == 2 else {}
+            return bodies, joints, twisted
+        beam = bar.bent(bars["right"])
+        lever, bearing = dict(zip(cars, beam.corners[::3])), dict(zip(cars, beam.corners[1:3]))
+        joints, forces = {}, dict(beam.forces)
+        for side, of in bars.items():
+            turning, bushings = of.bearings(side, bearing[side])
+            joints |= turning | of.drop_link(side, lever[side], held[side])
+            forces |= bushings
+        return beam.bodies, joints, forces
 
     def _between(self, compliant: bool) -> tuple[dict[str, Part], dict[str, Any]]:
         """The bodies that both sides share, and their joints."""

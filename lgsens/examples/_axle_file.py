@@ -12,6 +12,7 @@ from lgsens._validate import as_float
 from lgsens.examples._axle_parts import ALONG_Y, CURVED, CURVES, RATES, Bar, Mount, Rack, Stop
 from lgsens.examples._corner_scene import connections
 from lgsens.examples._hardpoint_file import Reader
+from lgsens.examples._link_beam import read_beam
 from lgsens.examples._suspension_parts import Connection, Link, Part, Strut
 
 CARRIERS = ("subframe", "rack")
@@ -134,15 +135,20 @@ def _carrier(root: Reader, table: Reader) -> str:
 
 def _bar(root: Reader, table: Reader, kilogram: float, links: Collection[str]) -> Bar:
     bodies = ("knuckle", *links)
-    ends = table.ends(bodies, ("bearing", "lever", "on", "mass", *SECTION))
+    ends = table.ends(bodies, ("bearing", "lever", "on", "mass", "beam", "bushing", *SECTION))
     if len(ends) != 1 or any(point.ndim != 1 for point in ends.values()):
         raise table.fail(
             "lever", f"its drop link needs the other end, a point of one body of {sorted(bodies)}, got {sorted(ends)}."
         )
+    beam = read_beam(table, ("mass", *SECTION), ("tube", "round")) if "beam" in table else None
     section = {key: table.number(key) for key in SECTION if key in table}
+    if "bushing" in table:
+        if beam is None:
+            raise table.fail("bushing", "is of the bearings of a bar with `beam`, others are hinges; leave it out.")
+        table.table("bushing").only(OF_MOUNT)
     if "stiffness" in section and len({*section} - {"damping"}) > 1:
         raise table.fail("stiffness", f"follows from the bar's dimensions; leave it or {sorted(section)} out.")
-    if "stiffness" not in section:
+    if "stiffness" not in section and beam is None:
         section |= {key: table.number(key) for key in ("diameter", "length")}
     bearing, lever = table.point("bearing"), table.point("lever")
     (end,) = ends.values()
@@ -154,9 +160,11 @@ def _bar(root: Reader, table: Reader, kilogram: float, links: Collection[str]) -
             "the lever has no length across y, or the drop link goes along it or along y and cannot turn it; "
             f"got bearing, end of lever and end of drop link {np.asarray(jnp.stack([bearing, lever, end])).tolist()}.",
         )
-    bar = Bar(bearing, lever, ends, table.number("mass", kilogram), section, _carrier(root, table))
+    mass = table.number("mass", kilogram) if beam is None else None
+    mount = _mount(table.table("bushing"), 1) if "bushing" in table else None
+    bar = Bar(bearing, lever, ends, mass, section, _carrier(root, table), beam, mount)
     try:
         bar.element("left", "right")
     except ValueError as error:
-        raise table.fail("diameter", str(error)) from error
+        raise table.fail("diameter" if beam is None else "beam", str(error)) from error
     return bar

@@ -18,6 +18,8 @@ _TABLES = {"mounts": "bushings", "stops": "", "bar": "anti_roll_bar", "tyre_stif
 _AT = {"at", "bearing", "lever"}
 _POSITIVE = {"rate", "stiffness", "damping", "rotational_stiffness", "rotational_damping", "diameter"}
 _POSITIVE |= {"tyre_stiffness", "rounding", "gap", "length", "bore", "shear_modulus", "progression"}
+_POSITIVE |= {"thickness", "width", "height"}
+_UNNAMED = ("ends", "section", "of", "shape", "material")  # that are no keys of the file
 
 
 class Place(NamedTuple):
@@ -48,7 +50,7 @@ def places(axle: Axle) -> dict[str, list[Place]]:
 def _key(names: list[str], carriers: Mapping[str, str]) -> str:
     """That of the file: "links.tie_rod.subframe", "bushings.pivot.stiffness", "subframe.mounts.front.at"."""
     owner = ".".join(names[: 2 if names[0] in ("links", "joints") else 1]) if names[0] != "stops" else names[1]
-    names = [_TABLES.get(names[0], names[0]), *(name for name in names[1:] if name not in ("ends", "section"))]
+    names = [_TABLES.get(names[0], names[0]), *(name for name in names[1:] if name not in _UNNAMED)]
     if names[-1] == "chassis":
         names[-1] = carriers.get(owner, "chassis")
     if names[-1] == "rate":

@@ -1,5 +1,6 @@
 """What an axle has beside rigid links: bushings, stops, a rack, an anti-roll bar, and the elements that they become."""
 
+import dataclasses
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -7,15 +8,20 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lgsens.examples._link_beam import ELEMENTS, LinkBeam, SectionShape
 from lgsens.examples._suspension_parts import Part
 from lgsens.model import (
+    AbstractForce,
     AbstractJoint,
     AntiRollBar,
+    BeamSection,
+    BentBeam,
     BumpStop,
     Bushing,
     DistanceJoint,
     RevoluteJoint,
     Sampled,
+    SphericalJoint,
     TorsionSpringDamper,
 )
 
@@ -108,49 +114,99 @@ class Rack(eqx.Module):
 
 class Bar(eqx.Module):
     """An anti-roll bar across the car: on each side a half that turns about y in a bearing, and a massless drop link.
+    Or a beam, straight from lever to bearing, across and back, on ball joints or bushings, of which torsion and bending
+    follow from the section: what it moves by at the end of either lever per force there, opposite on the other side, is
+
+        C = a³/3EI + a/kGA + r² L/2GJ + b² (L/6EI + 2/kGA L)
+
+    with a the length of its levers, r and b that across and along y, and L from bearing to bearing (Timoshenko): what
+    levers bend, the middle twists, and the middle bends, which the bearings do not hinder.
 
     Attributes:
         bearing: a point on the bar's straight middle [m], shape (3,). lever: where its lever meets the drop link.
         ends: by the link or knuckle at the other end of the drop link the point there.
-        mass: of the whole bar [kg], shape (), uniform along its middle and its levers.
+        mass: of the whole bar [kg], shape (), uniform along its middle and its levers; None: that of the beam.
         section: `stiffness` [N m/rad] of the whole bar in torsion, or `diameter`, `length`, `bore`, `shear_modulus` as
             of an `AntiRollBar`; and `damping` [N m s/rad].
         carrier: "chassis" or "subframe", which holds the bearing.
+        beam: a round section or a tube; None: halves twist against each other. mount: of its bearings; None: balls.
     """
 
     bearing: Float[Array, "3"]
     lever: Float[Array, "3"]
     ends: dict[str, Float[Array, "3"]]
-    mass: Float[Array, ""]
+    mass: Float[Array, ""] | None
     section: dict[str, Float[Array, ""]]
     carrier: str = eqx.field(static=True)
+    beam: LinkBeam | None = None
+    mount: Mount | None = None
 
     @property
     def link(self) -> str:
         """The body at the other end of the drop link."""
         return next(iter(self.ends))
 
+    def bending(self, section: SectionShape | BeamSection, *, elements: int = ELEMENTS) -> "Bar":
+        """The bar as a beam of this section, round or a tube, with so many elements for each lever and the middle."""
+        return dataclasses.replace(self, mass=None, section={}, beam=LinkBeam(section, elements))
+
+    @property
+    def own_mass(self) -> Array:
+        """Of the whole bar [kg], shape ()."""
+        if self.beam is None:
+            assert self.mass is not None
+            return self.mass
+        lever = self.lever - self.bearing
+        return self.beam.section.mass * 2.0 * (jnp.linalg.norm(lever) + jnp.abs(self.bearing[1]))
+
+    @property
+    def rate(self) -> Array:
+        """Of a beam as of halves that twist against each other [N m/rad]: r²/2C, shape ()."""
+        assert self.beam is not None
+        shear, torsion, bending = (self.beam.section.stiffness[i] for i in (1, 3, 4))
+        lever, length = self.lever - self.bearing, 2.0 * jnp.abs(self.bearing[1])
+        a, b2 = jnp.linalg.norm(lever), lever[1] ** 2
+        softness = a**3 / (3.0 * bending) + a / shear + (a**2 - b2) * length / (2.0 * torsion)
+        softness = softness + b2 * (length / (6.0 * bending) + 2.0 / (shear * length))
+        return (a**2 - b2) / (2.0 * softness)
+
+    def bent(self, right: "Bar") -> BentBeam:
+        """The beam, "anti_roll_bar.0" at the end of this lever, to that on the right."""
+        assert self.beam is not None
+        corners = jnp.stack([self.lever, self.bearing, right.bearing, right.lever])
+        return BentBeam("anti_roll_bar", self.beam.section, corners, elements=self.beam.elements)
+
     def half(self) -> Part:
         """One half: slender rods from the middle, y = 0, to the bearing and on to the end of the lever."""
         corners = jnp.stack([self.bearing * jnp.asarray([1.0, 0.0, 1.0]), self.bearing, self.lever])
         rods = jnp.diff(corners, axis=0)
         squares = jnp.sum(rods**2, axis=1)
-        masses = self.mass / 2 * jnp.sqrt(squares) / jnp.sum(jnp.sqrt(squares))
+        masses = self.own_mass / 2 * jnp.sqrt(squares) / jnp.sum(jnp.sqrt(squares))
         parts = [
             Part(middle, mass, mass / 12 * (square * jnp.eye(3, dtype=rod.dtype) - jnp.outer(rod, rod)))
             for middle, mass, square, rod in zip((corners[1:] + corners[:-1]) / 2, masses, squares, rods)
         ]
         return parts[0].joined(parts[1])
 
-    def joints(self, side: str) -> dict[str, AbstractJoint]:
-        """Of the half on this side."""
-        half, link = f"{side}_anti_roll_bar", f"{side}_{self.link}"
-        return {
-            f"{half}_{self.carrier}": RevoluteJoint(self.carrier, half, at=self.bearing, axis=ALONG_Y),
-            f"{side}_drop_link": DistanceJoint(half, link, at_a=self.lever, at_b=self.ends[self.link]),
-        }
+    def joints(self, side: str, link: str) -> dict[str, AbstractJoint]:
+        """Of the half on this side, to the body that is called so."""
+        half = f"{side}_anti_roll_bar"
+        bearing = RevoluteJoint(self.carrier, half, at=self.bearing, axis=ALONG_Y)
+        return {f"{half}_{self.carrier}": bearing} | self.drop_link(side, half, link)
+
+    def drop_link(self, side: str, lever: str, link: str) -> dict[str, AbstractJoint]:
+        """Between two bodies, on this side."""
+        return {f"{side}_drop_link": DistanceJoint(lever, link, at_a=self.lever, at_b=self.ends[self.link])}
+
+    def bearings(self, side: str, body: str) -> tuple[dict[str, AbstractJoint], dict[str, AbstractForce]]:
+        """What carries this node of a beam, on this side: joints or bushings."""
+        name = f"{side}_anti_roll_bar_{self.carrier}"
+        if self.mount is None:
+            return {name: SphericalJoint(self.carrier, body, at=self.bearing)}, {}
+        return {}, dict(self.mount.elements(name, self.carrier, body, self.bearing))
 
     def element(self, left: str, right: str) -> AntiRollBar | TorsionSpringDamper:
         """What twists between its two halves."""
-        kind: Any = TorsionSpringDamper if "stiffness" in self.section else AntiRollBar
-        return kind(left, right, axis=ALONG_Y, **self.section)
+        section = self.section if self.beam is None else {"stiffness": self.rate}
+        kind: Any = TorsionSpringDamper if "stiffness" in section else AntiRollBar
+        return kind(left, right, axis=ALONG_Y, **section)

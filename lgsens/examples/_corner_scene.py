@@ -18,7 +18,7 @@ class CornerScene(NamedTuple):
 
     Attributes:
         ends: by body that it shares with others, masses [kg] and places [m] of ends of rods on it.
-        sought: its forces whose preloads hold the car; those of `given` among them.
+        sought: its forces whose preloads hold the car, elements of beams and those of `given` among them.
         given: its bushings that have preloads of their own.
     """
 
@@ -68,18 +68,28 @@ def corner_scene(
     own, mounts = f"{side}_" if side else "", mounts or {}
     carriers = dict(car.carriers) if side else {}
 
+    node = lambda key, body: car.scene_name(body, key, own)
+
     def named(key: str):
         """What bodies are called by an element of the corner."""
-        return lambda body: carriers.get(key, body) if body == "chassis" else body if body in SHARED else own + body
+        return lambda body: (
+            carriers.get(key, body) if body == "chassis" else body if body in SHARED else node(key, body)
+        )
+
+    def jointed(name: str):
+        """By a joint, which has its carrier."""
+        return lambda body: body if body in SHARED else node(f"joints.{name}", body)
 
     joined = connections(car.links, car.joints, carriers)
     struts = {"spring": car.spring, "damper": car.damper}
     busy = {*held, *(end for link in car.links.values() for end in link.ends)}
     busy |= {end for acting in (*struts.values(), *car.stops.values()) for end in acting.ends}
     busy |= {end for name, c in joined.items() if name in car.joints or name in mounts for end in c.between}
+    beams = {name: link.bent(own + name) for name, link in car.links.items() if link.beam is not None}
     rods = {name: link for name, link in car.links.items() if links == "rods" and link.is_bar and name not in busy}
+    rods = {name: link for name, link in rods.items() if not {*link.ends} & {*beams}}
     parts = {"knuckle": car.knuckle, "wheel": car.wheel}
-    parts |= {name: link.part(car.link_radius) for name, link in car.links.items() if name not in rods}
+    parts |= {name: link.part(car.link_radius) for name, link in car.links.items() if name not in (*rods, *beams)}
     ends: dict[str, list[tuple[Array, Array]]] = {}
     joints, forces, sought, given = {}, {}, [own + "spring"], {}
     hub: dict[str, Any] = {"at": car.bearing} | ({"axis": ALONG_Y} if wheel == "hinged" else {})
@@ -89,20 +99,22 @@ def corner_scene(
         a, b = map(named(f"links.{name}"), (a, b))
         joints[own + name] = DistanceJoint(a, b, at_a=start, at_b=end)
         for body, place in ((a, start), (b, end)):
-            ends.setdefault(body, []).append((rod.mass / 2, place))
+            ends.setdefault(body, []).append((rod.own_mass / 2, place))
     joints |= {
-        own + name: connection.joint(named(""))
+        own + name: connection.joint(jointed(name))
         for name, connection in joined.items()
         if name not in mounts and connection.between[1] not in rods
     }
     for name, mount in mounts.items():
         place = Connection("fixed", ("chassis", "subframe"), mount.at) if mount.at is not None else joined[name]
-        a, b = map(named(""), place.between)
+        a, b = map(jointed(name), place.between)
         bushings = dict(mount.elements(own + name, a, b, place.at))
         forces |= bushings
         sought += bushings
         given |= {} if mount.preload is None else bushings
     bodies = {own + name: part.body(ends.pop(own + name, ())) for name, part in parts.items()}
+    for beam in beams.values():
+        bodies, forces, sought = bodies | beam.bodies, forces | beam.forces, [*sought, *beam.forces]
     forces |= {own + key: strut.element(key, named=named(key)) for key, strut in struts.items()}
     forces |= {own + key: stop.element(named(key)) for key, stop in car.stops.items()}
     return CornerScene(bodies, joints, forces, ends, sought, given)

@@ -81,6 +81,10 @@ class Reader:
             self._get(key, lambda value: value > 0, "positive")
         return as_float(value * scale, (), key)
 
+    def count(self, key: str) -> int:
+        holds = lambda value: isinstance(value, int) and not isinstance(value, bool) and value >= 1
+        return self._get(key, holds, "a whole number of at least 1")
+
     def vector(self, key: str) -> Array:
         """Three numbers as they are: a direction, moments of inertia."""
         value = self._get(key, lambda value: _are_numbers(value, 3), "three numbers [x, y, z]")

@@ -1,6 +1,6 @@
 """The quarter-car of the paper's §9 with a real five-link rear suspension."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,14 +13,17 @@ from jaxtyping import Array, Float
 from lgsens._validate import as_float, suggestion
 from lgsens.analysis import FrequencyWeighting, Kinematics, kinematics, linearize, random_road
 from lgsens.examples._axle_parts import Mount, Stop
+from lgsens.examples._bending import bending, rigid, with_nodes
 from lgsens.examples._corner_scene import corner_scene
 from lgsens.examples._hardpoint_file import read
 from lgsens.examples._leverage import motion_ratios
+from lgsens.examples._link_beam import ELEMENTS, SectionShape
 from lgsens.examples._suspension_curves import SuspensionCurves, suspension_curves
 from lgsens.examples._suspension_file import members
 from lgsens.examples._suspension_parts import Connection, Link, Part, Strut, reflected
 from lgsens.model import (
     ALL_FREE,
+    BeamSection,
     BumpRoad,
     Gravity,
     Model,
@@ -51,7 +54,8 @@ class RoadResponse(NamedTuple):
 class QuarterCar(eqx.Module):
     """A quarter-car with any independent suspension: its data, all numbers leaves. `QuarterCar.load()` reads them.
 
-    Chassis, knuckle, wheel and links are rigid bodies: `Link` says how a link holds on, and `joints` are all others.
+    Chassis, knuckle, wheel and links are rigid bodies, but for links that bend (`bending`, or `beam` in the file):
+    `Link` says how a link holds on, and `joints` are all others.
     The wheel turns on a hinge of the knuckle or is locked to it; the chassis heaves only. The five-link suspension is
     of eight bodies; with 48 coordinates and 45 (46) constraints it has 3 (2) degrees of freedom, a reduced scene the
     same with 19 and 16 (17), see `model`. Frame: x forward, y left, z up over the road; SI units.
@@ -91,7 +95,7 @@ class QuarterCar(eqx.Module):
         """
         with jax.ensure_compile_time_eval():  # the file's numbers are constants, inside `jit` too
             document, name = read(path)
-            car = QuarterCar(**members(document, name))
+            car = with_nodes(QuarterCar(**members(document, name)))
             car._check(f"Hardpoint file {name!r}")
             return car
 
@@ -104,6 +108,35 @@ class QuarterCar(eqx.Module):
         Camber, toe and the other curves, whose signs are those of the wheel's side, are the same.
         """
         return reflected(self)
+
+    def bending(
+        self, sections: Mapping[str, BeamSection | SectionShape], *, elements: int = ELEMENTS, up=None
+    ) -> "QuarterCar":
+        """The car with links that bend: uniform beams between their two ends, of the mass of their sections.
+
+            car.bending({"trailing_arm": lg.BeamSection.tube(0.03, 0.003, young=2.1e11, poisson=0.3, density=7850.0)})
+
+        Arguments:
+            sections: by link; a `SectionShape` keeps diameter and wall among the numbers of the car.
+            elements: of each, static.
+            up: as of a `Beam`; None: z, of a link that is nearly upright x.
+
+        In the scene they have the bodies "trailing_arm.0" … "trailing_arm.4", node 0 at the first end by the names of
+        its bodies, and as elements the forces "trailing_arm.0" … "trailing_arm.3" (`SectionState`). What a link carries
+        holds on to the nearest node, which is settled here: points and sections may be traced afterwards, sections now
+        too. Raises `ValueError` for links that the car does not have or that other than two ends hold, stiffness that
+        is not of principal axes, points that are traced already, and as `Beam`.
+        """
+        return bending(self, sections, elements, up)
+
+    def rigid(self) -> "QuarterCar":
+        """The car with links of the masses of their beams that do not bend: the limit of stiff ones."""
+        return rigid(self)
+
+    def scene_name(self, body: str, key: str, own: str = "") -> str:
+        """What a body of the corner is called in a scene by what holds on to it: of a beam one of its nodes."""
+        link = self.links.get(body)
+        return own + (body if link is None or link.beam is None else link.beam.node(body, key))
 
     def _check(self, name: str) -> None:
         """Raise `ValueError` for what moves or stands as no car does."""
@@ -140,9 +173,8 @@ class QuarterCar(eqx.Module):
     @property
     def mass(self) -> Float[Array, ""]:
         """Of all bodies [kg]."""
-        return jnp.sum(
-            jnp.stack([part.mass for part in (self.chassis, self.knuckle, self.wheel, *self.links.values())])
-        )
+        links = [link.own_mass for link in self.links.values()]
+        return jnp.sum(jnp.stack([self.chassis.mass, self.knuckle.mass, self.wheel.mass, *links]))
 
     def with_values(self, *, stiffness=None, damping=None, bump_height=None, hardpoints=None) -> "QuarterCar":
         """The car with some numbers replaced; None: it keeps its own.
@@ -190,12 +222,12 @@ class QuarterCar(eqx.Module):
                 goes to either end, on the bodies there, whose centres of mass and inertias move with it. Mass and
                 centre of mass of a bar stay so, and with them the static forces; its moment of inertia about its
                 centre becomes m L²/4 for m L²/12. A link that carries the spring or the damper is bent and not only
-                pulled, and remains a body.
+                pulled, and remains a body. Links that bend do in either.
             bushings: the links that a `Bushing` holds at the knuckle in place of a ball joint: 3 constraints less each.
                 Such a link remains a body.
             bushing_stiffness, bushing_damping: of those bushings, in every direction [N/m] and [N s/m].
-            free_length: free length of the spring [m]. None: the preloads of spring, tyre and bushings are those that
-                hold the car at the design position, whatever the parameters, and so are their derivatives.
+            free_length: free length of the spring [m]. None: the preloads of spring, tyre, bushings and beams are those
+                that hold the car at the design position, whatever the parameters, and so are their derivatives.
             free_radius: free radius of the tyre [m], with `free_length`.
 
         Raises `ValueError` for an unknown kind of wheel, chassis or links, for bushings at links that the car does not
@@ -223,17 +255,19 @@ class QuarterCar(eqx.Module):
         tyre = {"stiffness": self.tyre_stiffness, "free_radius": free_radius, "road": road}
         forces = {"gravity": Gravity((0.0, 0.0, -GRAVITY))} | scene.forces
         forces |= {"tyre": TyreSpring("wheel", at=self.wheel.centre, **tyre)}
-        forces |= {f"{name}_bushing": forces.pop(f"{name}_knuckle") for name in bushings}
+        called = {f"{name}_knuckle": f"{name}_bushing" for name in bushings}
+        forces = {called.get(name, name): force for name, force in forces.items()}
         if free_length is not None:
-            forces["spring"] = self.spring.element("spring", free_length)
+            forces["spring"] = self.spring.element("spring", free_length, lambda body: self.scene_name(body, "spring"))
         model = Model(bodies, joints, forces)
         if free_length is not None:
             return model
         self._check(f"Suspension {self.name!r}")  # else no preload holds it, or one that no car has
-        return static_preload(model, ("spring", "tyre", *(f"{name}_bushing" for name in bushings)))[0]
+        return static_preload(model, ("tyre", *(called.get(name, name) for name in scene.sought)))[0]
 
     def travel(self, travel, *, links: str = "rods", throw: bool = True) -> Kinematics:
-        """The suspension on a rig: the chassis held, the wheel locked, its centre moved up and down at rate 1.
+        """The suspension on a rig: the chassis held, the wheel locked, its centre moved up and down at rate 1; no link
+        bends.
 
         Arguments:
             travel: vertical displacements of the wheel centre [m], positive in bump, shape (n,), in an order in which
@@ -245,7 +279,7 @@ class QuarterCar(eqx.Module):
         preload here. Raises `ValueError` for travel that the links do not allow.
         """
         # Lengths that are given need no preload to be found.
-        scene = self.model(wheel="locked", chassis="heave", links=links, free_length=1.0, free_radius=1.0)
+        scene = self.rigid().model(wheel="locked", chassis="heave", links=links, free_length=1.0, free_radius=1.0)
         driver = TranslationDriver(None, "wheel", at=self.wheel.centre, axis=ALONG_Z)
         held = {"chassis": self.chassis.body(free=())}
         rig = Model(scene.bodies | held, scene.joints | {"travel": driver}, scene.forces)
@@ -274,8 +308,9 @@ class QuarterCar(eqx.Module):
             speed: V [m/s], shape (), positive.
             weighting: of the acceleration, by the name of a `FrequencyWeighting`; None: none.
 
-        The wheel is locked: one that turns freely does not settle. Differentiable by every number of the car, by the
-        adjoint Lyapunov equation. Raises `ValueError` as `lgsens.random_road`. Source: `lgsens.random_road`.
+        The wheel is locked: one that turns freely does not settle, nor do beams without `damping`. Differentiable by
+        every number of the car, by the adjoint Lyapunov equation. Raises `ValueError` as `lgsens.random_road`. Source:
+        `lgsens.random_road`.
         """
         linear = linearize(self.model(wheel="locked", chassis="heave"), inputs=("tyre",), outputs=_ON_ROAD)
         weighted = {} if weighting is None else {"acceleration": FrequencyWeighting(weighting)}

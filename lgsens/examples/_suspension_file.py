@@ -8,7 +8,10 @@ y left, z up. TOML, or JSON of the same structure.
     [road]         height: z of the road at the design position, in units of the file; left out: 0
     [links.NAME]   BODY = [x, y, z]: a ball joint at that body, or BODY = [[x, y, z], [x, y, z]]: a hinge through both
                    points; mass; centre_of_mass and inertia, left out: a uniform bar between its two ends; arm and
-                   link_arm: directions of the arms of its universal joint, see `Link`
+                   link_arm: directions of the arms of its universal joint, see `Link`; or in place of masses
+    [links.NAME.beam]  a link with two ends bends: tube = {diameter, thickness}, round = {diameter} or rectangle =
+                   {width, height} [m], a height goes along the direction up (left out: z); young [N/m²], poisson,
+                   density [kg/m³], damping [s] (left out: none), see `BeamSection`; elements (left out: 4)
     [joints.NAME]  type (cylindrical, fixed, prismatic, revolute, spherical), between = [BODY, BODY], at: a point, or
                    the two points of its line
     [knuckle], [wheel], [chassis]: centre_of_mass (wheel: centre, and bearing, its hub), mass, inertia (principal
@@ -32,7 +35,10 @@ Of an axle, in SI units; points are those of the side of the file:
     [anti_roll_bar]  bearing: a point of its straight middle, along y, where the chassis or on = "subframe" carries it;
                    lever: the end of its lever, and BODY = [x, y, z], the other end of the drop link on a link or the
                    knuckle; mass; stiffness [N m/rad] of the whole bar, or diameter, length [m] and, if they are
-                   others than those of a rod of steel, bore [m], shear_modulus [Pa]; damping [N m s/rad]
+                   others than those of a rod of steel, bore [m], shear_modulus [Pa]; damping [N m s/rad]; or in
+                   place of all these
+    [anti_roll_bar.beam]  as of a link, tube or round: the bar is a beam from lever to lever, see `Bar`
+    [anti_roll_bar.bushing]  the keys of a bushing: of the bearings of such a bar, left out: ball joints
     [bushings.NAME]  in place of the joint NAME, LINK_BODY of a link: stiffness, rotational_stiffness [N/m], [N m/rad],
                    damping, rotational_damping (left out: none), three numbers, or two times three of the two
                    bushings of a hinge; axes: [[x, y, z], [x, y, z]], the first and the plane of the second (left out:
@@ -43,8 +49,8 @@ Of an axle, in SI units; points are those of the side of the file:
     [bump_stop], [rebound_stop]  BODY = [x, y, z] twice (left out: the points of the damper), gap [m], stiffness [N/m],
                    rounding [m], progression [m]; see `BumpStop`
 
-A corner by itself has stops, and of the rest what is rigid: the chassis takes the place of subframe and rack, joints
-that of bushings, and there is no anti-roll bar.
+A corner by itself has stops and links that bend, and of the rest what is rigid: the chassis takes the place of
+subframe and rack, joints that of bushings, and there is no anti-roll bar.
 """
 
 from pathlib import Path
@@ -58,6 +64,7 @@ from jaxtyping import Array
 from lgsens._validate import as_float
 from lgsens.examples._axle_file import CARRIERS, OF_AXLE, carried, mounts, stop
 from lgsens.examples._hardpoint_file import Reader
+from lgsens.examples._link_beam import read_beam
 from lgsens.examples._suspension_parts import ALONG_A_LINE, AT_A_POINT, Connection, Link, Part, Strut
 from lgsens.model import Sampled
 
@@ -68,7 +75,7 @@ TABLES += ("link_section", "bump", "design")
 RATES = {"spring": "stiffness", "damper": "damping"}
 STOPS = ("bump_stop", "rebound_stop")
 OF_MODEL = ("hub", "heave", "travel")  # joints that there are beside those of the file
-OF_LINK = ("mass", "centre_of_mass", "inertia", "arm", "link_arm")
+OF_LINK = ("mass", "centre_of_mass", "inertia", "arm", "link_arm", "beam")
 
 
 def reader(document: dict, path: str) -> tuple[Reader, float]:
@@ -108,7 +115,7 @@ def members(document: dict, path: str) -> dict[str, Any]:
             f"tyre has a loaded radius outside of {LEAST_RADIUS} to {LARGEST_RADIUS} m; set the key 'road.height' to "
             "the z of the road at the design position.",
         )
-    bars = [link for link in links.values() if link.inertia is None]
+    bars = [link for link in links.values() if link.inertia is None and link.beam is None]
     bump = root.table("bump")
     struts = {key: _strut(key, root.table(key), bodies, rate, carriers) for key, rate in RATES.items()}
     root.only((*TABLES, *OF_AXLE))  # after what is missing: a table that is spelled wrong is both
@@ -134,6 +141,9 @@ def members(document: dict, path: str) -> dict[str, Any]:
 
 def _link(name: str, table: Reader, bodies: tuple[str, ...], kilogram: float, carriers: dict[str, str]) -> Link:
     ends = carried(table, f"links.{name}", table.ends([body for body in bodies if body != name], OF_LINK), carriers)
+    beam = read_beam(table, ("mass", "centre_of_mass", "inertia")) if "beam" in table else None
+    if beam is not None and len(ends) != 2:
+        raise table.fail("beam", f"goes between two ends, got {sorted(ends)}; leave it out, the link is rigid.")
     own = "centre_of_mass" in table or "inertia" in table
     if len(ends) < 2 and not own:  # one end makes no bar
         table.point("chassis" if "chassis" not in ends else "knuckle")
@@ -141,12 +151,18 @@ def _link(name: str, table: Reader, bodies: tuple[str, ...], kilogram: float, ca
         table.point("centre_of_mass")
     link = Link(
         ends,
-        table.number("mass", kilogram),
+        table.number("mass", kilogram) if beam is None else None,
         centre=table.point("centre_of_mass") if own else None,
         inertia=table.moments("inertia") if own else None,
         arm=table.direction("arm"),
         link_arm=table.direction("link_arm"),
+        beam=beam,
     )
+    if beam is not None:
+        try:
+            link.bent(name)
+        except ValueError as error:
+            raise table.fail("beam", str(error)) from error
     if link.first is None and (link.arm, link.link_arm) != (None, None):
         key = "link_arm" if link.arm is None else "arm"
         raise table.fail(key, "the link has a hinge or three ends and no universal joint; leave it out.")

@@ -9,10 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lgsens.examples._link_beam import LinkBeam
 from lgsens.model import (
     ALL_FREE,
     AbstractForce,
     AbstractJoint,
+    Beam,
     CurveSpringDamper,
     CylindricalJoint,
     FixedJoint,
@@ -32,7 +34,7 @@ ALONG_A_LINE: dict[str, Any] = {
     "prismatic": PrismaticJoint,
     "revolute": RevoluteJoint,
 }
-VECTORS = {"at", "arms", "axes", "ends", "centre", "arm", "link_arm", "bearing", "lever", "preload"}
+VECTORS = {"at", "arms", "axes", "ends", "centre", "arm", "link_arm", "bearing", "lever", "preload", "up"}
 AXIAL = "rotational_preload"
 # Curves of a bushing along its axes e₁, e₂, e₃ = e₁ × e₂: these become S e₁, S e₂, −S e₃, and turns change their sign.
 TURNED_ROUND = {"spring_3", "damper_3", *(f"rotational_{kind}_{i}" for kind in ("spring", "damper") for i in (1, 2))}
@@ -120,23 +122,26 @@ class Connection(eqx.Module):
 
 
 class Link(eqx.Module):
-    """A rigid link and where it holds on to other bodies.
+    """A link and where it holds on to other bodies: a rigid one, or a beam between its two ends.
 
     Attributes:
         ends: by the body it holds on to one point [m], shape (3,), a ball joint, or two, shape (2, 3), a hinge along
             their line. A link with one or two ball joints and no hinge has a universal joint at the first of them, the
             chassis if it is one, so that it does not spin.
-        mass: [kg], shape (). centre, inertia: as of a `Part`; None: it is a uniform round bar between its two ends.
+        mass: [kg], shape (); None: that of its beam. centre, inertia: as of a `Part`; None: it is a uniform round bar
+            between its two ends.
         arm: of the universal joint, fixed in the other body; None: level and across the link, which goes up and down
             by turning about it. link_arm: the one fixed in the link; None: across both.
+        beam: its section; None: it is rigid.
     """
 
     ends: dict[str, Float[Array, "3"] | Float[Array, "2 3"]]
-    mass: Float[Array, ""]
+    mass: Float[Array, ""] | None
     centre: Float[Array, "3"] | None = None
     inertia: Float[Array, "3"] | None = None
     arm: Float[Array, "3"] | None = None
     link_arm: Float[Array, "3"] | None = None
+    beam: LinkBeam | None = None
 
     @property
     def chassis(self) -> Array:
@@ -163,19 +168,46 @@ class Link(eqx.Module):
     @property
     def is_bar(self) -> bool:
         """Whether a massless rod can take its place."""
-        return self.centre is None and self.first is not None
+        return self.centre is None and self.first is not None and self.beam is None
+
+    @property
+    def axis(self) -> tuple[Array, Array]:
+        """Of a link with two ends these, by the names of the bodies."""
+        start, end = (self._middle(name) for name in sorted(self.ends))
+        return start, end
+
+    @property
+    def own_mass(self) -> Array:
+        """[kg], shape ()."""
+        if self.beam is None:
+            assert self.mass is not None
+            return self.mass
+        start, end = self.axis
+        return self.beam.section.mass * jnp.linalg.norm(end - start)
+
+    def bent(self, name: str) -> Beam:
+        """Its beam, of this name: node 0 is at the first of its ends, by the names of the bodies."""
+        assert self.beam is not None
+        return self.beam.beam(name, *self.axis)
 
     def part(self, radius: Any) -> Part:
-        """Its mass: its own, or of a bar of this radius: m r²/2 about its axis, m L²/12 + m r²/4 across."""
+        """Its mass: its own, or that of its beam's nodes, or of a bar of this radius: m r²/2 about its axis,
+        m L²/12 + m r²/4 across."""
+        if self.beam is not None:
+            beam = self.bent("")
+            nodes = [body.mass for body in beam.bodies.values()]
+            mass, centre, apart = lumped(jnp.stack(nodes), beam.points)
+            own = beam.axes[0] @ jnp.diag(beam.section.inertia) @ beam.axes[0].T
+            return Part(centre, mass, apart + own * (mass / beam.section.mass))
         if self.centre is not None and self.inertia is not None:
-            return Part(self.centre, self.mass, self.inertia)
-        start, end = (self._middle(name) for name in sorted(self.ends))
+            return Part(self.centre, self.own_mass, self.inertia)
+        start, end = self.axis
         direction = end - start
         square = jnp.dot(direction, direction)
         along = jnp.outer(direction, direction) / square
         across = jnp.eye(3, dtype=square.dtype) - along
-        inertia = self.mass * (radius**2 / 2 * along + (square / 12 + radius**2 / 4) * across)
-        return Part((end + start) / 2, self.mass, inertia)
+        inertia = self.own_mass * (radius**2 / 2 * along + (square / 12 + radius**2 / 4) * across)
+        return Part((end + start) / 2, self.own_mass, inertia)
 
     def _middle(self, name: str) -> Array:
         points = self.ends[name]

@@ -3,6 +3,7 @@
 from lgsens.model._beam_load import SectionState as SectionState
 from lgsens.model._beam_sections import BeamSection as BeamSection
 from lgsens.model._beams import Beam as Beam, BeamElement as BeamElement
+from lgsens.model._bent_beam import BentBeam as BentBeam, upward as upward
 from lgsens.model._body import RigidBody as RigidBody, lumped as lumped
 from lgsens.model._bushing import Bushing as Bushing
 from lgsens.model._checks import invalid_numbers as invalid_numbers
