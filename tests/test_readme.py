@@ -19,16 +19,15 @@ def blocks(text, language="python"):
 
 
 PAGES = [path for path in sorted((ROOT / "notebooks").rglob("*.md")) if blocks(path.read_text(encoding="utf-8"))]
-# How many blocks the quick run takes; where it is 0 `test_fidelity.py`, `test_step_jacobians.py`, `test_linearize.py`
-# `test_certify.py`, `test_flexible.py` and `test_suspension_files.py` are small versions.
-LONG = dict.fromkeys(("control", "flexible", "fidelity", "small_motions", "suspension", "trust"), 0)
-WHOLE = [pytest.param(path, None, marks=[pytest.mark.slow] * (path.stem in LONG), id=path.stem) for path in PAGES]
-BEGUN = [pytest.param(path, LONG[path.stem], id=f"begun-{path.stem}") for path in PAGES if LONG.get(path.stem)]
+# Not in the quick run, whose small versions are `test_fidelity.py`, `test_step_jacobians.py`, `test_linearize.py`,
+# `test_certify.py`, `test_flexible.py` and `test_suspension_files.py`.
+LONG = {"control", "flexible", "fidelity", "small_motions", "suspension", "trust"}
+WHOLE = [pytest.param(path, marks=[pytest.mark.slow] * (path.stem in LONG), id=path.stem) for path in PAGES]
 
 
-def run(text, filename, names, count=None):
-    """The blocks of a page, one after the other, or the first of them; returns `names` with theirs."""
-    exec(compile("\n".join(blocks(text)[:count]), filename, "exec"), names)
+def run(text, filename, names):
+    """The blocks of a page, one after the other; returns `names` with theirs."""
+    exec(compile("\n".join(blocks(text)), filename, "exec"), names)
     return names
 
 
@@ -53,18 +52,18 @@ def test_length_and_citation():
     assert f"\nversion: {version}\n" in README
 
 
-@pytest.mark.parametrize(("path", "count"), WHOLE + BEGUN)
-def test_page(path, count, readme, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("path", WHOLE)
+def test_page(path, readme, tmp_path, monkeypatch, capsys):
     """And prints what stands below its blocks, in a row, numbers of one or two digits aside: those are round-off."""
     monkeypatch.chdir(tmp_path)  # where a sweep keeps its results
     text = path.read_text(encoding="utf-8")
-    names = run(text, path.name, dict(readme), count)
+    names = run(text, path.name, dict(readme))
     words = lambda said: [line.split() for line in re.sub(r"\S*\de[+-]\d\d", "…", said).splitlines()]
     out, shown = (
         words(capsys.readouterr().out),
         words("".join(re.findall(r"\nprints\n\n```\n(.*?)```", text, re.DOTALL))),
     )
-    assert bool(out) >= bool(shown) and (out[: len(shown)] == shown if count is None else shown[: len(out)] == out)
+    assert bool(out) >= bool(shown) and out[: len(shown)] == shown
     CHECKS.get(path.stem, lambda names: None)(names)
 
 
