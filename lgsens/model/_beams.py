@@ -88,7 +88,8 @@ class Beam(eqx.Module):
             beam, m > 2 nodes. Its tangent at a node is that of the circle through the node and its neighbours.
         elements: of a straight beam, static; a curved one has m − 1.
         up: a direction, inertial frame, shape (3,), in whose plane with the tangent axis 3 of the sections lies: of a
-            rectangle that of its height.
+            rectangle that of its height. Of a twisted beam one at each node, shape (n, 3), also where `elements` says
+            how many nodes there are; sections turn uniformly in between, by less than π.
 
     Each node carries half the mass of the elements beside it, and their sections' rotary inertia; all masses of the
     scene are constant. Errors are O(1/elements²); for large rotations too, a beam bent to a circle by end moments is
@@ -104,7 +105,7 @@ class Beam(eqx.Module):
     def __init__(self, name: str, section: BeamSection, points, *, elements: int | None = None, up=(0.0, 0.0, 1.0)):
         if not isinstance(section, BeamSection):
             raise ValueError(f"Beam: `section` must be a BeamSection, got {section!r}.")
-        points, up = as_float(points, None, "Beam: `points`"), as_float(up, (3,), "Beam: `up`")
+        points, up = as_float(points, None, "Beam: `points`"), as_float(up, None, "Beam: `up`")
         if points.ndim != 2 or points.shape[1] != 3 or points.shape[0] < 2:
             raise ValueError(f"Beam: `points` must have shape (m, 3) with m of at least 2, got {points.shape}.")
         if points.shape[0] > 2 and elements is not None:
@@ -119,7 +120,9 @@ class Beam(eqx.Module):
             f"Beam: `points` {points} has two after each other that coincide.",
             chords,
         )
-        axes = jax.vmap(lambda tangent: _triad(tangent, up))(_tangents(chords))
+        if up.shape not in ((3,), points.shape):
+            raise ValueError(f"Beam: `up` must have shape (3,), or of each node {points.shape}, got {up.shape}.")
+        axes = jax.vmap(_triad)(_tangents(chords), jnp.broadcast_to(up, points.shape))
         require(
             lambda axes: np.all(np.isfinite(axes)) and np.all(np.abs(np.linalg.det(axes) - 1.0) < 1e-6),
             f"Beam: `up` {up} lies along the beam; give a direction across it.",
