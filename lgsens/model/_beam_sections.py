@@ -26,12 +26,14 @@ class BeamSection(eqx.Module):
 
     Arguments:
         stiffness: K of strains [ε₁, γ₂, γ₃, κ₁, κ₂, κ₃], its diagonal E A, k₂ G A, k₃ G A [N], G J, E I₂, E I₃ [N m²],
-            shape (6,), or all of it, shape (6, 6), symmetric and positive.
+            shape (6,), or all of it, shape (6, 6), symmetric and positive definite: of a composite, or about a point
+            that is not the centre.
         mass: per length [kg/m], shape (), positive.
         inertia: moments of inertia per length about the axes 1, 2, 3 [kg m], shape (3,), positive.
         damping: η [s], shape (): forces and moments are K (ε + η ε̇), damping proportional to stiffness.
 
-    Raises `ValueError` for wrong shapes, and numbers that are not positive or, of the damping, negative.
+    Raises `ValueError` for wrong shapes, numbers that are not positive or, of the damping, negative, and a K that is
+    not symmetric to 1e-6 of √(KᵢᵢKⱼⱼ).
     """
 
     stiffness: Float[Array, "6"] | Float[Array, "6 6"]
@@ -55,6 +57,11 @@ class BeamSection(eqx.Module):
         require(
             lambda K: np.all(np.linalg.eigvalsh(np.diag(K) if K.ndim == 1 else K) > 0),
             f"BeamSection: `stiffness` {self.stiffness} must be positive; what does not bend is a RigidBody.",
+            self.stiffness,
+        )
+        require(
+            lambda K: K.ndim == 1 or np.all(np.abs(K - K.T) <= 1e-6 * np.sqrt(np.outer(np.diag(K), np.diag(K)))),
+            f"BeamSection: `stiffness` {self.stiffness} must be symmetric: it is the second derivative of an energy.",
             self.stiffness,
         )
 

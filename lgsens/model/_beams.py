@@ -89,7 +89,8 @@ class Beam(eqx.Module):
             beam, m > 2 nodes. Its tangent at a node is that of the circle through the node and its neighbours.
         elements: of a straight beam, static; a curved one has m − 1.
         up: a direction, inertial frame, shape (3,), in whose plane with the tangent axis 3 of the sections lies: of a
-            rectangle that of its height.
+            rectangle that of its height. Of a twisted beam one at each node, shape (n, 3), also where `elements` says
+            how many nodes there are; sections turn uniformly in between, by less than π.
 
     Each node carries half the mass of the elements beside it, and their sections' rotary inertia; all masses of the
     scene are constant. Errors are O(1/elements²); for large rotations too, a beam bent to a circle by end moments is
@@ -106,7 +107,7 @@ class Beam(eqx.Module):
         if not isinstance(section, BeamSection):
             raise ValueError(f"Beam: `section` must be a BeamSection, got {section!r}.")
         with jax.ensure_compile_time_eval():  # of numbers that are known, inside of `jit` too
-            points, up = _known(as_float(points, None, "Beam: `points`"), as_float(up, (3,), "Beam: `up`"))
+            points, up = _known(as_float(points, None, "Beam: `points`"), as_float(up, None, "Beam: `up`"))
         if points.ndim != 2 or points.shape[1] != 3 or points.shape[0] < 2:
             raise ValueError(f"Beam: `points` must have shape (m, 3) with m of at least 2, got {points.shape}.")
         if points.shape[0] > 2 and elements is not None:
@@ -121,6 +122,8 @@ class Beam(eqx.Module):
             f"Beam: `points` {points} has two after each other that coincide.",
             chords,
         )
+        if up.shape not in ((3,), points.shape):
+            raise ValueError(f"Beam: `up` must have shape (3,), or of each node {points.shape}, got {up.shape}.")
         axes = _triads(_tangents(chords), up)
         require(
             lambda axes: np.all(np.isfinite(axes)) and np.all(np.abs(np.linalg.det(axes) - 1.0) < 1e-6),
@@ -188,7 +191,7 @@ def _tangents(chords: Float[Array, "n 3"]) -> Float[Array, "m 3"]:
 
 def _triads(tangents: Float[Array, "m 3"], up: Float[Array, "3"]) -> Float[Array, "m 3 3"]:
     xp: Any = np if isinstance(tangents, np.ndarray) and isinstance(up, np.ndarray) else jnp
-    across = xp.cross(up[None], tangents)
+    across = xp.cross(xp.broadcast_to(up, tangents.shape), tangents)
     with np.errstate(invalid="ignore"):  # `up` along the beam
         across = across / _norm(across)
     return xp.stack([tangents, across, xp.cross(tangents, across)], axis=2)
