@@ -18,7 +18,7 @@ from typing import Any
 from benchmark import SINGLE_THREAD, circumstances, environment, grid, interleaved, options, write
 
 TOP, CAR, REFERENCE, REPEATED = (200, 400, 800), (250, 500, 1000), (2000, 4000), 1000
-TITLES = {"R3xSO3": "R³ × SO(3)", "SE3": "SE(3)", "": "R³ × SO(3), sparse"}
+TITLES = {"R3xSO3": "R³ × SO(3)", "SE3": "SE(3)", "": "R³ × SO(3), solver chosen"}
 
 
 def formulated(model, formulation: str):
