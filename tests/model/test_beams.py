@@ -314,7 +314,10 @@ def test_sections():
         (lambda: lg.Beam("b", UNIT, [[0, 0, 0]]), r"`points` must have shape \(m, 3\)"),
         (lambda: lg.Beam("b", UNIT, [[0, 0, 0], [0, 0, 0]]), "coincide"),
         (lambda: lg.Beam("b", UNIT, [[0, 0, 0], [0, 0, 1]]), "`up` .* lies along the beam"),
-        (lambda: lg.BeamSection(np.eye(6) + 0.1 * np.eye(6, k=1), 1.0, [1.0] * 3), "`stiffness` .* must be symmetric"),
+        (
+            lambda: lg.BeamSection(np.eye(6) + 0.1 * np.eye(6, k=1), 1.0, [1.0] * 3),
+            "must be symmetric: it is the second derivative",
+        ),
         (
             lambda: lg.Beam("b", UNIT, np.eye(3), up=np.eye(2, 3)),
             r"`up` must have shape \(3,\), or of each node \(3, 3\)",
