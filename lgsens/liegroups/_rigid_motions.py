@@ -6,16 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import block_diag
 
-from ._base import AbstractLieGroup
 from ._groups import Pose
 from ._poses import Poses
+from ._products import AbstractDirectProduct
 from ._screw import SE3
 
 _ONE = SE3()
 _SEVEN = np.arange(7)  # rows of the matrix of a pose in `Poses`, four of one in SE(3)
 
 
-class RigidMotions(AbstractLieGroup):
+class RigidMotions(AbstractDirectProduct):
     """The poses of N bodies: `SE3` of each that has all six coordinates, and of the others what `Poses` has of them.
 
     An element is a `Pose` with a leading axis N on each array; coordinates, shape (k,), are those that the bodies have,
@@ -58,12 +58,29 @@ class RigidMotions(AbstractLieGroup):
         return argument[self.index]
 
     def _each(self, method, *args):
-        """What `Poses` says of all bodies, and in it what SE(3) says of the whole ones."""
-        every = getattr(self._poses, method)(*args)
-        own = jax.vmap(getattr(_ONE, method))(*map(self._own, args))
+        """What `Poses` says of all bodies, and in it what SE(3) says of the whole ones; both, of matrices."""
+        both = [each if type(each) is tuple else (self._own(each), each) for each in args]
+        own = jax.vmap(getattr(_ONE, method))(*(first for first, _ in both))
+        every = getattr(self._poses, method)(*(second for _, second in both))
         if isinstance(every, Pose):
             return Pose(*(leaf.at[self.whole].set(part) for leaf, part in zip(every, own)))
-        return every.at[self.index].set(own)
+        return (own, every) if every.ndim == 2 else every.at[self.index].set(own)
+
+    def _split(self, x):
+        return x
+
+    def _join(self, pieces):
+        return pieces
+
+    def _diagonal(self, blocks):
+        """The matrices of the whole bodies, then those of the others."""
+        own, every = blocks
+        return block_diag(*own, every[self._others])
+
+    def _blocks(self, X):
+        count, size = 4 * len(self.whole), len(_SEVEN) * len(self.free)
+        own = [X[i : i + 4, i : i + 4] for i in range(0, count, 4)]
+        return jnp.stack(own), jnp.zeros((size, size), X.dtype).at[self._others].set(X[count:, count:])
 
     @property
     def dim(self):
@@ -71,56 +88,3 @@ class RigidMotions(AbstractLieGroup):
 
     def identity(self, dtype=None):
         return self._poses.identity(dtype)
-
-    def compose(self, p, q):
-        return self._each("compose", p, q)
-
-    def inverse(self, q):
-        return self._each("inverse", q)
-
-    def exp(self, x):
-        return self._each("exp", x)
-
-    def log(self, q):
-        return self._each("log", q)
-
-    def wedge(self, x):
-        return self._diagonal(jax.vmap(_ONE.wedge)(x[self.index]), self._poses.wedge(x))
-
-    def vee(self, X):
-        count = len(self.whole)
-        blocks = [X[4 * i : 4 * i + 4, 4 * i : 4 * i + 4] for i in range(count)]
-        size = len(_SEVEN) * len(self.free)
-        rest = jnp.zeros((size, size), X.dtype).at[self._others].set(X[4 * count :, 4 * count :])
-        return self._poses.vee(rest).at[self.index].set(jax.vmap(_ONE.vee)(jnp.stack(blocks)))
-
-    def matrix(self, q):
-        return self._diagonal(jax.vmap(_ONE.matrix)(self._own(q)), self._poses.matrix(q))
-
-    def _diagonal(self, own, every):
-        """The matrices of the whole bodies, then those of the others."""
-        return block_diag(*own, every[self._others])
-
-    def ad_mv(self, x, y):
-        return self._each("ad_mv", x, y)
-
-    def Ad_inv_mv(self, q, w):
-        return self._each("Ad_inv_mv", q, w)
-
-    def Ad_inv_rmv(self, q, w):
-        return self._each("Ad_inv_rmv", q, w)
-
-    def tangent_mv(self, x, y):
-        return self._each("tangent_mv", x, y)
-
-    def tangent_rmv(self, x, y):
-        return self._each("tangent_rmv", x, y)
-
-    def tangent_inv_mv(self, x, y):
-        return self._each("tangent_inv_mv", x, y)
-
-    def to_ambient(self, q, w):
-        return self._each("to_ambient", q, w)
-
-    def from_ambient(self, q, dq):
-        return self._each("from_ambient", q, dq)
