@@ -44,6 +44,7 @@ def test_it_says_how_many_digits_and_what_to_do(oscillator):
     assert strict._replace(tolerance=0.5).good
 
 
+@pytest.mark.slow  # programs of two runs; `certify` is in the quick run
 def test_differentiate_has_a_certificate_of_each_criterion(oscillator):
     found = lg.differentiate(BOTH, build, P, t1=T1, num_steps=100, certificate=True)
     for name, certificate in found.certificate.items():

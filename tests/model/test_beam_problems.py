@@ -22,6 +22,7 @@ def tip(model, beam, load, sizes):
     return np.asarray(lg.statics(model, loads={load: sizes}).body(beam.nodes[-1]).position[-1] - beam.points[-1])
 
 
+@pytest.mark.slow  # a program of statics; a beam bent to a circle is in the quick run
 def test_a_slender_beam_does_not_lock():
     """P L³/3EI (1 − 1/4n²), the mean of the moment in each element being that at its middle, and P L/GA; L/h = 1e3."""
     section = lg.BeamSection.rectangle(1e-3, 1e-3, young=2e11, poisson=0.3, density=7850.0)
@@ -49,7 +50,8 @@ def of_theory(axis):
     return quad(density, 0.0, length, epsabs=0, epsrel=1e-12)[0]
 
 
-@pytest.mark.parametrize("elements", [8, pytest.param(16, marks=pytest.mark.slow)])
+@pytest.mark.slow  # programs of statics
+@pytest.mark.parametrize("elements", [8, 16])
 def test_twisted_cantilever(elements):
     """Twisted by 90°, unit loads: 0.005424 and 0.001754 in (MacNeal & Harder, Finite Elem. Anal. Des. 1 (1985) 3)."""
     turn = np.pi / 2 * np.arange(elements + 1) / elements
@@ -72,6 +74,19 @@ def test_twisted_cantilever(elements):
 STIFFNESS = np.diag([1368.17e3, 88.56e3, 38.78e3, 16.96e3, 59.12e3, 141.47e3])
 STIFFNESS[3:, 3:] += np.array([[0, 17.61, -0.351], [17.61, 0, -0.37], [-0.351, -0.37, 0]]) * 1e3
 COMPOSITE = lg.BeamSection(STIFFNESS, 8.538e-2, [1.44332e-2, 0.40972e-2, 1.0336e-2])
+
+
+@pytest.mark.slow  # programs of two statics
+def test_composite_cantilever():
+    """At rest under the same load: twelve digits of BeamDyn and Kynema (static_composite), all three displacements."""
+    ends = {}
+    for elements in (8, 16):
+        model, beam = cantilever(COMPOSITE, 10.0, elements, {"P": [0.0, 0.0, 150.0]})
+        ends[elements] = tip(model, beam, "P", [0.25, 0.5, 0.75, 1.0])
+    published = np.array([-9.02726627566299e-2, -6.47488486259036e-2, 1.22973648292371])
+    coarse, fine = (ends[n] - published for n in (8, 16))
+    np.testing.assert_allclose(coarse / fine, 4.0, rtol=2e-3)  # 1/n² and 1/n⁴
+    np.testing.assert_allclose((4 * fine - coarse) / 3, 0.0, atol=3e-7)  # 1/n⁴ of it
 
 
 @pytest.mark.slow  # 600 steps of 16 elements

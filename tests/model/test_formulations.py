@@ -37,19 +37,19 @@ def controlled():
     return lg.Model(bodies, joints, forces)
 
 
-SCENES = [pytest.param(everything, marks=pytest.mark.slow), lambda: mixed()[0]]  # the other one has whole bodies, too
+SCENES = {"every element": everything, "partly free bodies": lambda: mixed()[0], "small": controlled}
 
 
-@pytest.mark.parametrize("scene", SCENES, ids=["whole bodies", "partly free bodies"])
-def test_tangents_and_jacobians_equal_autodiff(scene):
-    system = on_se3(scene()).equations()
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n != "small")) for n in SCENES])
+def test_tangents_and_jacobians_equal_autodiff(name):
+    system = on_se3(SCENES[name]()).equations()
     rng, k, m = np.random.default_rng(1), system.group.dim, len(system.constraint_names)
     draw = lambda size, scale=1.0: jnp.asarray(rng.normal(scale=scale, size=size))
     q = system.group.retract(system.bodies.pose, draw(k, 0.3))
     point = q, draw(k), draw(k), draw(m), jnp.asarray(0.17)
     found = eqx.filter_jit(lambda system, point: system.tangents(*point))(system, point)
     expected = eqx.filter_jit(lambda system, point: autodiff_tangents(system, *point))(system, point)
-    assert isinstance(system.group, RigidMotions) == (scene is not everything)
+    assert isinstance(system.group, RigidMotions) == (name != "every element")
     # sums of some ten terms of some ten products, as on R³ × SO(3), turned twice
     jax.tree.map(lambda x, y: close(x, y, 1000), found, expected)
     close(autodiff_constraint_jacobian(system, q, point[-1]), system.constraint_jacobian(q, point[-1]), 1000)
@@ -68,6 +68,7 @@ def test_mass_and_gyroscopic_forces_are_those_of_the_kinetic_energy():
     close(system.residual(q, v, vdot, jnp.zeros(0), jnp.asarray(0.0)), expected, 20)
 
 
+@pytest.mark.slow  # two programs; the top about its fixed point is in the quick run
 def test_a_screw_is_exact_in_any_step():
     """A body on a cylindrical joint, which turns and slides at constant rates: q exp(h v) is its motion."""
     rates = {"velocity": (-0.8, 0.0, 0.3), "angular_velocity": (0.0, 0.0, 2.0)}
@@ -155,6 +156,29 @@ def test_states_of_both_say_the_same():
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(mixed_state)):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-10 * max(1.0, np.abs(b).max()))  # two linear solves
     assert isinstance(found, State)
+
+
+@pytest.mark.slow  # programs of two linearizations
+def test_rest_and_small_motions_are_the_same():
+    """Equilibrium, eigenvalues, and the response of an output to an input, of a pendulum on a torsion spring."""
+    body = lg.RigidBody(2.0, (0.1, 0.2, 0.3), position=(0.4, 0.0, 0.1))
+    joint = lg.RevoluteJoint(None, "b", at=(0, 0, 0), axis=(0, 1.0, 0))
+    forces = {
+        "gravity": lg.Gravity((0.0, 0.0, -9.81)),
+        "spring": lg.TorsionSpringDamper(None, "b", axis=(0, 1.0, 0), stiffness=30.0, damping=0.5),
+        "push": lg.AppliedForce("b", force=(0, 0, 1.0)),
+    }
+    model = lg.Model({"b": body}, {"hinge": joint}, forces)
+    found = [
+        lg.linearize(each, inputs=("push",), outputs={"z": lambda s: s.body("b").position[2]})
+        for each in (model, on_se3(model))
+    ]
+    mixed_one, one = found
+    for name in ("position", "orientation"):
+        np.testing.assert_allclose(getattr(one.state.q, name), getattr(mixed_one.state.q, name), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(one.eigenvalues, mixed_one.eigenvalues, rtol=1e-10)  # two bases of one matrix
+    response = [(of.C @ np.linalg.solve(1j * np.eye(2) * 3.0 - of.A, of.B)).ravel() for of in found]
+    np.testing.assert_allclose(response[1], response[0], rtol=1e-10)
 
 
 @pytest.mark.parametrize(
