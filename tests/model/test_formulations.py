@@ -177,7 +177,8 @@ def test_rest_and_small_motions_are_the_same():
     for name in ("position", "orientation"):
         np.testing.assert_allclose(getattr(one.state.q, name), getattr(mixed_one.state.q, name), rtol=0, atol=1e-12)
     np.testing.assert_allclose(one.eigenvalues, mixed_one.eigenvalues, rtol=1e-10)  # two bases of one matrix
-    response = [(of.C @ np.linalg.solve(1j * np.eye(2) * 3.0 - of.A, of.B)).ravel() for of in found]
+    matrices = [tuple(map(np.asarray, (of.A, of.B, of.C))) for of in found]
+    response = [(C @ np.linalg.solve(3.0j * np.eye(2) - A, B)).ravel() for A, B, C in matrices]
     np.testing.assert_allclose(response[1], response[0], rtol=1e-10)
 
 
