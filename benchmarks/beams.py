@@ -22,9 +22,9 @@ import time
 
 import rival_beams
 from benchmark import SINGLE_THREAD, circumstances, environment, interleaved, options, write
+from rival_beams import GRAVITY, INERTIA, LENGTH, MASS, STIFFNESS
 
 STEPS, H = (20, 100), 1e-3
-STIFFNESS = (1e6, 5e5, 5e5, 1e3, 1e3, 1e3)
 STEEL = {"young": 2.1e11, "poisson": 0.3, "density": 7850.0}
 
 
@@ -32,10 +32,10 @@ def height(stiffness, elements: int, steps: int, damping: float):
     """Of the tip [m], after so many steps."""
     import lgsens as lg
 
-    section = lg.BeamSection(stiffness, 1.0, [0.02, 0.01, 0.01], damping=damping)
-    beam = lg.Beam("b", section, [[0, 0, 0], [10.0, 0, 0]], elements=elements)
+    section = lg.BeamSection(stiffness, MASS, INERTIA, damping=damping)
+    beam = lg.Beam("b", section, [[0, 0, 0], [LENGTH, 0, 0]], elements=elements)
     hinge = {"hinge": lg.RevoluteJoint(None, "b.0", at=[0, 0, 0], axis=[0, 0, 1.0])}
-    model = lg.Model(beam.bodies, hinge, beam.forces | {"gravity": lg.Gravity([0, -9.81, 0])})
+    model = lg.Model(beam.bodies, hinge, beam.forces | {"gravity": lg.Gravity([0, -GRAVITY, 0])})
     return lg.simulate(model, t1=steps * H, num_steps=steps).body(beam.nodes[-1]).position[-1, 1]
 
 

@@ -43,10 +43,8 @@ def top() -> list[dict[str, Any]]:
     for formulation in ("R3xSO3", "SE3"):
         for n in TOP:
             run = lg.simulate(formulated(scene(), formulation), t1=heavy_top.T1, num_steps=n)
-            body = run.body("top")
-            found = [body.position, body.orientation, body.velocity, body.angular_velocity, run.multiplier("pivot")]
-            of_steps = (array[:: TOP[-1] // n] for array in exact)
-            errors = heavy_top.errors(heavy_top.Motion(*map(np.asarray, found)), heavy_top.Motion(*of_steps))
+            of_steps = heavy_top.Motion(*(array[:: TOP[-1] // n] for array in exact))
+            errors = heavy_top.errors(heavy_top.motion_of(run), of_steps)
             relative = {
                 "rotation": float(errors["rotation"].max()),
                 "velocity": float(errors["velocity"].max() / largest["velocity"]),

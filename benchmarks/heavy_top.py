@@ -84,7 +84,10 @@ def published_states() -> tuple[np.ndarray, Motion]:
 
 def simulated(num_steps: int, second_order_start: bool) -> Motion:
     scheme = lg.GeneralizedAlpha(RHO_INF, second_order_start=second_order_start)
-    trajectory = lg.simulate(heavy_top(), t1=T1, num_steps=num_steps, integrator=scheme)
+    return motion_of(lg.simulate(heavy_top(), t1=T1, num_steps=num_steps, integrator=scheme))
+
+
+def motion_of(trajectory: lg.Trajectory) -> Motion:
     body = trajectory.body("top")
     motion = (body.position, body.orientation, body.velocity, body.angular_velocity, trajectory.multiplier("pivot"))
     return Motion(*map(np.asarray, motion))

@@ -12,14 +12,13 @@ converge with this element.
 
 import importlib
 import itertools
-import sys
 import time
 from typing import Any
 
 import numpy as np
+from exudyn_solver import FULL, MODIFIED, PER_STEP, converges, fast, solver_settings
 
 TOLERANCES = (1e-8, 1e-7, 1e-6)  # relative and absolute
-MODIFIED, PER_STEP, FULL = "modified Newton", "modified Newton, a matrix per step", "full Newton"
 SPARSE, DENSE = "EigenSparse", "EXUdense"
 LARGEST_DENSE = 32  # elements: dense matrices take several times as long there, and grow with the third power
 NODES = {"NodeRigidBodyEP": [1.0, 0.0, 0.0, 0.0], "NodeRigidBodyRxyz": [0.0, 0.0, 0.0]}
@@ -28,25 +27,17 @@ STIFFNESS, MASS, INERTIA, LENGTH, GRAVITY = (1e6, 5e5, 5e5, 1e3, 1e3, 1e3), 1.0,
 
 def available() -> bool:
     try:
-        _fast()
+        fast()
     except ImportError:
         return False
     return True
-
-
-def _fast() -> Any:
-    """Exudyn without its range checks."""
-    sys.exudynFast = True
-    exudyn = importlib.import_module("exudyn")
-    exudyn.config.printToConsole = False  # what a tolerance out of reach makes it say
-    return exudyn
 
 
 class Beam:
     """The beam on its hinge."""
 
     def __init__(self, elements: int, nodes: str, *, lumped: bool = False):
-        self.exu, items = _fast(), importlib.import_module("exudyn.itemInterface")
+        self.exu, items = fast(), importlib.import_module("exudyn.itemInterface")
         self.container = self.exu.SystemContainer()
         self.mbs = self.container.AddSystem()
         add, length, section = self.mbs, LENGTH / elements, self.exu.BeamSection()
@@ -77,25 +68,10 @@ class Beam:
         add.Assemble()
 
     def settings(self, steps: int, h: float, linear: str, newton: str, tolerance: float) -> Any:
-        exu, settings = self.exu, self.exu.SimulationSettings()
-        integration = settings.timeIntegration
-        integration.endTime, integration.numberOfSteps = steps * h, steps
-        integration.verboseMode, integration.adaptiveStep = 0, False
-        integration.generalizedAlpha.spectralRadius = 0.9
-        integration.newton.relativeTolerance = integration.newton.absoluteTolerance = tolerance
-        integration.newton.useModifiedNewton = newton != FULL
-        integration.newton.modifiedNewtonJacUpdatePerStep = newton == PER_STEP
-        settings.linearSolver.solverType = getattr(exu.LinearSolverType, linear)
-        settings.parallel.numberOfThreads = 1
-        settings.solution.file.write = False
-        settings.show.computationTime = settings.show.statistics = False
-        return settings
+        return solver_settings(self.exu, steps * h, steps, linear, newton, tolerance)
 
     def solve(self, settings: Any) -> bool:
-        try:
-            return self.exu.SolveDynamic(self.mbs, settings, storeSolver=False, autoAssemble=False)
-        except self.exu.SolverError:
-            return False
+        return converges(self.exu, self.mbs, settings)
 
     def height(self) -> float:
         """Of the tip [m], at the end of the run before."""

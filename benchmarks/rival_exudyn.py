@@ -10,17 +10,16 @@ tolerance (1e-8) stand beside them.
 """
 
 import importlib
-import sys
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from exudyn_solver import FULL, MODIFIED, PER_STEP, converges, fast, solver_settings
 from rival_scenes import SCENES, Numbers, Scene
 from rival_timing import Program
 
 TOLERANCES = (1e-10, 1e-9, 1e-8)
-MODIFIED, PER_STEP, FULL = "modified Newton", "modified Newton, a matrix per step", "full Newton"
 
 
 class Options(NamedTuple):
@@ -51,16 +50,8 @@ OPTIONS = (
 FASTEST = OPTIONS[8]  # of them, on the quarter-car
 
 
-def _fast() -> Any:
-    """Exudyn without its range checks."""
-    sys.exudynFast = True
-    exudyn = importlib.import_module("exudyn")
-    exudyn.config.printToConsole = False  # what a tolerance out of reach makes it say
-    return exudyn
-
-
 def version() -> str:
-    return _fast().__version__
+    return fast().__version__
 
 
 CHAIN_OPTIONS = tuple(
@@ -73,7 +64,7 @@ class Mechanism:
     """The quarter-car in Exudyn."""
 
     def __init__(self, scene: Scene, numbers: Numbers, options: Options, observe: bool):
-        self.exu, self.items = _fast(), importlib.import_module("exudyn.itemInterface")
+        self.exu, self.items = fast(), importlib.import_module("exudyn.itemInterface")
         self.container = self.exu.SystemContainer()
         self.mbs = self.container.AddSystem()
         self.numbers, self.scene, self.options = numbers, scene, options
@@ -185,28 +176,14 @@ class Mechanism:
         self.mbs.SetLoadParameter(load, "loadVectorUserFunction", self.bump)
 
     def settings(self, tolerance: float) -> Any:
-        exu, options, settings = self.exu, self.options, self.exu.SimulationSettings()
-        time = settings.timeIntegration
-        time.endTime, time.numberOfSteps = self.scene.t1, self.scene.num_steps
-        time.solverType = getattr(exu.DynamicSolverType, options.solver)
-        time.verboseMode = 0
-        time.adaptiveStep = False
-        time.generalizedAlpha.spectralRadius = 0.9
-        time.newton.relativeTolerance = time.newton.absoluteTolerance = tolerance
-        time.newton.useModifiedNewton = options.newton != FULL
-        time.newton.modifiedNewtonJacUpdatePerStep = options.newton == PER_STEP
-        settings.linearSolverType = getattr(exu.LinearSolverType, options.linear)
-        settings.parallel.numberOfThreads = 1
-        settings.solution.file.write = False
-        settings.solution.sensors.writePeriod = self.scene.t1 / self.scene.num_steps
-        settings.displayComputationTime = settings.displayStatistics = False
+        scene, options = self.scene, self.options
+        settings = solver_settings(self.exu, scene.t1, scene.num_steps, options.linear, options.newton, tolerance)
+        settings.timeIntegration.solverType = getattr(self.exu.DynamicSolverType, options.solver)
+        settings.solution.sensors.writePeriod = scene.t1 / scene.num_steps
         return settings
 
     def solve(self, settings: Any) -> bool:
-        try:
-            return self.exu.SolveDynamic(self.mbs, settings, storeSolver=False, autoAssemble=False)
-        except self.exu.SolverError:
-            return False
+        return converges(self.exu, self.mbs, settings)
 
     def value(self) -> float:
         """Ψ of the solution, of a mechanism that is observed."""
@@ -246,7 +223,7 @@ _PROCESS: dict[str, Scene] = {}  # in a process of `batches.py`: its scene
 def begin(name: str, ready: Any) -> None:
     """What a process does first."""
     _PROCESS["scene"] = SCENES[name]()
-    _fast()
+    fast()
     ready.wait()
 
 
