@@ -4,6 +4,7 @@ Programs are counted, in JAX's own log, and the numbers of those with room for m
 programs made for one number of steps, inside of `jit`.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -76,6 +77,29 @@ def test_the_same_derivative_by_parts(compiled):
     expected = jax.jit(jax.value_and_grad(lambda p: psi(p, *changed)))(P)
     for found, exact in zip(differentiate(*changed), expected):
         np.testing.assert_allclose(found, exact, rtol=RTOL)
+
+
+class Spring(eqx.Module):
+    """A design with numbers of its own, whose method is a scene."""
+
+    rate: jax.Array
+
+    def scene(self, p):
+        spring = lg.SpringDamper(None, "mass", at_a=(0, 0, 0), at_b=(0, 0, 1), stiffness=self.rate, free_length=1.0 + p)
+        return lg.Model({"mass": lg.RigidBody(2.0, (1.0, 1.0, 1.0), position=(0, 0, 1), free="z")}, {}, {"s": spring})
+
+
+def test_a_method_of_a_design_is_a_scene(compiled):
+    """z = 1 + p (1 − cos ωt): by p, and for another rate without another program of the motion."""
+    height = lg.Criterion(terminal=lambda s, p: s.body("mass").position[2])
+    settings = {"t1": 0.5, "num_steps": 100, "method": lg.AdjointVariable()}
+    for rate in (40.0, 80.0):
+        scene, p = Spring(jnp.asarray(rate)).scene, jnp.asarray(0.1)
+        names, found = compiled(lambda s=scene, p=p: lg.differentiate(height, s, p, **settings)[:2])
+        slope = 1.0 - np.cos(0.5 * np.sqrt(rate / 2.0))
+        # second order: (ω h)² ω t / 12 and less
+        np.testing.assert_allclose([float(n) for n in found], [1.0 + 0.1 * slope, slope], rtol=1e-3)
+    assert not {"_scene", "_motion"} & set(names)
 
 
 @pytest.mark.slow  # two programs of second derivatives

@@ -58,8 +58,9 @@ def top() -> Scene:
 
 
 def quarter_car(bushings: Sequence[str] = ()) -> Scene:
-    """The five-link quarter-car with locked wheel over its bump: Ψ₀ with respect to k, c and the chassis hardpoints.
+    """The five-link quarter-car over its bump: Ψ₀ with respect to k, c and the chassis hardpoints.
 
+    The wheel is locked, and the chassis a body that heaves: the motion of one on a slider, in fewer equations.
     With `bushings` of 1e8 N/m in place of the ball joints of those links explicit routes need steps of 0.2 ms.
     """
     import diffrax  # takes its time to import
@@ -68,35 +69,31 @@ def quarter_car(bushings: Sequence[str] = ()) -> Scene:
     parameters = {"stiffness": car.spring.rate, "damping": car.damper.rate, "hardpoints": car.hardpoints}
 
     def build(p, **options):
-        return car.with_values(**p).model(wheel="locked", bushings=bushings, **options)
+        return car.with_values(**p).model(**({"wheel": "locked", "chassis": "heave", "bushings": bushings} | options))
 
     comfort = Criterion(integrand=lambda s, p: s.body("chassis").acceleration[2] ** 2)
     # The bump ends at 0.25 s: a fourth of the steps, so that the kink is between two of them.
     loose, alpha, dopri8 = GeneralizedAlpha(tolerance=1e-5), GeneralizedAlpha(), IndexReducedODE(diffrax.Dopri8())
-    heave, rods = {"chassis": "heave"}, {"chassis": "heave", "links": "rods"}
     extrapolated = (
-        *grid((28, 52), GeneralizedAlpha(tolerance=1e-6), extrapolate=True, model=heave),
-        *grid((40,), GeneralizedAlpha(tolerance=1e-7), extrapolate=3, model=heave),
+        *grid((28, 52), GeneralizedAlpha(tolerance=1e-6), extrapolate=True),
+        *grid((40,), GeneralizedAlpha(tolerance=1e-7), extrapolate=3),
     )
     if bushings:
         settings = (
-            *grid((28, 76, 200), loose, model=heave),
-            *grid((400, 1600, 6400), alpha, model=heave),
+            *grid((28, 76, 200), loose),
+            *grid((400, 1600, 6400), alpha),
             *extrapolated,
-            *grid((200, 800), alpha, extrapolate=True, model=heave),
-            *grid((8000,), IndexReducedODE(), model=heave),
-            *grid((5000,), dopri8, model=heave),
+            *grid((200, 800), alpha, extrapolate=True),
+            *grid((8000,), IndexReducedODE()),
+            *grid((5000,), dopri8),
         )
-    else:
+    else:  # three pairs of scene and scheme, in at most 256 steps: three programs forward and three backward
         settings = (
-            *grid((28, 76), loose),
+            *grid((28, 52, 76), loose),
             *grid((200,), alpha),
-            *grid((52,), loose, model=heave),
-            *grid((28, 76), loose, model=rods),
+            *grid((28, 52, 76), loose, model={"links": "rods"}),
             *extrapolated,
-            *grid((60,), IndexReducedODE()),
-            *grid((40,), dopri8),
-            *grid((20, 40, 80), dopri8, model=heave),
+            *grid((16, 20, 40, 80), dopri8),
         )
     return Scene(f"{'stiff ' if bushings else ''}five-link quarter-car", build, comfort, parameters, 1.0, settings)
 

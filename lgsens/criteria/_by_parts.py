@@ -55,7 +55,8 @@ def reverse_by_parts(
     calls, and sees the programs.
     """
     t0, t1 = task.t0, task.t1
-    (system, state0), of_p = call(_scene, task.build, task.start, p)
+    numbers, functions = eqx.partition((task.build, task.start), eqx.is_array)  # a method of a pytree has numbers
+    (system, state0), of_p = call(_scene, functions, numbers, p)
     given = for_any_number(task.num_steps, task.integrator, method, None, (system, state0, t0, t1 - t0))
     exact = given[0] if isinstance(given[0], int) else None
     steps = None if exact else given[0]
@@ -67,8 +68,10 @@ def reverse_by_parts(
     return parts, dataclasses.replace(found, system=system)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _scene(build, start, p):
+@partial(jax.jit, static_argnums=0)
+def _scene(functions, numbers, p):
+    build, start = eqx.combine(functions, numbers)
+
     def of(p):
         return as_system(build(p)), None if start is None else start(p)
 

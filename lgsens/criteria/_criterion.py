@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PyTree
 
 from lgsens._validate import as_float, require
 from lgsens.dynamics import AbstractSystem, State
+from lgsens.sensitivity import Functional
 from lgsens.simulation import Instant, Trajectory
 
 Pointwise = Callable[[Instant, Any], Float[Array, ""]]
@@ -145,3 +146,15 @@ def soft_maximum(values: Float[Array, " n"], sharpness: float | Float[Array, ""]
         raise ValueError("`soft_maximum`: `values` is empty; there is no largest value.")
     require(lambda rho: rho > 0, f"`soft_maximum`: `sharpness` must be positive, got {sharpness}.", sharpness)
     return jax.nn.logsumexp(sharpness * values) / sharpness
+
+
+def stacked(criteria: tuple[Criterion, ...], unravel: Callable[[Any], Any]) -> Functional:
+    """All criteria as one function of the flat vector of parameters."""
+
+    def of(which):
+        def function(p, system, state, t):
+            return jnp.stack([getattr(c, which)(system, state, t, unravel(p)) for c in criteria])
+
+        return function
+
+    return Functional(rate=of("rate"), final=of("final"))

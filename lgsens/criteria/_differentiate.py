@@ -17,7 +17,7 @@ from lgsens._xla import tracing
 from lgsens.criteria._advice import direct_or_adjoint
 from lgsens.criteria._by_parts import Parts, reverse_by_parts, unique
 from lgsens.criteria._certify import certify, check_certifiable
-from lgsens.criteria._criterion import Criterion
+from lgsens.criteria._criterion import Criterion, stacked
 from lgsens.criteria._criterion_use import Use, checked_for
 from lgsens.criteria._reference_methods import STENCIL, FiniteDifferences, IndexReduced
 from lgsens.criteria._to_accuracy import differentiate_to
@@ -29,7 +29,6 @@ from lgsens.sensitivity import (
     AdjointVariable,
     ContinuousAdjoint,
     DirectDifferentiation,
-    Functional,
     Parameters,
     configuration_cotangent,
     direct_on_the_fly,
@@ -93,7 +92,8 @@ def differentiate(
     Arguments:
         criteria: a `Criterion`, or a pytree of them (a dict, say): all are differentiated at once, with one
             factorization per step.
-        build: p ↦ the scene, a `Model` or an `AbstractSystem`; `lambda model: model` for every number of a model.
+        build: p ↦ the scene, a `Model` or an `AbstractSystem`; `lambda model: model` for every number of a model. It may
+            be a method of a pytree (an `eqx.Module`), whose numbers are data of the programs.
         p: the design parameters, a pytree of floats.
         t0, t1, num_steps, integrator: as in `simulate`.
         method: `DirectDifferentiation()`: on the fly, no trajectory is stored (unless criteria are integrated over
@@ -190,30 +190,27 @@ def _index_reduced(task: "_Task", p, method: IndexReduced):
         raise ValueError("IndexReduced starts from the consistent initial state of the model; leave `state0` out.")
     flat, unravel = ravel_pytree(p)
     shapes = tuple(leaf.shape for leaf in jax.tree.leaves(p))
-    rate, final, system = _functions(task.criteria, task.build, jax.tree.structure(p), shapes)
+    scene = (task.criteria, task.build, jax.tree.structure(p), shapes)
+    rate, final, system = (_functions if _hashable(scene) else _functions.__wrapped__)(*scene)
     settings = {"rtol": method.rtol, "atol": method.atol, "breaks": method.breaks}
     found = integrate_index_reduced(rate, final, system, flat, task.t0, task.t1, **settings)
     return tuple(found.value), tuple(unravel(row) for row in found.gradient)
+
+
+def _hashable(scene) -> bool:
+    """False of a method of a pytree, which has numbers: that scene compiles anew."""
+    try:
+        hash(scene)
+    except TypeError:
+        return False
+    return True
 
 
 @functools.lru_cache(maxsize=64)
 def _functions(criteria, build, structure, shapes):
     """F, G and the system as functions of the flat vector; the same ones for the same scene, so compiled once."""
     _, unravel = ravel_pytree(jax.tree.unflatten(structure, [np.zeros(shape) for shape in shapes]))
-    stacked = _stacked(criteria, unravel)
-    return *stacked, lambda p: as_system(build(unravel(p)))
-
-
-def _stacked(criteria, unravel) -> Functional:
-    """All criteria as one function of the flat vector of parameters."""
-
-    def of(which):
-        def function(p, system, state, t):
-            return jnp.stack([getattr(c, which)(system, state, t, unravel(p)) for c in criteria])
-
-        return function
-
-    return Functional(rate=of("rate"), final=of("final"))
+    return *stacked(criteria, unravel), lambda p: as_system(build(unravel(p)))
 
 
 class _Task(NamedTuple):
@@ -283,7 +280,7 @@ def _on_the_fly(task: _Task, p) -> _Found:
         state0 = begun.start.at(system, laid.grid.first_size)
         return (state0, Parameters(system, laid.grid)), (begun, laid._replace(found=None, stats=None))
 
-    found = direct_on_the_fly(scheme, start, _stacked(task.criteria, task.unravel), p)
+    found = direct_on_the_fly(scheme, start, stacked(task.criteria, task.unravel), p)
     begun, laid = found.begun
     t = laid.grid.times()
     ended = outcome(scheme, begun, found.stats, jnp.diff(t) * found.rates, t, laid)
@@ -323,7 +320,7 @@ def _continuous_adjoint(task: _Task, p, method: ContinuousAdjoint, uses: list[Us
         task.integrator.scheme,
         trajectory.states,
         Parameters(system, grid),
-        _stacked(task.criteria, task.unravel),
+        stacked(task.criteria, task.unravel),
         p,
         uses=(any(any(use.integrand) for use in uses), any(any(use.terminal) for use in uses)),
     )

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -10,6 +11,7 @@ from lgsens.accuracy import Setting
 from lgsens.cli._main import main
 from lgsens.cli._tradeoff import SCENES
 from lgsens.examples import PROBLEMS
+from lgsens.integrate import Steps
 
 PNG = b"\x89PNG\r\n\x1a\n"
 ROOT = Path(__file__).parents[2]
@@ -91,6 +93,25 @@ def test_scenes(name):
     scene = SCENES[name]()
     assert len(scene.settings) >= 12 and len(set(scene.settings)) == len(scene.settings)
     assert all(isinstance(setting, Setting) for setting in scene.settings)
+
+
+def test_a_ladder_of_three_programs():
+    """Scene and kind of scheme, with room for 256 steps of every run, the reference's three runs too, are a program."""
+    settings = SCENES["quarter-car"]().settings
+    kinds = {(one.model, type(one.integrator), getattr(one.integrator, "solver", None)) for one in settings}
+    assert len(kinds) == 3
+    most = max(one.num_steps * 2 ** (one.runs - 1) for one in settings)
+    reference = 4 * 4 * min(one.num_steps for one in settings)  # generalized-α, the finest of three (`converge`)
+    assert Steps.of(max(most, reference), float).room == Steps.of(1, float).room
+
+
+@pytest.mark.slow  # two minutes
+def test_compilations_of_the_command(tmp_path, compiled):
+    """Of fourteen settings and of the reference: three programs forward, three backward."""
+    jax.clear_caches()
+    names, status = compiled(main, ["tradeoff", "quarter-car", "--quiet", "--out", str(tmp_path / "found")])
+    assert status == 0
+    assert names.count("_motion") == 3 and names.count("_pulled_to_scene") == 3
 
 
 def committed(name: str):
