@@ -149,6 +149,7 @@ TABLES: dict[str, tuple[str, tuple[str, ...], Callable[..., str]]] = {
     "work against precision": ("results/work_precision", ("work_precision",), of("precision_tables", "markdown")),
     "schemes": ("results/work_precision", ("schemes",), of("precision_tables", "markdown")),
     "compile time": ("results/compile_time", ("compile_time",), of("compile_time", "markdown")),
+    "compile profile": ("results/compile_time", ("compile_profile",), of("compile_profile", "markdown")),
     "loops": ("results/loops", ("loops",), of("loops", "markdown")),
     "chains": ("results/chains", ("chain",), of("chain", "table")),
     "beams": ("flexible", ("beams",), of("beams", "table")),

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from lgsens.criteria._criterion_use import Use
+from lgsens.criteria._packed import Packed
 from lgsens.dynamics import RESULTS, AbstractSystem, State, is_redundant, softness
 from lgsens.integrate import AbstractIntegrator, Steps
 from lgsens.sensitivity import AbstractSensitivity
@@ -75,7 +76,8 @@ def _scene(functions, numbers, p):
     def of(p):
         return as_system(build(p)), None if start is None else start(p)
 
-    return jax.vjp(of, p)
+    scene, pull_back = jax.vjp(of, p)
+    return scene, Packed.of(pull_back)
 
 
 @partial(jax.jit, static_argnums=7)
@@ -86,7 +88,7 @@ def _motion(system, state0, t0, t1, steps: Steps | None, integrator, method, exa
         return (found.states, found.stages, found.error), (dataclasses.replace(found, system=None), details)
 
     _, pull_back, found = jax.vjp(of, system, state0, has_aux=True)
-    return found, pull_back
+    return found, Packed.of(pull_back)
 
 
 class _Rows(NamedTuple):
@@ -120,14 +122,14 @@ def _each(pull_back: Callable, rows: Any) -> Any:
 
 
 @jax.jit
-def _pulled_to_scene(pull_back, rows: _Rows):
-    of_system, of_state0 = _each(pull_back, rows.motion)
+def _pulled_to_scene(pull_back: Packed, rows: _Rows):
+    of_system, of_state0 = _each(pull_back.unpacked, rows.motion)
     return jax.tree.map(jnp.add, of_system, rows.system), of_state0
 
 
 @jax.jit
-def _pulled_to_p(pull_back, of_scene, rows: _Rows):
-    (of_p,) = _each(pull_back, of_scene)
+def _pulled_to_p(pull_back: Packed, of_scene, rows: _Rows):
+    (of_p,) = _each(pull_back.unpacked, of_scene)
     total = jax.tree.map(jnp.add, of_p, rows.p)
     return tuple(jax.tree.map(lambda leaf, i=i: leaf[i], total) for i in range(jax.tree.leaves(total)[0].shape[0]))
 

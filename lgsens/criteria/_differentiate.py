@@ -92,8 +92,8 @@ def differentiate(
     Arguments:
         criteria: a `Criterion`, or a pytree of them (a dict, say): all are differentiated at once, with one
             factorization per step.
-        build: p ↦ the scene, a `Model` or an `AbstractSystem`; `lambda model: model` for every number of a model. It may
-            be a method of a pytree (an `eqx.Module`), whose numbers are data of the programs.
+        build: p ↦ the scene, a `Model` or an `AbstractSystem`; `lambda model: model` for every number of a model. It
+            may be a method of a pytree (an `eqx.Module`), whose numbers are data of the programs.
         p: the design parameters, a pytree of floats.
         t0, t1, num_steps, integrator: as in `simulate`.
         method: `DirectDifferentiation()`: on the fly, no trajectory is stored (unless criteria are integrated over
