@@ -12,8 +12,10 @@ import pytest
 from helpers import says
 
 import lgsens as lg
+from lgsens.criteria._packed import Packed
 from lgsens.examples import spinning_top
 from lgsens.integrate import Steps
+from lgsens.linear import tuned
 
 P = jnp.array([0.7, 1.0])  # angle, length
 HIGH = lg.Criterion(integrand=lambda s, p: s.body("top").position[2] ** 2 * p[1])
@@ -100,6 +102,22 @@ def test_a_method_of_a_design_is_a_scene(compiled):
         # second order: (ω h)² ω t / 12 and less
         np.testing.assert_allclose([float(n) for n in found], [1.0 + 0.1 * slope, slope], rtol=1e-3)
     assert not {"_scene", "_motion"} & set(names)
+
+
+def test_what_is_packed_is_unpacked():
+    """Small and large arrays of three dtypes, a scalar and an empty one, through a program."""
+    tree = {
+        "small": [jnp.arange(6.0).reshape(2, 3), jnp.asarray(7.0), jnp.zeros((0, 2)), jnp.arange(3, dtype=jnp.int32)],
+        "large": jnp.arange(2.0 * tuned.PASSED_ALONE).reshape(2, -1),
+        "flag": jnp.array([True, False]),
+    }
+    packed = jax.jit(Packed.of)(tree)
+    assert len(jax.tree.leaves(packed)) == 4  # one for each dtype, and the large one
+    found = jax.jit(lambda packed: packed.unpacked)(packed)
+    assert jax.tree.structure(found) == jax.tree.structure(tree)
+    for one, exact in zip(jax.tree.leaves(found), jax.tree.leaves(tree)):
+        assert one.dtype == exact.dtype
+        np.testing.assert_array_equal(one, exact)
 
 
 @pytest.mark.slow  # two programs of second derivatives

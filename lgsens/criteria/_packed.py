@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-_LARGE = 4096  # entries from which on an array is passed as it is: to copy it would cost more than to pass it
+from lgsens.linear import tuned
 
 
 class Packed(eqx.Module):
@@ -23,7 +23,7 @@ class Packed(eqx.Module):
     @classmethod
     def of(cls, tree: Any) -> "Packed":
         leaves, structure = jax.tree.flatten(tree)
-        small = [leaf.size < _LARGE for leaf in leaves]
+        small = [leaf.size < tuned.PASSED_ALONE for leaf in leaves]
         dtypes = tuple(leaf.dtype.name for leaf in leaves)
         parts: dict[str, list[jax.Array]] = {}
         for leaf, name, one in zip(leaves, dtypes, small):
