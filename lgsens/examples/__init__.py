@@ -14,6 +14,7 @@ from lgsens.examples._mechanisms import (
     slider_crank as slider_crank,
     spatial_chain as spatial_chain,
 )
+from lgsens.examples._misaligned_four_bar import misaligned_four_bar as misaligned_four_bar
 from lgsens.examples._problems import (
     PROBLEMS as PROBLEMS,
     Evaluation as Evaluation,
