@@ -11,15 +11,18 @@ believed if the one before says the same, and above 1.5 · 2^p the error is take
 claimed, and more steps are taken.
 
 Where runs are clearly of second order, three of them also give two that are extrapolated (`_richardson`), χ_n = ψ_n +
-(ψ_n − ψ_{n/2})/3. The error of the finer one is taken to be their distance, which smooth motions have 15 times (or 7
-times) better: at an edge between two times what extrapolation leaves changes its size from run to run. What no run
-sees, an event shorter than all steps, is in no estimate.
+(ψ_n − ψ_{n/2})/3. The error of the finer one is taken to be their distance e_n = |χ_n − χ_{n/2}|, which smooth motions
+have 15 times better: at an edge between two times what extrapolation leaves changes its size from run to run. Where a
+fourth run shows that it does not, r = e_{n/2}/e_n is clearly 2⁴ and the order of the runs was clear before too, the
+error is taken to be 2 e_n/(r − 1), twice what the order says. What no run sees, an event shorter than all steps, is in
+no estimate.
 
 Sources: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I (2008), §II.4 and §II.9; Roache,
 Verification and validation in computational science and engineering (1998), §5 (observed order of convergence).
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -40,6 +43,7 @@ from lgsens.simulation._trajectory import Trajectory
 _FEWEST = 64
 _MOST = 2**17  # what a trajectory of a car keeps of them is 0.2 GB
 _CLEAR = (0.7, 1.5)  # of 2^p
+_SAFETY = 2.0  # of what the order of extrapolated runs says
 _LEAST = 1.4  # below that runs do not converge
 _COARSE = (RESULTS.newton_failed, RESULTS.turn_not_resolved, RESULTS.singular_configuration)  # more steps may help
 
@@ -69,7 +73,7 @@ def to_accuracy(
     while n <= most:
         found = run(n, n > most // 8 and not tried)  # a scene that fails in any number of steps says why
         if int(found.result) == RESULTS.successful:
-            results = [*results[-2:], found]
+            results = [*results[-3:], found]
             tried.append((n, distance(*results[-2:]) if len(results) > 1 else np.inf))
             reached = _reached(results, tried, distance, extrapolated, accuracy, order)
             if reached is not None:
@@ -97,7 +101,7 @@ def _reached(results, tried, distance, extrapolated, accuracy: float, order: int
     ratio = before / last if last > 0.0 else np.inf
     if not ratio > _LEAST:
         return None
-    clear = _CLEAR[0] <= ratio / 2.0**order <= _CLEAR[1]
+    clear = _clear(ratio, order)
     if ratio < _CLEAR[0] * 2.0**order:
         earlier = distances[-3] / before if len(distances) > 2 else 0.0
         if earlier < _LEAST:
@@ -108,9 +112,17 @@ def _reached(results, tried, distance, extrapolated, accuracy: float, order: int
         return results[-1], Reached(accuracy, float(error), n, False, history)
     if extrapolated is None or not clear:
         return None
-    coarse, fine = (extrapolated(*pair) for pair in (results[:2], results[1:]))
+    *_, coarse, fine = pairs = [extrapolated(*pair) for pair in itertools.pairwise(results)]
     error = distance(coarse, fine)
+    if len(pairs) > 2 and _clear(distances[-3] / before, order) and error > 0.0:
+        ratio = distance(pairs[0], coarse) / error
+        error = _SAFETY * error / (min(ratio, 2.0**4) - 1.0) if _clear(ratio, 4) else error
     return (fine, Reached(accuracy, float(error), n, True, history)) if error <= accuracy else None
+
+
+def _clear(ratio: float, order: int) -> bool:
+    """Whether distances that fall by this ratio are those of the order."""
+    return _CLEAR[0] <= ratio / 2.0**order <= _CLEAR[1]
 
 
 def simulate_to(simulate: Callable[..., Any], accuracy, model, num_steps: int | None, settings: dict) -> Trajectory:

@@ -32,11 +32,20 @@ def sequence(error):
         lambda n: 30.0 / n**2,
         lambda n: 30.0 / n**2 + 4e3 / n**3,
         lambda n: -30.0 / n**2 + 1e5 / n**4,
+        lambda n: 30.0 / n**2 + 6.0 * (0.37 * n % 1.0) / n**2,
         lambda n: 2.0 / n + 30.0 / n**2,
         lambda n: (1.0 if n < 100 else 0.0) + 30.0 / n**2,
         lambda n: 0.3 * np.sin(n) if n < 1000 else 30.0 / n**2,
     ],
-    ids=["h²", "h² and h³", "h² and h⁴", "h", "another branch at first", "coarse runs are accidents"],
+    ids=[
+        "h²",
+        "h² and h³",
+        "h² and h⁴",
+        "an edge between times",
+        "h",
+        "another branch at first",
+        "coarse runs are accidents",
+    ],
 )
 def test_never_worse_than_asked(error, accuracy):
     try:
@@ -48,6 +57,14 @@ def test_never_worse_than_asked(error, accuracy):
     assert abs(found.value - 1.0) <= accuracy
     assert reached.error <= accuracy
     assert reached.error > 0.4 * abs(found.value - 1.0) - 1e-15  # of two runs in three the ratio is not yet 4
+
+
+def test_no_more_steps_than_the_order_of_extrapolated_runs_says():
+    error = lambda n: -30.0 / n**2 + 2e3 / n**4
+    found, reached = to_accuracy(*sequence(error), 3e-8, 2)
+    left = abs(found.value - 1.0)
+    assert reached.extrapolated and left <= 3e-8 < 16.0 * left  # half as many steps would not do
+    np.testing.assert_allclose(reached.error, 2.0 * left, rtol=0.02)  # twice what it is; of h⁶ there is nothing
 
 
 def test_coarse_runs_that_fail_are_no_answer():
