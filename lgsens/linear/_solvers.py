@@ -54,19 +54,27 @@ class BlockSparse(AbstractLinearSolver):
     mixed: bool = eqx.field(static=True, default=False, kw_only=True)
 
 
-def elimination(solver: AbstractLinearSolver | None, graph: Graph) -> Elimination | None:
-    """The plan of `BlockSparse` for a graph, or None for a dense LU; `solver` None: the cheaper one."""
+def elimination(solver: AbstractLinearSolver | None, graph: Graph, by_joints: Graph) -> Elimination | None:
+    """The plan of `BlockSparse`, or None for a dense LU; `solver` None: the cheaper one.
+
+    graph: of the matrices of steps. by_joints: of those that are factorized once in a run, which have no forces.
+    """
     size = sum(map(len, graph.nodes))
     if isinstance(solver, DenseLU) or (solver is None and size < tuned.SMALLEST_SPARSE):
         return None
-    found = [levels(graph, early=early) for early in (False, True)]
-    dense = Elimination([], size)
-    sparse = [Elimination(some[: 1 + count], size) for some in found for count in range(len(some))]
-    best = min(sparse, key=_cost, default=dense)
+    dense, best = Elimination([], size), _cheapest(graph)
     if solver is None and _cost(dense) <= _cost(best):
         return None
-    steps, once = _with_loop(best, tuned.LOOP_COST), _with_loop(best, math.inf)
-    return best if once is best else Elimination(steps.levels, size, steps.looped, once)
+    steps, once = _with_loop(best, tuned.LOOP_COST), _with_loop(_cheapest(by_joints), math.inf)
+    return Elimination(steps.levels, size, steps.looped, once)
+
+
+def _cheapest(graph: Graph) -> Elimination:
+    """As many levels as take the least time, joints early or not; none where no node may go."""
+    size = sum(map(len, graph.nodes))
+    found = [levels(graph, early=early) for early in (False, True)]
+    sparse = [Elimination(some[: 1 + count], size) for some in found for count in range(len(some))]
+    return min(sparse, key=_cost, default=Elimination([], size))
 
 
 def _with_loop(plan: Elimination, limit: float) -> Elimination:

@@ -104,8 +104,8 @@ class Topology:
         return found
 
     @cached_property
-    def _graph(self) -> Graph:
-        """Bodies, and after them joints, for the elimination."""
+    def _graphs(self) -> tuple[Graph, Graph]:
+        """Bodies, and after them joints, for the elimination: of all elements, and of joints alone, as in [M, Bᵀ; B, 0]."""
         k = int((self.index >= 0).sum())
         count = len(self.index)
         names = sorted({owner for ends in self._constraints for owner in ends.owners})
@@ -122,6 +122,7 @@ class Topology:
                     known.bodies | set(bodies), known.grounded or len(bodies) == 1, known.relative and ends.relative
                 )
                 _join(near, {node, *bodies})
+        by_joints = [set(some) for some in near]
         for ends in self._loads:
             for bodies in ends.slots.tolist():
                 _join(near, set(bodies))
@@ -129,12 +130,12 @@ class Topology:
             if len(joint.bodies) + joint.grounded > 2:
                 joints[node] = joint._replace(relative=False)
         whole = frozenset(body for body, own in enumerate(self.index) if (own >= 0).all())
-        return Graph(nodes, near, joints, whole)
+        return Graph(nodes, near, joints, whole), Graph(nodes, by_joints, joints, whole)
 
     def elimination(self, solver: AbstractLinearSolver | None) -> Elimination | None:
         """The plan of the linear solver, made once; None: a dense one. `solver` None: the cheaper one."""
         if solver not in self._plans:  # rows of velocity level are not those of B T in S, as plans take them to be
-            self._plans[solver] = None if self.num_velocity_rows else elimination(solver, self._graph)
+            self._plans[solver] = None if self.num_velocity_rows else elimination(solver, *self._graphs)
         return self._plans[solver]
 
 

@@ -132,7 +132,7 @@ def test_levels_grow_with_the_logarithm():
 def test_levels_in_a_loop(first, kind):
     """The same solutions, of S and its transpose, whether levels are split and filled up for a loop or not."""
     system, rng = systems("branched")[1], np.random.default_rng(4)
-    some, size = levels(system.topology._graph, early=True)[:-1], system.elimination.size
+    some, size = levels(system.topology._graphs[0], early=True)[:-1], system.elimination.size
     assert len({(own.shape, boundary.shape) for own, boundary in some[first:]}) > 1
     equal = of_one_shape(some[first:], 2, size)
     assert len(equal) == len(some) - first + (first == 0)  # three clusters are two and two, one of them filled up
@@ -162,6 +162,19 @@ def test_a_long_chain_compiles_as_a_short_one():
         assert plan.once.looped == len(plan.once.levels)
 
 
+@pytest.mark.parametrize("elements", [32, 256])
+def test_forces_are_not_in_what_is_factorized_once(elements):
+    """Nodes of a beam are coupled by its stiffness alone: at the start they go in one level, whatever their number."""
+    section = lg.BeamSection([1e6, 5e5, 5e5, 1e3, 1e3, 1e3], 1.0, [0.02, 0.01, 0.01])
+    beam = lg.Beam("b", section, [[0, 0, 0], [10.0, 0, 0]], elements=elements)
+    hinge = {"hinge": lg.RevoluteJoint(None, "b.0", at=[0, 0, 0], axis=[0, 0, 1.0])}
+    plan = lg.Model(beam.bodies, hinge, beam.forces).system().elimination
+    assert len(plan.levels) > 1
+    ((own, boundary),) = plan.once.levels
+    assert (own.shape, boundary.size) == ((elements, 6), 0)
+    assert len(plan.once.rest) == 6 + 5  # the node on the hinge, and its multipliers
+
+
 def test_everything_is_eliminated_once():
     plan = systems("branched")[1].elimination
     gone = np.concatenate([level.own.ravel() for level in plan.levels] + [plan.rest])
@@ -176,7 +189,7 @@ def test_joints_go_with_bodies_that_hold_them(name, early):
     rows_of_all = np.asarray(system.constraint_jacobian(system.reference()[0], 0.0))
     k = rows_of_all.shape[1]
     gone, incomplete = np.zeros(0, int), False
-    for own, _ in levels(system.topology._graph, early=early):
+    for own, _ in levels(system.topology._graphs[0], early=early):
         gone = np.append(gone, own[own < sum(rows_of_all.shape)])
         rows, columns = rows_of_all[gone[gone >= k] - k], gone[gone < k]
         assert np.linalg.matrix_rank(rows[:, columns]) == len(rows)
