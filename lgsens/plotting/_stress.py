@@ -13,6 +13,9 @@ LABEL = "stress in beams (von Mises) [MPa]"
 SCALE = ("#0d0887", "#41049d", "#6a00a8", "#8f0da4", "#b12a90", "#cc4778", "#e16462", "#f2844b", "#fca636")
 
 
+_LEAST = 1e-6  # what no load has: strains are zero to round-off, 1e-14 or so, and E times it is 1e-9 [MPa]
+
+
 class Stress(NamedTuple):
     """The largest stress in each strut of a scene, over the frames.
 
@@ -31,15 +34,16 @@ class Stress(NamedTuple):
 
 
 def beam_stress(scene: Shapes, system: MultibodySystem, q, v, lam, t, by: ColourBeams) -> Stress | None:
-    """What beams are coloured by along a motion, whose arrays have a leading axis; None where no beam has a stress that
-    is not 0, and of `by` None. Raises `ValueError` for another `by`."""
+    """What beams are coloured by along a motion, whose arrays have a leading axis; None where no beam has a stress but
+    round-off, and of `by` None. Raises `ValueError` for another `by`."""
     if by not in ("stress", None):
         raise ValueError(f'`colour_beams` must be "stress" or None, got {by!r}.')
-    found = {} if by is None else stresses(system, q, v, lam, t)
+    beams = [strut.owner for strut in scene.struts if strut.role == "beam" and by]
+    found = stresses(system, beams, q, v, lam, t)
     unknown = np.full(np.shape(t), np.nan)
     values = [1e-6 * np.asarray(found[strut.owner]) if strut.owner in found else unknown for strut in scene.struts]
     top = max((float(of.max()) for of in values if not np.isnan(of).any()), default=0.0)
-    return Stress(np.stack(values, axis=1), top) if top > 0.0 else None
+    return Stress(np.stack(values, axis=1), top) if top > _LEAST else None
 
 
 def colour_bar(fig: Any, axes: Any, top: float) -> None:
@@ -47,7 +51,15 @@ def colour_bar(fig: Any, axes: Any, top: float) -> None:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    fig.colorbar(ScalarMappable(Normalize(0.0, top), _map()), ax=axes, label=LABEL, shrink=0.6, aspect=30, pad=0.1)
+    fig.colorbar(
+        ScalarMappable(Normalize(0.0, top), _map()),
+        ax=axes,
+        label=LABEL,
+        shrink=0.6,
+        aspect=30,
+        fraction=0.06,
+        pad=0.08,
+    )
 
 
 def in_page(stress: Stress) -> tuple[dict[str, Any], list[dict[str, Any]]]:
