@@ -51,10 +51,10 @@ def mechanism(
     points, held, labels = [], [], {}
     for name, model in models.items():
         last = name == list(models)[-1]
-        system, *state = _last(model)
-        position, orientation = (np.asarray(array[0]) for array in state[0])
+        system, q, v, lam, t = _last(model)
+        position, orientation = (np.asarray(array[0]) for array in q)
         scene = shapes(system)
-        stress = beam_stress(scene, system, *state, colour_beams if last else None)
+        stress = beam_stress(scene, system, q, v, lam, t, colour_beams if last else None)
         colours = stress.colours(0) if stress else [None] * len(scene.struts)
         points.append(draw(axes, scene, position, orientation, last, colours))
         held.append(corners(scene, position, orientation))
