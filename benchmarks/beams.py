@@ -1,16 +1,17 @@
 """Beams: what elements cost, how fast they converge, and which links of a suspension have to bend.
 
-    python benchmarks/beams.py [--elements 8 32 128] [--repeats 5] [--exudyn] [--out benchmarks/results]
+    python benchmarks/beams.py [--elements 8 32 128] [--repeats 5] [--exudyn] [--picture] [--out benchmarks/results]
 
 Cost: a beam on a hinge falls, h = 1 ms; the gradient is that of the height of its tip by the stiffnesses of its
 section, in reverse mode. Time per step as in chain.py, the difference of two runs. Convergence: the Princeton beam,
 loaded at 45° by 8.896 N, its tip against that of 16 and 32 elements extrapolated. Links: the five-link quarter-car with
 its strut, which carries spring and damper, and its trailing arm as steel tubes of 30 × 3 mm in four elements each; what
 bending changes of its comfort and the gradient, predicted by one program of the rich scene and run. Writes beams.json
-and prints tables.
+and prints tables, and draws beams.png: an anti-roll bar before and under a load, in the colours of its stress.
 
-With `--exudyn` this alone: the simulation beside the fastest program of Exudyn's geometrically exact beam
-(`rival_beams.py`), timed in the same rounds on the same beam without damping. It joins what beams.json has already.
+With `--picture` that picture alone. With `--exudyn` this alone: the simulation beside the fastest program of Exudyn's
+geometrically exact beam (`rival_beams.py`), timed in the same rounds on the same beam without damping. It joins what
+beams.json has already.
 """
 
 import itertools
@@ -127,6 +128,29 @@ def links() -> list[dict]:
     return rows
 
 
+def picture(path) -> None:
+    """An anti-roll bar of 22 mm in two bearings, one end on a drop link, 1500 N on the other."""
+    import numpy as np
+
+    import lgsens as lg
+
+    corners = [[0.3, 0.6, 0.0], [0.0, 0.5, 0.0], [0.0, -0.5, 0.0], [0.3, -0.6, 0.0]]
+    bar = lg.BentBeam("bar", lg.BeamSection.round(0.022, **STEEL), corners, elements=6)
+    end, left, right, other = bar.corners
+    joints = {
+        "left bearing": lg.RevoluteJoint(None, left, at=corners[1], axis=[0, 1.0, 0]),
+        "right bearing": lg.CylindricalJoint(None, right, at=corners[2], axis=[0, 1.0, 0]),
+        "drop link": lg.DistanceJoint(None, other, at_a=[0.3, -0.6, -0.3], at_b=corners[3]),
+    }
+    load = {"load": lg.AppliedForce(end, at=corners[0], force=[0, 0, 1.0])}
+    model = lg.Model(bar.bodies, joints, bar.forces | load)
+    loaded = lg.statics(model, loads={"load": np.linspace(0.0, 1500.0, 7)})
+    largest = {name: 1e-6 * float(loaded.force(name).stress[-1]) for name in bar.forces}
+    worst = max(largest, key=lambda name: largest[name])
+    print(f"\nThe largest stress in the anti-roll bar: {largest[worst]:.0f} MPa, in {worst}.")
+    lg.plotting.save(lg.plotting.mechanism({"before": model, "under load": loaded}), path, dpi=110)
+
+
 def table(document: dict) -> str:
     lines = [circumstances(document["environment"]), ""]
     lines += ["| elements | simulate [µs/step] | with gradient [µs/step] | compile: simulate, gradient [s] |"]
@@ -176,12 +200,16 @@ def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--elements", nargs="+", type=int, default=[8, 32, 128])
     parser.add_argument("--exudyn", action="store_true", help="beside Exudyn, nothing else; skipped without it")
+    parser.add_argument("--picture", action="store_true", help="draws beams.png, nothing else")
     arguments = parser.parse_args()
     path = arguments.out / "beams.json"
     os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    if arguments.picture:
+        picture(path.with_suffix(".png"))
+        return
     document: dict = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     if arguments.exudyn:
         if not rival_beams.available():
@@ -198,6 +226,7 @@ def main() -> None:
     document |= {"convergence": convergence(), "links": links()}
     write(path, document)
     print(table(json.loads(path.read_text(encoding="utf-8"))))
+    picture(path.with_suffix(".png"))
 
 
 if __name__ == "__main__":

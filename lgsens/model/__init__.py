@@ -75,7 +75,11 @@ from lgsens.model._loads import (
     LoadTangents as LoadTangents,
     SpringDamperLoad as SpringDamperLoad,
 )
-from lgsens.model._measured import element_forces as element_forces, measured as measured
+from lgsens.model._measured import (
+    element_forces as element_forces,
+    measured as measured,
+    stresses as stresses,
+)
 from lgsens.model._model import Model as Model
 from lgsens.model._on_merged_bodies import carried as carried
 from lgsens.model._reductions import (

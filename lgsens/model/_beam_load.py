@@ -33,6 +33,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens.liegroups import SE3, Pose, cross, skew, turn, turn_back
+from lgsens.model._beam_outlines import AbstractOutline
+from lgsens.model._beam_sections import BeamSection
 from lgsens.model._elements import body_fixed
 from lgsens.model._frames import ROTATION, ROTATION_A, ROTATION_B, Frame, embedded
 from lgsens.model._loads import AbstractClosedFormLoad, LoadTangents
@@ -48,6 +50,8 @@ class SectionState(NamedTuple):
         curvature: κ₁ twist, κ₂ and κ₃ bendings [1/m], shape (3,).
         force: N, Q₂, Q₃ [N], shape (3,).
         moment: M₁, M₂, M₃ [N m], shape (3,).
+        stress: the largest equivalent one (von Mises) of the forces and moments [N/m²], shape (), `BeamSection.stress`;
+            None of a section that does not know its outline.
 
     Of a trajectory each has a leading axis over the times.
     """
@@ -56,6 +60,7 @@ class SectionState(NamedTuple):
     curvature: Float[Array, "3"]
     force: Float[Array, "3"]
     moment: Float[Array, "3"]
+    stress: Float[Array, ""] | None = None
 
     def fibre_strain(self, second, third) -> Float[Array, ""]:
         """ε₁ + x₃ κ₂ − x₂ κ₃, the strain along the beam where the section's axes 2 and 3 have x₂, x₃ [m]; E times it is
@@ -87,6 +92,7 @@ class BeamLoad(AbstractClosedFormLoad):
     stiffness: Float[Array, "6 6"]
     damping: Float[Array, ""]
     preload: Float[Array, "6"]  # σ₀
+    outline: AbstractOutline | None
 
     balanced = True
     drawn = "beam"
@@ -114,7 +120,9 @@ class BeamLoad(AbstractClosedFormLoad):
     def measure(self, a, b, va, vb, t) -> SectionState:
         motion = self._motion(a, b, va, vb)
         strain = motion.strain + jnp.linalg.solve(self.stiffness, self.preload)
-        return SectionState(strain[:3], strain[3:], motion.stress[:3], motion.stress[3:])
+        force, moment = motion.stress[:3], motion.stress[3:]
+        stress = None if self.outline is None else self.outline.stress(force, moment)
+        return SectionState(strain[:3], strain[3:], force, moment, stress)
 
     def _on_b(self, motion):
         """φ and μ."""
@@ -162,8 +170,9 @@ class BeamLoad(AbstractClosedFormLoad):
         return LoadTangents(geometric - gradient.T @ position, -gradient.T @ velocity)
 
 
-def element(a: Frame, b: Frame, points, triads, stiffness, damping, preload) -> BeamLoad:
+def element(a: Frame, b: Frame, points, triads, section: BeamSection, preload) -> BeamLoad:
     """The load between sections at these points, with these axes as columns, all of the reference configuration."""
+    stiffness = section.matrix
     load = BeamLoad(
         point_a=a.local_point(points[0]),
         point_b=b.local_point(points[1]),
@@ -172,8 +181,9 @@ def element(a: Frame, b: Frame, points, triads, stiffness, damping, preload) -> 
         reference=jnp.zeros(6, stiffness.dtype),
         length=jnp.ones((), stiffness.dtype),
         stiffness=stiffness,
-        damping=damping,
+        damping=section.damping,
         preload=preload,
+        outline=section.outline,
     )
     reference = load.screw(a, b)
     length = jnp.sqrt(jnp.sum(reference[:3] ** 2))  # of the helix

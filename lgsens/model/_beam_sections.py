@@ -5,8 +5,7 @@ and shears, and κ = [κ₁, κ₂, κ₃], twist and bendings per length [1/m],
 
     [N, Q₂, Q₃, M₁, M₂, M₃] = K [ε, κ],     K = diag(E A, k₂ G A, k₃ G A, G J, E I₂, E I₃),     G = E / 2(1 + ν).
 
-Shear coefficients k: Cowper (1966), J. Appl. Mech. 33, 335, table 1. Torsion constants J: Timoshenko & Goodier (1970),
-Theory of Elasticity, §109.
+What follows from a shape, and the stress in it: `_beam_outlines`.
 """
 
 import equinox as eqx
@@ -16,9 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, require
-
-_ODD = np.arange(1.0, 11.0, 2.0)  # 2/(exp(nπ) + 1) is 5e-14 of the first at n = 9
-_SUM = 1.0045237627951382  # Σ n⁻⁵ of odd n, 31 ζ(5)/32
+from lgsens.model._beam_outlines import AbstractOutline, Rectangle, Ring
 
 
 class BeamSection(eqx.Module):
@@ -31,6 +28,7 @@ class BeamSection(eqx.Module):
         mass: per length [kg/m], shape (), positive.
         inertia: moments of inertia per length about the axes 1, 2, 3 [kg m], shape (3,), positive.
         damping: η [s], shape (): forces and moments are K (ε + η ε̇), damping proportional to stiffness.
+        outline: what bounds it, by which it has a `stress`; `round`, `tube` and `rectangle` bring theirs.
 
     Raises `ValueError` for wrong shapes, numbers that are not positive or, of the damping, negative, and a K that is
     not symmetric to 1e-6 of √(KᵢᵢKⱼⱼ).
@@ -40,8 +38,15 @@ class BeamSection(eqx.Module):
     mass: Float[Array, ""]
     inertia: Float[Array, "3"]
     damping: Float[Array, ""]
+    outline: AbstractOutline | None
 
-    def __init__(self, stiffness, mass, inertia, damping=0.0):
+    def __init__(self, stiffness, mass, inertia, damping=0.0, outline: AbstractOutline | None = None):
+        if outline is not None and not isinstance(outline, AbstractOutline):
+            raise ValueError(
+                "BeamSection: `outline` must be None or that of another section, which `round`, `tube` and `rectangle` "
+                f"have, got {outline!r}."
+            )
+        self.outline = outline
         with jax.ensure_compile_time_eval():  # of numbers that are known, inside of `jit` too
             self.stiffness = as_float(stiffness, None, "BeamSection: `stiffness`")
             self.mass = as_float(mass, (), "BeamSection: `mass`")
@@ -69,6 +74,32 @@ class BeamSection(eqx.Module):
     def matrix(self) -> Float[Array, "6 6"]:
         """K."""
         return jnp.diag(self.stiffness) if self.stiffness.ndim == 1 else self.stiffness
+
+    def stress(self, force, moment) -> Float[Array, "..."]:
+        """The largest equivalent stress (von Mises) in the section, of tension, bending and torsion.
+
+        It is √(σ² + 3τ²) where on the boundary that is largest, with σ = N/A + x₃ M₂/I₂ − x₂ M₃/I₃ and τ of torsion:
+        M c/I of a cantilever, √3 T r/J of a shaft. Shear stresses of Q₂ and Q₃, and what notches and clamps add, are
+        not in it. It is differentiable; where there is no load its derivative is 0.
+
+        Arguments:
+            force: N, Q₂, Q₃ [N], frame of the section, shape (…, 3).
+            moment: M₁, M₂, M₃ [N m], frame of the section, shape (…, 3), as of a `SectionState`.
+
+        Returns [N/m²], shape (…,); of a rectangle to 1e-3. Raises `ValueError` for a section without outline, and for
+        wrong shapes. Sources: Young & Budynas (2002), Roark's Formulas for Stress and Strain, chapters 8 and 10;
+        Timoshenko & Goodier (1970), Theory of Elasticity, §109.
+        """
+        if self.outline is None:
+            raise ValueError(
+                "BeamSection: `outline` is None, so `stress` is not known: stiffnesses do not say how far fibres are "
+                "from the axes. Make the section by `round`, `tube` or `rectangle`, or take `fibre_strain` times E."
+            )
+        force, moment = as_float(force, None, "`force`"), as_float(moment, None, "`moment`")
+        for name, value in (("force", force), ("moment", moment)):
+            if value.ndim == 0 or value.shape[-1] != 3 or value.shape != force.shape:
+                raise ValueError(f"`{name}` must have shape (…, 3), as `force` has, got {value.shape}.")
+        return jnp.vectorize(self.outline.stress, signature="(3),(3)->()")(force, moment)
 
     @staticmethod
     def round(diameter, *, young, poisson, density, damping=0.0) -> "BeamSection":
@@ -100,13 +131,7 @@ class BeamSection(eqx.Module):
             (wall,) = _positive("BeamSection", thickness=thickness)
             inner = outer - 2.0 * wall
             require(lambda inner: inner >= 0, "BeamSection: `thickness` is more than the radius; take `round`.", inner)
-        ratio = (inner / outer) ** 2
-        area = jnp.pi / 4.0 * (outer**2 - inner**2)
-        second = jnp.pi / 64.0 * (outer**4 - inner**4)
-        nu = as_float(poisson, (), "BeamSection: `poisson`")
-        shear = 6.0 * (1.0 + nu) * (1.0 + ratio) ** 2
-        shear = shear / ((7.0 + 6.0 * nu) * (1.0 + ratio) ** 2 + (20.0 + 12.0 * nu) * ratio)
-        return _of_shape(area, second, second, 2.0 * second, (shear, shear), young, nu, density, damping)
+        return _of_outline(Ring(_known(outer, inner)), young, poisson, density, damping)
 
     @staticmethod
     def rectangle(width, height, *, young, poisson, density, damping=0.0) -> "BeamSection":
@@ -119,14 +144,7 @@ class BeamSection(eqx.Module):
         Raises `ValueError` as `round`.
         """
         w, h = _positive("BeamSection", width=width, height=height)
-        nu = as_float(poisson, (), "BeamSection: `poisson`")
-        shear = 10.0 * (1.0 + nu) / (12.0 + 11.0 * nu)
-        # J = a b³/3 (1 − 192/π⁵ (b/a) Σ tanh(nπa/2b)/n⁵), n odd, b ≤ a; tanh = 1 − 2/(exp(nπa/b) + 1).
-        short, long = jnp.minimum(w, h), jnp.maximum(w, h)
-        odd = jnp.asarray(_ODD, w.dtype)
-        series = _SUM - jnp.sum(2.0 / (jnp.exp(odd * jnp.pi * long / short) + 1.0) / odd**5)
-        torsion = long * short**3 / 3.0 * (1.0 - 192.0 / jnp.pi**5 * short / long * series)
-        return _of_shape(w * h, w * h**3 / 12.0, h * w**3 / 12.0, torsion, (shear, shear), young, nu, density, damping)
+        return _of_outline(Rectangle(_known(w, h)), young, poisson, density, damping)
 
 
 def _positive(what: str, **numbers) -> list[Float[Array, ""]]:
@@ -138,13 +156,16 @@ def _positive(what: str, **numbers) -> list[Float[Array, ""]]:
     return found
 
 
-def _of_shape(area, second, third, torsion, shear, young, poisson, density, damping) -> BeamSection:
-    """I₂ and I₃ are `second` and `third`."""
+def _known(*numbers) -> Float[Array, " n"]:
+    with jax.ensure_compile_time_eval():
+        return jnp.stack(numbers)
+
+
+def _of_outline(outline: AbstractOutline, young, poisson, density, damping) -> BeamSection:
     E, rho = _positive("BeamSection", young=young, density=density)
-    require(
-        lambda nu: -1 < nu <= 0.5, f"BeamSection: `poisson` must be above -1 and at most 0.5, got {poisson}.", poisson
-    )
-    G = E / (2.0 * (1.0 + poisson))
-    k2, k3 = shear
-    stiffness = jnp.stack([E * area, k2 * G * area, k3 * G * area, G * torsion, E * second, E * third])
-    return BeamSection(stiffness, rho * area, rho * jnp.stack([second + third, second, third]), damping)
+    nu = as_float(poisson, (), "BeamSection: `poisson`")
+    require(lambda nu: -1 < nu <= 0.5, f"BeamSection: `poisson` must be above -1 and at most 0.5, got {poisson}.", nu)
+    G, area, (second, third) = E / (2.0 * (1.0 + nu)), outline.area, outline.second
+    across = outline.shear(nu) * G * area
+    stiffness = jnp.stack([E * area, across, across, G * outline.torsion, E * second, E * third])
+    return BeamSection(stiffness, rho * area, rho * jnp.stack([second + third, second, third]), damping, outline)

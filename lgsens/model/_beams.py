@@ -68,7 +68,7 @@ class BeamElement(AbstractConnection):
     def load(self, a, b):
         sections = (self.at_a, self.at_b), (self.axes_a, self.axes_b)
         preload = jnp.zeros(6, self.at_a.dtype) if self.preload is None else self.preload
-        return element(a, b, *sections, self.section.matrix, self.section.damping, preload)
+        return element(a, b, *sections, self.section, preload)
 
 
 class Beam(eqx.Module):

@@ -26,8 +26,8 @@ class AbstractElement(eqx.Module):
     """A law between the frames of two bodies a and b, and numbers for it; no names, so that elements can be stacked.
 
     `drawn` is what is drawn from its first point to its last: a "joint" or "link" that holds bodies, a "beam"
-    (bent, its axes at both ends with the first along it), a "spring", a "damper", or a "wheel" on its `road`; None:
-    nothing.
+    (bent, its axes at both ends with the first along it, in the colour of the `stress` that it measures, if any), a
+    "spring", a "damper", or a "wheel" on its `road`; None: nothing.
     """
 
     drawn: ClassVar[Any] = "joint"

@@ -1,5 +1,7 @@
 """What force elements measure along a motion."""
 
+from collections.abc import Collection
+from functools import partial
 from typing import Any
 
 import jax
@@ -61,3 +63,22 @@ def element_forces(
 
     found = jax.vmap(at_time)(q, v, lam, t)
     return [(stack.owners, scaled(forces)) for stack, forces in zip(system.loads, found)]
+
+
+def stresses(system: MultibodySystem, forces: Collection[str], q, v, lam, t) -> dict[str, Float[Array, " n"]]:
+    """What these force elements measure as their `stress` [N/m²], along a leading axis of states and times, by name;
+    without those that have none."""
+    own = tuple(i for i, stack in enumerate(system.loads) if not {*stack.owners}.isdisjoint(forces))
+    found = zip(own, _stresses(system, own, q, v, lam, t)) if own else ()
+    known = [(system.loads[i].owners, values) for i, values in found if values is not None]
+    return {owner: values[:, i] for owners, values in known for i, owner in enumerate(owners) if owner in forces}
+
+
+@partial(jax.jit, static_argnums=1)
+def _stresses(system: MultibodySystem, own: tuple[int, ...], q, v, lam, t) -> list[Float[Array, "n e"] | None]:
+    def at_time(q, v, lam, t):
+        acting = [*system._acting(system._placed(q), system.twists(v), lam, t, system.topology.forces)]
+        measure = lambda e, *args: getattr(e.measure(*args), "stress", None)
+        return [stack.map(measure, ends, inputs) for stack, ends, inputs, _ in (acting[i] for i in own)]
+
+    return jax.vmap(at_time)(q, v, lam, t)

@@ -105,7 +105,7 @@ class Topology:
 
     @cached_property
     def _graphs(self) -> tuple[Graph, Graph]:
-        """Bodies, and after them joints, for the elimination: of all elements, and of joints alone, as in [M, Bᵀ; B, 0]."""
+        """Bodies, and after them joints, for the elimination: of all elements, and of joints alone (of M and B)."""
         k = int((self.index >= 0).sum())
         count = len(self.index)
         names = sorted({owner for ends in self._constraints for owner in ends.owners})

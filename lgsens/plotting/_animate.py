@@ -15,6 +15,7 @@ from lgsens.analysis import Kinematics
 from lgsens.model import scene_of
 from lgsens.plotting._mechanism import draw, frame, view_of
 from lgsens.plotting._shapes import Shapes, corners, placed, shapes
+from lgsens.plotting._stress import ColourBeams, Stress, beam_stress, colour_bar, in_page
 from lgsens.plotting._style import ROAD, ROLES, figure
 from lgsens.simulation import Trajectory
 
@@ -32,6 +33,7 @@ class Film(NamedTuple):
         position: origins of the body frames [m], inertial frame, shape (n, N, 3).
         orientation: body to inertial frame, shape (n, N, 3, 3).
         road: height of the road [m] under each tyre, shape (n, tyres).
+        stress: what beams are coloured by, if anything.
     """
 
     shapes: Shapes
@@ -42,6 +44,7 @@ class Film(NamedTuple):
     position: np.ndarray
     orientation: np.ndarray
     road: np.ndarray
+    stress: Stress | None
 
 
 def animate(
@@ -52,6 +55,7 @@ def animate(
     speed: float = 1.0,
     max_frames: int = 300,
     view: tuple[float, float] | None = None,
+    colour_beams: ColourBeams = "stress",
 ) -> Path:
     """Write a motion as an animation and return its path; what is written follows from the suffix.
 
@@ -67,17 +71,19 @@ def animate(
         max_frames: as many frames are drawn at most, and 30 per second; a Python int. Frames are steps of the motion,
             chosen as evenly as they allow; there is no interpolation.
         view: elevation and azimuth of the eye at first [degree]; None: from the front, or across the plane of motion.
+        colour_beams: "stress": elements of beams have the colour of their `SectionState.stress` [MPa], where it is
+            known, on a scale from 0 to the largest of the motion; None: all have the same.
 
     Bodies, joints, springs, dampers and tyres are drawn as in `mechanism`, the road as a patch under the wheel
     of a `Trajectory`.
 
-    Raises `ValueError` for another suffix, a motion of a system without bodies, a failed motion or a speed that is not
-    positive, `ImportError` without matplotlib (but for `.html`), and `OSError` without ffmpeg.
+    Raises `ValueError` for another suffix or `colour_beams`, a motion of a system without bodies, a failed motion or a
+    speed that is not positive, `ImportError` without matplotlib (but for `.html`), and `OSError` without ffmpeg.
     """
     path = Path(path)
     if not speed > 0:
         raise ValueError(f"`speed` must be positive, got {speed}.")
-    found = film(motion, speed, as_count(max_frames, "max_frames"))
+    found = film(motion, speed, as_count(max_frames, "max_frames"), colour_beams)
     poses = zip(found.position, found.orientation)
     everything = np.concatenate([corners(found.shapes, *pose) for pose in poses])  # of all frames
     view = view_of(everything) if view is None else view
@@ -88,10 +94,13 @@ def animate(
     fig = figure(8.0, 7.0)
     fig.set_layout_engine("none")  # it would move the axes from frame to frame, and takes longer than the drawing
     axes: Any = fig.add_subplot(projection="3d")
+    if found.stress:
+        colour_bar(fig, axes, found.stress.top)
     with writer.saving(fig, path, dpi=100):
         for i, value in enumerate(found.values):
             axes.clear()
-            draw(axes, found.shapes, found.position[i], found.orientation[i])
+            colours = found.stress.colours(i) if found.stress else [None] * len(found.shapes.struts)
+            draw(axes, found.shapes, found.position[i], found.orientation[i], True, colours)
             for tyre, height in zip(found.shapes.tyres, found.road[i]):
                 centre = placed(tyre.centre, found.position[i], found.orientation[i])
                 patch = _patch(centre, height, 0.06 * np.max(np.ptp(everything, axis=0)))
@@ -102,7 +111,7 @@ def animate(
     return path
 
 
-def film(motion: Trajectory | Kinematics, speed: float, max_frames: int) -> Film:
+def film(motion: Trajectory | Kinematics, speed: float, max_frames: int, colour_beams: ColourBeams) -> Film:
     """The frames of a motion."""
     system = getattr(motion, "system", None)
     scene = scene_of(system)
@@ -130,7 +139,11 @@ def film(motion: Trajectory | Kinematics, speed: float, max_frames: int) -> Film
         drawn = drawn._replace(tyres=[])
     t = jnp.asarray(motion.t)[frames]
     road = np.array([jax.vmap(tyre.road)(t) for tyre in drawn.tyres]).reshape(-1, len(frames)).T
-    return Film(drawn, clock[frames], values[frames], label, unit, position, orientation, road)
+    _, states, times = motion.of_bodies()
+    stress = beam_stress(drawn, scene, states.q, states.v, states.lam, times, colour_beams)
+    if stress:  # on the scale of the whole motion
+        stress = stress._replace(values=stress.values[frames])
+    return Film(drawn, clock[frames], values[frames], label, unit, position, orientation, road, stress)
 
 
 def _digits(film: Film) -> int:
@@ -154,6 +167,7 @@ def page(film: Film, title: str, points: np.ndarray, view: tuple[float, float]) 
     digits = max(0, 6 - int(np.floor(np.log10(radius))))
     rounded = lambda array, digits=digits: np.round(np.asarray(array, float), digits).tolist()
     plain = lambda shape: {k: rounded(v) if isinstance(v, np.ndarray) else v for k, v in shape._asdict().items()}
+    scale, stresses = in_page(film.stress) if film.stress else (None, [{}] * len(film.shapes.struts))
     data = {
         "label": film.label,
         "unit": film.unit,
@@ -167,7 +181,8 @@ def page(film: Film, title: str, points: np.ndarray, view: tuple[float, float]) 
         "position": rounded(film.position),
         "orientation": rounded(film.orientation.reshape(*film.orientation.shape[:2], 9), 6),
         "outlines": [plain(outline) for outline in film.shapes.outlines],
-        "struts": [plain(strut) for strut in film.shapes.struts],
+        "struts": [plain(strut) | stress for strut, stress in zip(film.shapes.struts, stresses)],
+        "stress": scale,
         "joints": [plain(mark) for mark in film.shapes.joints],
         "tyres": [plain(tyre.centre) | {"road": rounded(film.road[:, i])} for i, tyre in enumerate(film.shapes.tyres)],
     }

@@ -3,11 +3,15 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from lgsens.model import Model
+from lgsens.model import Model, MultibodySystem
 from lgsens.plotting._shapes import Shapes, corners, placed, shapes, stretched
+from lgsens.plotting._stress import ColourBeams, beam_stress, colour_bar
 from lgsens.plotting._style import COLOURS, ROLES, figure, legend_below
+from lgsens.simulation import AbstractRun
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -18,46 +22,68 @@ TICKS = 6  # along the longest axis
 
 
 def mechanism(
-    models: Mapping[str, Model],
+    models: Mapping[str, Model | AbstractRun],
     title: str = "",
     view: tuple[float, float] | None = None,
     axes_names: Sequence[str] = ("x", "y", "z"),
+    *,
+    colour_beams: ColourBeams = "stress",
 ) -> "Figure":
-    """Mechanisms in their reference configuration, in space; the last in colour, those before it in grey.
+    """Mechanisms in space, in their reference configuration or at the end of a motion; the last in colour, those before
+    it in grey.
 
     A body is drawn from the points at which joints hold it: two make a bar, more a solid; one with a tyre is a wheel;
     with fewer points it is a box of its inertia. The axes are equal. Springs are coils, dampers tubes with a rod,
     massless rods lines, elements of beams bent lines.
 
     Arguments:
-        models: scenes by name, drawn over each other.
+        models: scenes by name, drawn over each other: a `Model`, or what `simulate`, `kinematics` and `statics` return.
         title: over the figure.
         view: elevation and azimuth [degree]; None: from the front, or across the plane in which everything lies.
         axes_names: names of the inertial axes: ("x, forward", "y, left", "z, up") of a car.
+        colour_beams: "stress": elements of beams have the colour of their `SectionState.stress` [MPa], with its scale,
+            where it is known and not 0 everywhere (of a `Model` at rest it is that of preloads); None: all one colour.
 
-    Raises `ImportError` without matplotlib.
+    Raises `ValueError` for another `colour_beams`, `ImportError` without matplotlib.
     """
     fig = figure(8.0, 7.0, title)
     axes: Any = fig.add_subplot(projection="3d")
     points, held, labels = [], [], {}
     for name, model in models.items():
         last = name == list(models)[-1]
-        system = model.system()
-        position, orientation = (np.asarray(array) for array in system.pose)
+        system, q, v, lam, t = _last(model)
+        position, orientation = (np.asarray(array[0]) for array in q)
         scene = shapes(system)
-        points.append(draw(axes, scene, position, orientation, last))
+        stress = beam_stress(scene, system, q, v, lam, t, colour_beams if last else None)
+        colours = stress.colours(0) if stress else [None] * len(scene.struts)
+        points.append(draw(axes, scene, position, orientation, last, colours))
         held.append(corners(scene, position, orientation))
         if len(models) > 1:
             labels[name] = ROLES["link"] if last else COLOURS[0]
         else:
-            seen = {shape.role for shape in (*scene.outlines, *scene.struts)}
+            own = [strut for strut, colour in zip(scene.struts, colours) if colour is None]
+            seen = {shape.role for shape in (*scene.outlines, *own)}
             labels = {role: colour for role, colour in ROLES.items() if role in seen}
+        if stress:
+            colour_bar(fig, axes, stress.top)
     frame(axes, np.concatenate(points), view_of(np.concatenate(held)) if view is None else view, axes_names)
     if labels:
         line = lambda label, colour: axes.plot([], [], [], color=colour, linewidth=3, label=label)[0]
         handles = {label: line(label, colour) for label, colour in labels.items()}
         legend_below(fig, handles, len(handles))
     return fig
+
+
+def _last(model: Model | AbstractRun) -> tuple[MultibodySystem, Any, Any, Any, Any]:
+    """The system of a scene, and q, v, λ and t with an axis of length 1: at rest in the reference configuration, or
+    what a motion ends with."""
+    if isinstance(model, AbstractRun):
+        system, states, t = model.of_bodies()
+        return system, *jax.tree.map(lambda leaf: leaf[-1:], (states.q, states.v, states.lam, t))
+    system = model.system()
+    zeros = lambda count: jnp.zeros(count, system.mass.dtype)
+    rest = system.pose, jnp.zeros_like(system.velocity), zeros(system.topology.num_constraints), zeros(())
+    return system, *jax.tree.map(lambda leaf: leaf[None], rest)
 
 
 def view_of(points: np.ndarray) -> tuple[float, float]:
@@ -93,8 +119,9 @@ def frame(axes: Any, points: np.ndarray, view: tuple[float, float], names: Seque
         axis.labelpad = 10 / max(np.max(np.delete(shares, i)), 0.05) if shown else -8
 
 
-def draw(axes: Any, scene: Shapes, position, orientation, coloured: bool = True) -> np.ndarray:
-    """Draw a scene at the given poses of its bodies; returns the points that the axes must hold, shape (n, 3)."""
+def draw(axes: Any, scene: Shapes, position, orientation, coloured: bool, own: Sequence[Any]) -> np.ndarray:
+    """Draw a scene at the given poses of its bodies, struts in colours of their own unless they are None; returns the
+    points that the axes must hold, shape (n, 3)."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     colours = ROLES if coloured else dict.fromkeys(ROLES, COLOURS[0])
@@ -112,12 +139,12 @@ def draw(axes: Any, scene: Shapes, position, orientation, coloured: bool = True)
                 axes.plot(*np.concatenate([points, points[:1]]).T, color=colour, linewidth=0.4, alpha=0.5)
         else:
             axes.plot(*points.T, color=colour, linewidth=4.5, solid_capstyle="round")
-    for strut in scene.struts:
-        lines = stretched(strut, position, orientation)
+    for strut, shade in zip(scene.struts, own):
+        lines, colour = stretched(strut, position, orientation), shade or colours[strut.role]
         drawn += lines
         widths = {"spring": (1.8,), "damper": (1.8, 6.0), "link": (3.0,), "beam": (3.5,)}[strut.role]
         for line, width in zip(lines, widths):
-            axes.plot(*line.T, color=colours[strut.role], linewidth=width, alpha=0.45 if width > 5 else 1.0)
+            axes.plot(*line.T, color=colour, linewidth=width, alpha=0.45 if width > 5 else 1.0)
     joints = np.array([placed(mark, position, orientation) for mark in scene.joints]).reshape(-1, 3)
     if len(joints):
         axes.scatter(*joints.T, color="white", edgecolors=colours["link"], s=24, depthshade=False, zorder=5)

@@ -31,7 +31,7 @@ class Outline(NamedTuple):
 
 class StrutShape(NamedTuple):
     """What stretches between two bodies: a coil ("spring"), a tube ("damper"), a rod ("link") or what bends ("beam");
-    points [m], and of a beam its directions there, in the frames of the bodies."""
+    points [m], and of a beam its directions there, in the frames of the bodies; the name of the element."""
 
     role: str
     a: int
@@ -39,6 +39,7 @@ class StrutShape(NamedTuple):
     b: int
     at_b: np.ndarray
     radius: float  # of the coil [m]
+    owner: str
     along_a: np.ndarray | None = None
     along_b: np.ndarray | None = None
 
@@ -87,7 +88,7 @@ def shapes(system: MultibodySystem) -> Shapes:
             if role in ("link", "beam", "spring", "damper") and len(marks) > 1:
                 (a, at_a), (b, at_b) = marks[0], marks[-1]
                 line = _world(position, orientation, b, at_b) - _world(position, orientation, a, at_a)
-                struts.append(StrutShape(role, a, at_a, b, at_b, _RADIUS * float(np.linalg.norm(line))))
+                struts.append(StrutShape(role, a, at_a, b, at_b, _RADIUS * float(np.linalg.norm(line)), owner))
                 if role == "beam":
                     along_a, along_b = (np.asarray(element.fixed("axes", end)[0])[:, 0] for end in ends)
                     struts[-1] = struts[-1]._replace(along_a=along_a, along_b=along_b)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import says
+from matplotlib.colors import to_rgb
 from pages import Page, world
 from PIL import Image
 
@@ -110,6 +111,36 @@ def test_elements_of_a_beam_are_bent_as_they_are(swinging, tmp_path):
     assert 0.2 < max(bends) < np.pi / 2
 
 
+def test_elements_of_a_beam_have_their_stress(swinging, tmp_path):
+    """In MPa at each frame, to 1e-4 of a scale that ends with the largest of the whole motion."""
+    data = Page(plotting.animate(swinging, tmp_path / "a.html")).data
+    chosen = np.abs(np.asarray(swinging.t)[:, None] - data["values"]).argmin(axis=0)
+    stresses = {name: 1e-6 * np.asarray(swinging.force(name).stress) for name in ("b.0", "b.1", "b.2")}
+    top = max(of.max() for of in stresses.values())
+    assert data["stress"]["top"] == pytest.approx(top, rel=1e-4)
+    for strut in data["struts"]:
+        np.testing.assert_allclose(strut["stress"], stresses[strut["owner"]][chosen], rtol=0, atol=1e-4 * top)
+    few = Page(plotting.animate(swinging, tmp_path / "b.html", max_frames=1)).data
+    assert few["stress"] == data["stress"] and max(strut["stress"][0] for strut in few["struts"]) == 0.0  # at first
+    plain = Page(plotting.animate(swinging, tmp_path / "c.html", colour_beams=None)).data
+    assert plain["stress"] is None and not any("stress" in strut for strut in plain["struts"])
+
+
+def test_a_gif_has_the_colours_of_stress(swinging, tmp_path):
+    """The end of its scale, beside the beam and at last in it; without stress that colour is nowhere."""
+    counts = {}
+    for by in ("stress", None):
+        path = plotting.animate(swinging, tmp_path / "a.gif", max_frames=2, colour_beams=by)
+        with Image.open(path) as image:
+            assert image.n_frames == 2
+            pictures = [np.asarray((image.seek(i), image.convert("RGB"))[1], int) for i in range(2)]
+        end = np.round(255 * np.array(to_rgb(plotting._stress.SCALE[-1])))
+        # a GIF has 256 colours: within 10 of 255
+        counts[by] = [int((np.abs(picture - end).max(axis=-1) <= 10).sum()) for picture in pictures]
+    assert counts["stress"][1] > counts["stress"][0] + 100 > 100
+    assert counts[None] == [0, 0]
+
+
 def test_a_rig_is_swept_through(rig, tmp_path):
     data = Page(plotting.animate(rig, tmp_path / "a.html")).data
     assert (data["label"], data["unit"], data["digits"]) == ("travel", "m", 2)
@@ -179,6 +210,7 @@ def test_a_video_needs_ffmpeg(linkage, tmp_path, monkeypatch):
         ({"path": "a.avi"}, says("`path` must end in .html, .gif or .mp4", "a.avi")),
         ({"speed": 0.0}, says("`speed` must be positive, got 0.0")),
         ({"max_frames": 0}, says("`max_frames` must be at least 1, got 0")),
+        ({"colour_beams": "heat"}, says("`colour_beams` must be \"stress\" or None, got 'heat'")),
         ({"motion": 3.0}, says("`motion` must be a Trajectory or a Kinematics of a Model, got float")),
     ],
 )

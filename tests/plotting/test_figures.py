@@ -6,9 +6,12 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import matplotlib
 import numpy as np
 import pytest
+from helpers import says
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
 from matplotlib.text import Text
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -147,6 +150,63 @@ def test_before_and_after_are_told_apart(car):
     assert words(legend) == ["before", "after"]
     colours = [line.get_color() for line in legend.get_lines()]
     assert colours == [plotting.COLOURS[0], plotting.ROLES["link"]]
+
+
+def stressed(section, preload=None):
+    """An element of a beam that nothing has bent yet."""
+    axes = {"axes_a": jnp.eye(3), "axes_b": jnp.eye(3)}
+    arm = lg.BeamElement(None, "tip", at_a=[0, 0, 0], at_b=[1.0, 0, 0.2], section=section, preload=preload, **axes)
+    return lg.Model({"tip": lg.RigidBody(1.0, (1.0, 1.0, 1.0), position=[1.0, 0.0, 0.2])}, {}, {"arm": arm})
+
+
+def test_beams_have_the_colour_of_their_stress():
+    """In the reference configuration that of preloads, M c/I; the end of the scale is the largest."""
+    section = lg.BeamSection.round(0.02, young=2e11, poisson=0.3, density=7850.0)
+    modulus = np.pi * 0.02**3 / 32
+    model = stressed(section, [0.0, 0.0, 0.0, 0.0, 50e6 * modulus, 0.0])
+    fig = plotting.mechanism({"arm": model})
+    axes, bar = fig.axes
+    assert bar.get_ylabel() == "stress in beams (von Mises) [MPa]"
+    np.testing.assert_allclose(bar.get_ylim(), (0.0, 50.0), rtol=1e-12)  # M c/I to round-off
+    assert words(fig.legends[0]) == ["body"]  # beams are on the scale
+    beam = max(axes.lines, key=lambda line: line.get_linewidth() if len(line.get_data_3d()[0]) == 9 else 0.0)
+    assert to_hex(beam.get_color()) == plotting._stress.SCALE[-1]
+    overlaid = plotting.mechanism({"after": model, "before": stressed(section)})
+    assert len(overlaid.axes) == 1  # the last one has none, and those before are grey
+
+
+@pytest.mark.parametrize(
+    ("scene", "colour_beams"),
+    [
+        (lambda: stressed(lg.BeamSection.round(0.02, young=2e11, poisson=0.3, density=7850.0)), "stress"),
+        (lambda: stressed(lg.BeamSection([1e7] * 6, 1.0, [1.0] * 3), [1e3] * 6), "stress"),
+        (lambda: stressed(lg.BeamSection.round(0.02, young=2e11, poisson=0.3, density=7850.0), [1e3] * 6), None),
+    ],
+    ids=["without load", "without outline", "not asked for"],
+)
+def test_beams_without_stress_have_one_colour(scene, colour_beams):
+    fig = plotting.mechanism({"arm": scene()}, colour_beams=colour_beams)
+    assert len(fig.axes) == 1 and words(fig.legends[0]) == ["beam", "body"]
+    assert plotting.ROLES["beam"] in {line.get_color() for line in fig.axes[0].lines}
+
+
+def test_a_motion_is_drawn_as_it_ends(swinging):
+    fig = plotting.mechanism({"end": swinging})
+    axes, bar = fig.axes
+    ends = [np.transpose(line.get_data_3d())[-1] for line in axes.lines if len(line.get_data_3d()[0]) == 9]
+    np.testing.assert_allclose(ends, [swinging.body(f"b.{i}").position[-1] for i in (1, 2, 3)], rtol=0, atol=1e-14)
+    largest = 1e-6 * float(swinging.force("b.0").stress[-1])  # at the clamp
+    assert bar.get_ylim()[1] == pytest.approx(largest, rel=1e-12)  # the same numbers by two programs
+    with pytest.raises(ValueError, match=says("`colour_beams` must be \"stress\" or None, got 'heat'")):
+        plotting.mechanism({"end": swinging}, colour_beams="heat")
+
+
+def test_the_scale_of_stress_is_a_map_whose_steps_look_alike():
+    plasma, own = matplotlib.colormaps["plasma"], plotting._stress._map()
+    shares = np.linspace(0.0, 1.0, 33)
+    # straight lines between nine of its colours; and it gets lighter all the way, also where colours are not seen
+    np.testing.assert_allclose(own(shares), plasma(0.8 * shares), rtol=0, atol=0.02)
+    assert np.all(np.diff(own(shares)[:, :3] @ [0.2126, 0.7152, 0.0722]) > 0)
 
 
 def test_a_mechanism_in_a_plane_or_with_one_body_is_drawn():

@@ -1,6 +1,7 @@
 """The script of the page, run by Node where there is one: it draws what NumPy projects, controls do what they say."""
 
 import json
+import re
 import shutil
 import subprocess
 
@@ -111,6 +112,26 @@ if NODE:
             along = [frame @ strut[f"along_{s}"] for frame, s in zip(frames, "ab")]
             expected = projected(plotting._shapes.bent(*map(np.asarray, ends), *along), **camera)
             assert min(np.abs(points - expected).max() for points in found) < 1e-6
+
+    def test_the_script_colours_beams_as_matplotlib_does(swinging, tmp_path):
+        """By their stress at the frame; and its scale stands in the legend in place of beams."""
+        page = plotting.animate(swinging, tmp_path / "a.html")
+        data = Page(page).data
+        last = len(data["clock"]) - 1
+        camera = {"elevation": 0.0, "azimuth": 0.0, "centre": [0.0, 0.0, 0.0], "scale": 1.0, "x": 0.0, "y": 0.0}
+        body = f"""
+        open();
+        [Player.scene(data, {last}, {json.dumps(camera)}).filter((item) => item.role === "beam").map((i) => i.colour),
+         elements.legend.innerHTML]
+        """
+        colours, legend = run_script(page, body, tmp_path)
+        shares = [strut["stress"][last] / data["stress"]["top"] for strut in data["struts"]]
+        expected = 255 * plotting._stress._map()(shares)[:, :3]
+        found = [[int(number) for number in re.findall(r"\d+", colour)] for colour in colours]
+        # matplotlib has 256 colours, 1/512 of the map off, which is 1 of 255; both are rounded
+        np.testing.assert_allclose(sorted(found), sorted(expected.tolist()), rtol=0, atol=2.0)
+        assert "von Mises" in legend and "linear-gradient" in legend and f"{data['stress']['top']:.3g}" in legend
+        assert ">beam<" not in legend and ">body<" in legend
 
     def test_the_slider_moves_the_bodies_and_the_time(linkage, tmp_path):
         page = plotting.animate(linkage, tmp_path / "a.html")
