@@ -1,13 +1,14 @@
 """What several test modules need: random bodies and poses, differences, a scene with everything."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 import lgsens as lg
@@ -17,6 +18,12 @@ from lgsens.model import AbstractForce, AbstractLoad, Attached, Frame
 
 EPS = float(np.finfo(np.float64).eps)
 GRAVITY = (0.0, 0.0, -9.81)
+
+
+def some_quick(values: Iterable[Any], count: int = 1) -> list[Any]:
+    """Parameters of a test, of which the quick run has so many; a tuple is several arguments."""
+    several = [value if isinstance(value, tuple) else (value,) for value in values]
+    return [pytest.param(*own, marks=[pytest.mark.slow] * (i >= count)) for i, own in enumerate(several)]
 
 
 def close(actual, expected, ulps, scale=None):

@@ -263,6 +263,7 @@ def at_the_design(model):
     return system.residual(q, rest, rest, lam, 0.0), system.constraint_jacobian(q, 0.0)
 
 
+@pytest.mark.slow  # preloads of a corner, and the motion of an axle, are in the quick run
 def test_its_forces_are_in_balance():
     """Joints can bear what bushings, springs, tyres and weights leave: by least squares of NumPy; half to each tyre."""
     model = pushed(Axle.load("multi_link"))

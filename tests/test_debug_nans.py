@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import some_quick
 
 import lgsens as lg
 from lgsens.examples import spinning_top
@@ -16,7 +17,7 @@ RUNS = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n == "radau")) for n in RUNS])
+@pytest.mark.parametrize("name", some_quick(RUNS))
 def test_no_nan_on_the_way(name):
     def last_height(mass):
         run = lg.simulate(spinning_top(jnp.asarray(0.7), mass=mass), t1=0.02, num_steps=4, **RUNS[name])

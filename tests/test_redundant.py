@@ -110,6 +110,7 @@ def multipliers(trajectory):
     return lam
 
 
+@pytest.mark.slow  # the gradients of the same door are in the quick run
 def test_a_door_on_two_hinges_moves_like_one_on_one_and_loads_both():
     two, one = (lg.simulate(door(DOOR, hinges), t1=0.5, num_steps=100, integrator=EXACT) for hinges in (2, 1))
     # joints give way by 1e-7 of what the scheme is off in a step

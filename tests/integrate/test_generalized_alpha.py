@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import equations
+from helpers import equations, some_quick
 
 import lgsens as lg
 from lgsens.dynamics import State
@@ -38,7 +38,7 @@ def heavy_reference():
     return lg.simulate(heavy_top(), t1=0.1, num_steps=6400)
 
 
-@pytest.mark.parametrize(("second_order_start", "order_of_first_multipliers"), [(True, 2.0), (False, 1.0)])
+@pytest.mark.parametrize(("second_order_start", "order_of_first_multipliers"), some_quick([(True, 2.0), (False, 1.0)]))
 def test_orders_on_the_heavy_top(heavy_reference, second_order_start, order_of_first_multipliers):
     """q, v second order; λ second order from the first step with the special start, first order without."""
     integrator = lg.GeneralizedAlpha(0.9, second_order_start=second_order_start)
@@ -128,7 +128,7 @@ def test_a_failed_step_ends_the_run():
     assert bool(jnp.all(jnp.isfinite(states.v[0]))) and bool(jnp.all(jnp.isnan(states.v[1:])))
 
 
-@pytest.mark.parametrize("factor_every", [1, 7, 1000])
+@pytest.mark.parametrize("factor_every", some_quick([7, 1, 1000]))
 @pytest.mark.parametrize("scene", [lambda: spinning_top(0.7), heavy_top, lambda: spatial_chain(2)])
 def test_modified_newton_is_full_newton(scene, factor_every):
     """The age of the matrix changes the iterations, not the motion; the heavy top turns 0.15 rad in a step."""

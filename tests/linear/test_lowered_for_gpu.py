@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
+from helpers import some_quick
 
 import lgsens as lg
 from lgsens.examples import QuarterCar
@@ -63,7 +64,7 @@ SWEEP = [[]]  # blocks of steps: steps
 
 @pytest.mark.parametrize(
     "integrator, step",
-    [(lg.GeneralizedAlpha(), NEWTON), (lg.GeneralizedAlpha(iterations=4), FIXED)],
+    some_quick([(lg.GeneralizedAlpha(), NEWTON), (lg.GeneralizedAlpha(iterations=4), FIXED)]),
     ids=["until converged", "fixed iterations"],
 )
 def test_loops_over_steps_are_those_of_newton_and_of_the_sweep(integrator, step):

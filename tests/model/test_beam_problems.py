@@ -211,6 +211,7 @@ def agrees(found, numbers, tolerances):
         np.testing.assert_allclose(values, numbers[name][: len(values)], rtol=0, atol=tolerance, err_msg=name)
 
 
+@pytest.mark.slow  # 100 steps; a link of a four-bar that bends is in the quick run
 def test_four_bar_with_a_hinge_out_of_line():
     """Bauchau et al. (2016) at its start: the same equations and steps in Exudyn, both to its Newton's 1e-8."""
     agrees(linkage(0.5), FOUR_BAR["lumped"], {"C": 1e-8, "force": 1e-3, "moment": 1e-5})  # 1e-8 of EA, 1e-8 of EI

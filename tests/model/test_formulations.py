@@ -125,6 +125,7 @@ def test_partly_free_bodies_with_states_and_friction():
         assert np.abs(found - expected)[10:].max() < 1e-3 * size
 
 
+@pytest.mark.slow  # the equations and their tangents, and a motion, are in the quick run
 def test_derivatives():
     """DDM and AVM of a top by its numbers and its start, to round-off; differences."""
     exact = lg.GeneralizedAlpha(tolerance=1e-13)  # differences see what Newton leaves

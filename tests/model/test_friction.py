@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import close, says
+from helpers import close, says, some_quick
 
 import lgsens as lg
 from lgsens.dynamics import multiplier_jacobian
@@ -108,7 +108,7 @@ def test_accelerations_of_what_rubs():
         np.testing.assert_allclose(found[name], rates, rtol=1e-10, atol=1e-10)  # condition of 1e5 round-offs
 
 
-@pytest.mark.parametrize("solver", [lg.DenseLU(), lg.BlockSparse()])
+@pytest.mark.parametrize("solver", some_quick([lg.DenseLU(), lg.BlockSparse()]))
 def test_forces_by_multipliers(solver):
     """∂r/∂λ is that of the residual by differences, which Jᵀ is not; nothing else makes it of another kind."""
     system = rubbing(solver).system()

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import BODIES, PointMasses, close, everything, random_body, random_rotation, says
+from helpers import BODIES, PointMasses, close, everything, random_body, random_rotation, says, some_quick
 
 import lgsens as lg
 from lgsens.liegroups import Power, R3xSO3
@@ -170,7 +170,7 @@ REDUCED = {
 }
 
 
-@pytest.mark.parametrize("case", REDUCED)
+@pytest.mark.parametrize("case", some_quick(REDUCED, 3))
 def test_reduced_bodies(case):
     """The freedoms of the one that has fewer; velocities, accelerations and forces are those of the separate bodies."""
     first, second, free, pivot = REDUCED[case]

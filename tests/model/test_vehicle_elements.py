@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import close, random_body, says
+from helpers import close, random_body, says, some_quick
 from scipy.spatial.transform import Rotation
 
 import lgsens as lg
@@ -24,7 +24,7 @@ JOINTS = {
 }
 
 
-@pytest.mark.parametrize("name", JOINTS)
+@pytest.mark.parametrize("name", some_quick(JOINTS))
 def test_joints_are_what_they_say(name):
     check_joint(JOINTS[name]).raise_if_failed()
 
@@ -77,7 +77,7 @@ FORCES = {
 }
 
 
-@pytest.mark.parametrize("name", FORCES)
+@pytest.mark.parametrize("name", some_quick(FORCES, 2))
 def test_forces_are_what_they_say(name):
     force, options = FORCES[name]
     check_force(force, **options).raise_if_failed()

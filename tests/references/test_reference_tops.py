@@ -198,6 +198,7 @@ def test_published_position_of_the_heavy_top(heavy_runs):
     np.testing.assert_allclose(published - exact, first_order * 2e-6, rtol=0, atol=allowed)
 
 
+@pytest.mark.slow  # its published position is in the quick run
 def test_published_orientation_of_the_heavy_top():
     """EXUDYN's index-2 solution with Euler parameters at 0.2 s, known to 5.3e-5 and to the file."""
     published = HEAVY["published"][1]

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import equations, says
+from helpers import equations, says, some_quick
 
 import lgsens as lg
 from lgsens.examples import spinning_top
@@ -47,7 +47,7 @@ def by_jax():
 
 @pytest.mark.parametrize(
     "method",
-    [lg.DirectDifferentiation(), lg.AdjointVariable(), pytest.param(lg.ContinuousAdjoint(), marks=pytest.mark.slow)],
+    some_quick([lg.AdjointVariable(), lg.DirectDifferentiation(), lg.ContinuousAdjoint()]),
     ids=lambda m: type(m).__name__,
 )
 def test_structures_and_explicit_parameters(method, by_jax):
@@ -109,7 +109,7 @@ def test_direct_differentiation_stores_no_trajectory():
 
 @pytest.mark.parametrize(
     "method",
-    [lg.DirectDifferentiation(), lg.AdjointVariable(), lg.ContinuousAdjoint(None)],
+    some_quick([lg.DirectDifferentiation(), lg.AdjointVariable(), lg.ContinuousAdjoint(None)]),
     ids=lambda m: type(m).__name__,
 )
 def test_one_factorization_for_all_parameters_and_criteria(method, monkeypatch):

@@ -248,7 +248,8 @@ def programs(scheme, n):
     }
 
 
-@pytest.mark.parametrize("scheme", [ALPHA, pytest.param(lg.RadauIIA(), marks=pytest.mark.slow)])
+@pytest.mark.slow  # programs of two lengths
+@pytest.mark.parametrize("scheme", [ALPHA, lg.RadauIIA()])
 def test_depth(scheme):
     """Eight times as many steps: eight times the depth of the sweeps, and three levels more of the scan.
 

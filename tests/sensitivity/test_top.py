@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from differences import central, every_leaf
+from helpers import some_quick
 
 import lgsens as lg
 from lgsens.examples import spinning_top
@@ -27,7 +28,7 @@ def psi(alpha0, num_steps, length=1.0, **settings):
     return criterion(spinning_top(alpha0, length=length), num_steps, **settings)
 
 
-@pytest.mark.parametrize("step", [0.02, 0.005, 0.001])
+@pytest.mark.parametrize("step", some_quick([0.02, 0.005, 0.001]))
 def test_values_of_the_scheme(step):
     """Ψ and dΨ/dα₀ of the discrete scheme, by an independent implementation with a₀ = v̇₀; l = 0.5 and 1 m."""
     integrator = lg.GeneralizedAlpha(DISCRETE["rho"], second_order_start=False)
