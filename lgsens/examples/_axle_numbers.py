@@ -50,6 +50,8 @@ def places(axle: Axle) -> dict[str, list[Place]]:
 def _key(names: list[str], carriers: Mapping[str, str]) -> str:
     """That of the file: "links.tie_rod.subframe", "bushings.pivot.stiffness", "subframe.mounts.front.at"."""
     owner = ".".join(names[: 2 if names[0] in ("links", "joints") else 1]) if names[0] != "stops" else names[1]
+    if names[-3:] == ["beam", "of", "stiffness"]:
+        names = [*names[:-3], "beam.section", "stiffness"]
     names = [_TABLES.get(names[0], names[0]), *(name for name in names[1:] if name not in _UNNAMED)]
     if names[-1] == "chassis":
         names[-1] = carriers.get(owner, "chassis")
