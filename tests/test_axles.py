@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import says
+from helpers import says, some_quick
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from suspension_closures import Closure, changed, corner_of
@@ -205,7 +205,7 @@ def test_the_bar_is_twisted_by_roll_and_not_by_heave(trailing):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["five_link_suspension", "mcpherson", "multi_link", "push_rod"])
+@pytest.mark.parametrize("name", ["five_link_suspension", "mcpherson", "multi_link", "push_rod", "twist_beam"])
 @pytest.mark.parametrize("links", ["bodies", "rods"])
 def test_every_axle_moves_as_its_corners(name, links):
     """Rack, subframe and bar in between change nothing where both wheels travel alike."""
@@ -263,10 +263,10 @@ def at_the_design(model):
     return system.residual(q, rest, rest, lam, 0.0), system.constraint_jacobian(q, 0.0)
 
 
-@pytest.mark.slow  # preloads of a corner, and the motion of an axle, are in the quick run
-def test_its_forces_are_in_balance():
+@pytest.mark.parametrize("name", some_quick(["twist_beam", "multi_link"]))
+def test_its_forces_are_in_balance(name):
     """Joints can bear what bushings, springs, tyres and weights leave: by least squares of NumPy; half to each tyre."""
-    model = pushed(Axle.load("multi_link"))
+    model = pushed(Axle.load(name))
     force, jacobian = at_the_design(model)
     left = force + jacobian.T @ np.linalg.lstsq(jacobian.T, -np.asarray(force))[0]
     weights = [9.81 * float(body.mass) for body in model.bodies.values()]
@@ -462,6 +462,52 @@ MISTAKES = {
         ("key 'rack.c_factor'", "2π times `ratio`", "one of them"),
     ),
     "rack without mass": ("mcpherson", {"rack.mass": None}, ("key 'rack.mass'", "is missing")),
+    "twist beam of two arms": (
+        "twist_beam",
+        {"twist_beam.knuckle": None},
+        ("key 'twist_beam.beam'", "fixed to one body of the corner", "['knuckle']", "got []"),
+    ),
+    "arm on a hinge": (
+        "twist_beam",
+        {"joints.pivot.type": "revolute", "joints.pivot.at": [[0.42, 0.5, 0.03], [0.42, 0.6, 0.03]]},
+        ("key 'twist_beam.knuckle'", "on one ball joint of the chassis", "'knuckle' has none", "of type 'spherical'"),
+    ),
+    "twist beam without length": (
+        "twist_beam",
+        {"twist_beam.knuckle": [0.27, 0.0, 0.015]},
+        ("key 'twist_beam.knuckle'", "is in the plane y = 0", "its mirror image", "move it"),
+    ),
+    "twist beam without a section": ("twist_beam", {"twist_beam.beam": None}, ("key 'twist_beam.beam'", "is missing")),
+    "shear centre of three": (
+        "twist_beam",
+        {"twist_beam.shear_centre": [0.0, 0.0, 0.03]},
+        ("key 'twist_beam.shear_centre'", "2 numbers", "[0.0, 0.0, 0.03]"),
+    ),
+    "twist beam up along it": (
+        "twist_beam",
+        {"twist_beam.beam.up": [0.0, 1.0, 0.0]},
+        ("key 'twist_beam.beam'", "`up`", "lies along the beam"),
+    ),
+    "twist beam with a mass": (
+        "twist_beam",
+        {"twist_beam.mass": 9.0},
+        ("key 'twist_beam.mass'", "is no body and no key of this table", "'shear_centre'"),
+    ),
+    "section of five": (
+        "twist_beam",
+        {"twist_beam.beam.section.stiffness": [1.0] * 5},
+        ("key 'twist_beam.beam.section.stiffness'", "6 numbers"),
+    ),
+    "section with a material": (
+        "twist_beam",
+        {"twist_beam.beam.young": 2e11},
+        ("key 'twist_beam.beam.young'", "is no key of this table", "'section'"),
+    ),
+    "section that is free": (
+        "twist_beam",
+        {"twist_beam.beam.section.stiffness": [1.0, 1.0, 1.0, 0.0, 1.0, 1.0]},
+        ("key 'twist_beam.beam'", "must be positive"),
+    ),
     "bar of two rates": (
         "mcpherson",
         {"anti_roll_bar.stiffness": 400.0},

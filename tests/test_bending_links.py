@@ -128,7 +128,7 @@ MISTAKES = {
     ),
     "two sections": (
         strut_as_a_beam(TABLE | {"round": {"diameter": 0.03}}),
-        (OF_STRUT + ".beam'", "needs one section of ['rectangle', 'round', 'tube'], got ['tube', 'round']"),
+        (OF_STRUT + ".beam'", "needs one section of ['rectangle', 'round', 'section', 'tube'], got ['tube', 'round']"),
     ),
     "no section": (strut_as_a_beam(STEEL), (OF_STRUT + ".beam'", "needs one section", "got []")),
     "key of another shape": (

@@ -1,5 +1,6 @@
 """An axle: two corners, and what is between them."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from lgsens.examples._hardpoint_file import read
 from lgsens.examples._quarter_car import GRAVITY, QuarterCar, check_choice
 from lgsens.examples._suspension_file import reader
 from lgsens.examples._suspension_parts import Part, reflected
+from lgsens.examples._twist_beam import TwistBeam
 from lgsens.model import (
     ALL_FREE,
     BumpRoad,
@@ -43,6 +45,7 @@ class Axle(eqx.Module):
         subframe: a body that carries links in place of the chassis, on mounts of the corners; None: there is none.
         rack: it slides and steers; None: the wheels are not steered.
         bar: the anti-roll bar, the same on both sides; None: there is none.
+        twist_beam: the cross member of a twist-beam axle, the same on both sides; None: there is none.
     """
 
     left: QuarterCar
@@ -50,6 +53,7 @@ class Axle(eqx.Module):
     subframe: Part | None = None
     rack: Rack | None = None
     bar: Bar | None = None
+    twist_beam: TwistBeam | None = None
 
     @staticmethod
     def load(path: str | Path | None = None) -> "Axle":
@@ -63,7 +67,7 @@ class Axle(eqx.Module):
         with jax.ensure_compile_time_eval():
             corner = QuarterCar.load(path)
             root, kilogram = reader(*read(path))
-            between = axle_members(root, kilogram, [*corner.links])
+            between = axle_members(root, kilogram, corner.links)
             axle = Axle(with_nodes(corner, between["bar"].ends) if "bar" in between else corner, **between)
             return axle if corner.wheel.centre[1] > 0 else reflected(axle)
 
@@ -87,11 +91,12 @@ class Axle(eqx.Module):
         """Of all bodies [kg]: of two quarters of a car, and what is between them."""
         between = [self.subframe, None if self.rack is None else self.rack.part]
         every = [part.mass for part in (self.left, self.right, *between) if part is not None]
-        return jnp.sum(jnp.stack([*every, *([] if self.bar is None else [self.bar.own_mass])]))
+        every += [part.own_mass for part in (self.bar, self.twist_beam) if part is not None]
+        return jnp.sum(jnp.stack(every))
 
     def two_sided(self) -> "Axle":
         """The same axle with numbers of its own on each side."""
-        return Axle(self.left, self.right, self.subframe, self.rack, self.bar)
+        return dataclasses.replace(self, other=self.right)
 
     def model(
         self, *, chassis: str = "held", links: str = "bodies", compliant: bool = True, tyres: bool = False
@@ -104,12 +109,15 @@ class Axle(eqx.Module):
         `left_spring`, `left_damper`, `left_NAME` of bushings (of a hinge `left_NAME_1` and `_2`), `left_subframe_NAME`,
         `left_bump_stop`, `anti_roll_bar`, `left_tyre`. Of beams there are nodes and elements in their places,
         `left_LINK.0`, `anti_roll_bar.0`, …, the first on the left, and `left_anti_roll_bar_BODY`, what carries the bar.
+        A twist beam has `twist_beam.0`, … and the joints `left_twist_beam_BODY`; or `left_twist_beam`, rigid, and the
+        joint and the force `twist_beam`.
 
         Arguments:
             chassis: "held", or "guided": it heaves, and rolls about its centre of mass.
             links: "bodies", or "rods" as in `QuarterCar.model`; a link with a bushing remains a body.
             compliant: whether there are bushings and beams. False: each is the joint that it replaces, the subframe is
-                fixed to the chassis, no link bends, and a bar has halves and the stiffness of its beam (`Bar`).
+                fixed to the chassis, no link bends, and a bar or a twist beam has halves and the stiffness of its beam
+                in torsion (`Bar`, `TwistBeam`).
             tyres: whether the wheels stand on a road, on `TyreSpring`s at their centres.
 
         The preloads of springs, tyres, bushings and beams are those with which the whole car, guided and on tyres,
@@ -134,7 +142,7 @@ class Axle(eqx.Module):
 
         A motion of both sides alike turns or moves nothing across the plane y = 0: half of the chassis heaves, half of
         the subframe moves in x and z and pitches, half of the rack is fixed to what carries it, the bar does not twist,
-        nor does it bend.
+        nor does it bend; of a twist beam the middle stays in that plane and upright to it.
         Names, preloads and joints are those of `model(chassis="guided", tyres=True)` on the left.
 
         Arguments:
@@ -168,10 +176,14 @@ class Axle(eqx.Module):
         forces: dict[str, Any] = {"gravity": Gravity((0.0, 0.0, -GRAVITY))}
         bodies, ends, sought, given = {}, {}, [], {}
         cars = cars if compliant else {side: car.rigid() for side, car in cars.items()}
-        held = () if self.bar is None else (self.bar.link,)
         for side, car in cars.items():
             if side == "left" or self.other is not None:
                 car._check(f"Suspension {self.name!r}")
+        between = [part for part in (self.bar, self.twist_beam) if part is not None]
+        held = [part.link for part in between]
+        if self.twist_beam is not None and (compliant or len(cars) == 2):
+            cars = {side: self.twist_beam.instead(car) for side, car in cars.items()}
+        for side, car in cars.items():
             mounts = car.mounts if compliant else {}
             scene = corner_scene(car, wheel="locked", links=links, side=side, mounts=mounts, held=held)
             bodies, joints, forces = bodies | scene.bodies, joints | scene.joints, forces | scene.forces
@@ -180,30 +192,11 @@ class Axle(eqx.Module):
             tyre = {"at": car.wheel.centre, "stiffness": car.tyre_stiffness, "road": road}
             forces[f"{side}_tyre"] = TyreSpring(f"{side}_wheel", **tyre)
             sought, given = [*sought, f"{side}_tyre", *scene.sought], given | scene.given
-        if self.bar is not None:
-            bent = compliant and self.bar.beam is not None and len(cars) == 2
-            more, bound, acting = self._bar(self.bar, cars, bent)
-            bodies, joints, forces = bodies | more, joints | bound, forces | acting
-            sought += [*acting] if bent else []
+        for part in between:
+            more = part.scene(cars, compliant)
+            bodies, joints, forces = bodies | more.bodies, joints | more.joints, forces | more.forces
+            sought += more.sought
         return CornerScene(bodies, joints, forces, ends, sought, given)
-
-    def _bar(self, bar: Bar, cars: dict[str, QuarterCar], bent: bool) -> tuple[dict, dict, dict]:
-        """Bodies, joints and forces of the anti-roll bar: of a beam, or of halves."""
-        bars = {side: bar if side == "left" else reflected(bar) for side in cars}
-        held = {side: car.scene_name(bar.link, "drop_link", f"{side}_") for side, car in cars.items()}
-        if not bent:
-            bodies = {f"{side}_anti_roll_bar": of.half().body() for side, of in bars.items()}
-            joints = {name: joint for side, of in bars.items() for name, joint in of.joints(side, held[side]).items()}
-            twisted = {"anti_roll_bar": bar.element(*bodies)} if len(bodies) == 2 else {}
-            return bodies, joints, twisted
-        beam = bar.bent(bars["right"])
-        lever, bearing = dict(zip(cars, beam.corners[::3])), dict(zip(cars, beam.corners[1:3]))
-        joints, forces = {}, dict(beam.forces)
-        for side, of in bars.items():
-            turning, bushings = of.bearings(side, bearing[side])
-            joints |= turning | of.drop_link(side, lever[side], held[side])
-            forces |= bushings
-        return beam.bodies, joints, forces
 
     def _between(self, compliant: bool) -> tuple[dict[str, Part], dict[str, Any]]:
         """The bodies that both sides share, and their joints."""

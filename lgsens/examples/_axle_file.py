@@ -1,5 +1,6 @@
 """The tables of an axle in a suspension file; `lgsens/examples/_suspension_file.py` has the format."""
 
+import dataclasses
 import math
 from collections.abc import Collection, Mapping
 from typing import Any
@@ -13,13 +14,15 @@ from lgsens.examples._axle_parts import ALONG_Y, CURVED, CURVES, RATES, Bar, Mou
 from lgsens.examples._corner_scene import connections
 from lgsens.examples._hardpoint_file import Reader
 from lgsens.examples._link_beam import read_beam
-from lgsens.examples._suspension_parts import Connection, Link, Part, Strut
+from lgsens.examples._suspension_parts import LEVEL, Connection, Link, Part, Strut
+from lgsens.examples._twist_beam import TwistBeam
 
 CARRIERS = ("subframe", "rack")
-OF_AXLE = (*CARRIERS, "anti_roll_bar", "bushings", "bump_stop", "rebound_stop")
+OF_AXLE = (*CARRIERS, "anti_roll_bar", "twist_beam", "bushings", "bump_stop", "rebound_stop")
 OF_MOUNT = (*RATES, *CURVES, "axes", "preload", "rotational_preload")
 OF_PART = ("centre_of_mass", "mass", "inertia")
 SECTION = ("stiffness", "diameter", "length", "bore", "shear_modulus", "damping")
+OF_TWIST_BEAM = ("beam", "shear_centre")
 OF_STOP = ("gap", "stiffness", "rounding", "progression")
 
 
@@ -103,7 +106,7 @@ def _centred(table: Reader, key: str) -> Array:
     return as_float(curve, None, key)
 
 
-def axle_members(root: Reader, kilogram: float, links: Collection[str]) -> dict[str, Any]:
+def axle_members(root: Reader, kilogram: float, links: Mapping[str, Link]) -> dict[str, Any]:
     """The fields of an `Axle` beside its corners."""
     part = lambda table: Part(table.point("centre_of_mass"), table.number("mass", kilogram), table.moments("inertia"))
     found: dict[str, Any] = {}
@@ -125,7 +128,53 @@ def axle_members(root: Reader, kilogram: float, links: Collection[str]) -> dict[
         found["rack"] = Rack(part(table), axis, ratio, travel, _carrier(root, table))
     if "anti_roll_bar" in root:
         found["bar"] = _bar(root, root.table("anti_roll_bar"), kilogram, links)
+    if "twist_beam" in root:
+        found["twist_beam"] = _twist_beam(root.table("twist_beam"), links)
     return found
+
+
+def levelled(root: Reader, links: Collection[str], joints: dict[str, Connection]) -> dict[str, Connection]:
+    """The joints of a corner: that of an arm which a twist beam guides is a hinge along y, as both sides move alike."""
+    if "twist_beam" not in root:
+        return joints
+    table = root.table("twist_beam")
+    (arm,) = _arm(table, links)
+    between = {arm, "chassis"}
+    found = [name for name, joint in joints.items() if joint.kind == "spherical" and {*joint.between} == between]
+    if len(found) != 1:
+        raise table.fail(
+            arm,
+            f"it guides an arm that is on one ball joint of the chassis (a bushing of the axle may replace it), and "
+            f"{arm!r} has {found or 'none'}; give it one in `joints`, of type 'spherical'.",
+        )
+    return joints | {found[0]: dataclasses.replace(joints[found[0]], kind=LEVEL)}
+
+
+def _arm(table: Reader, links: Collection[str]) -> dict[str, Any]:
+    """The body of the corner to which a twist beam is fixed, and where."""
+    bodies = ("knuckle", *links)
+    ends = table.ends(bodies, OF_TWIST_BEAM)
+    if len(ends) != 1 or any(point.ndim != 1 for point in ends.values()):
+        raise table.fail(
+            "beam", f"it is fixed to one body of the corner, a point of one of {sorted(bodies)}, got {sorted(ends)}."
+        )
+    return ends
+
+
+def _twist_beam(table: Reader, links: Mapping[str, Link]) -> TwistBeam:
+    ends = _arm(table, links)
+    ((arm, end),) = ends.items()
+    if arm in links and links[arm].beam is not None:
+        raise table.fail(arm, "is a link that bends, and a twist beam is fixed to a rigid arm; leave out its `beam`.")
+    if not end[1]:
+        raise table.fail(arm, "is in the plane y = 0, and the beam goes from there to its mirror image; move it.")
+    centre = table.numbers("shear_centre", 2) if "shear_centre" in table else None
+    member = TwistBeam(ends, read_beam(table, ()), centre)
+    try:
+        member.bent()
+    except ValueError as error:
+        raise table.fail("beam", str(error)) from error
+    return member
 
 
 def _carrier(root: Reader, table: Reader) -> str:

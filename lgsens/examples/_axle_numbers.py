@@ -37,7 +37,7 @@ def places(axle: Axle) -> dict[str, list[Place]]:
     for i, (path, leaf) in enumerate(jax.tree_util.tree_leaves_with_path(axle)):
         names = [str(getattr(entry, "name", getattr(entry, "key", ""))) for entry in path]
         names = names[1:] if names[0] == "left" else names
-        if names[0] not in ("links", "joints", "spring", "damper", *_TABLES):
+        if names[0] not in ("links", "joints", "spring", "damper", "twist_beam", *_TABLES):
             continue
         is_point = "ends" in names or names[-1] in _AT
         if is_point or (names[-1] in _POSITIVE and np.all(np.asarray(leaf) > 0)):
@@ -50,6 +50,8 @@ def places(axle: Axle) -> dict[str, list[Place]]:
 def _key(names: list[str], carriers: Mapping[str, str]) -> str:
     """That of the file: "links.tie_rod.subframe", "bushings.pivot.stiffness", "subframe.mounts.front.at"."""
     owner = ".".join(names[: 2 if names[0] in ("links", "joints") else 1]) if names[0] != "stops" else names[1]
+    if names[-3:] == ["beam", "of", "stiffness"]:
+        names = [*names[:-3], "beam.section", "stiffness"]
     names = [_TABLES.get(names[0], names[0]), *(name for name in names[1:] if name not in _UNNAMED)]
     if names[-1] == "chassis":
         names[-1] = carriers.get(owner, "chassis")

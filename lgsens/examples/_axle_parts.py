@@ -1,15 +1,15 @@
 """What an axle has beside rigid links: bushings, stops, a rack, an anti-roll bar, and the elements that they become."""
 
 import dataclasses
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens.examples._link_beam import ELEMENTS, LinkBeam, SectionShape
-from lgsens.examples._suspension_parts import Part
+from lgsens.examples._suspension_parts import ALONG_Y, Part, reflected
 from lgsens.model import (
     AbstractForce,
     AbstractJoint,
@@ -20,12 +20,12 @@ from lgsens.model import (
     Bushing,
     DistanceJoint,
     RevoluteJoint,
+    RigidBody,
     Sampled,
     SphericalJoint,
     TorsionSpringDamper,
 )
 
-ALONG_Y: Any = (0.0, 1.0, 0.0)
 RATES = ("stiffness", "rotational_stiffness", "damping", "rotational_damping")
 CURVED: dict[str, str] = dict(zip(RATES, ("spring", "rotational_spring", "damper", "rotational_damper")))
 CURVES = {f"{kind}_{i + 1}": (f"{kind}s", i) for kind in CURVED.values() for i in range(3)}  # of a `Bushing`, its axes
@@ -110,6 +110,15 @@ class Rack(eqx.Module):
     ratio: Float[Array, ""] | None
     travel: Float[Array, ""] | None
     carrier: str = eqx.field(static=True)
+
+
+class Between(NamedTuple):
+    """What a part between the corners brings into a scene; `sought`: of its forces those with preloads."""
+
+    bodies: dict[str, RigidBody]
+    joints: dict[str, AbstractJoint]
+    forces: dict[str, AbstractForce]
+    sought: tuple[str, ...]
 
 
 class Bar(eqx.Module):
@@ -204,6 +213,24 @@ class Bar(eqx.Module):
         if self.mount is None:
             return {name: SphericalJoint(self.carrier, body, at=self.bearing)}, {}
         return {}, dict(self.mount.elements(name, self.carrier, body, self.bearing))
+
+    def scene(self, cars: Mapping[str, Any], compliant: bool) -> Between:
+        """It between corners: a beam, or halves that twist against each other, of one side alone without a twist."""
+        bars = {side: self if side == "left" else reflected(self) for side in cars}
+        held = {side: car.scene_name(self.link, "drop_link", f"{side}_") for side, car in cars.items()}
+        if self.beam is None or not compliant or len(cars) < 2:
+            bodies = {f"{side}_anti_roll_bar": of.half().body() for side, of in bars.items()}
+            joints = {name: joint for side, of in bars.items() for name, joint in of.joints(side, held[side]).items()}
+            return Between(bodies, joints, {"anti_roll_bar": self.element(*bodies)} if len(bodies) == 2 else {}, ())
+        beam = self.bent(bars["right"])
+        lever, bearing = dict(zip(cars, beam.corners[::3])), dict(zip(cars, beam.corners[1:3]))
+        joints: dict[str, AbstractJoint] = {}
+        forces: dict[str, AbstractForce] = {**beam.forces}
+        for side, of in bars.items():
+            turning, bushings = of.bearings(side, bearing[side])
+            joints |= turning | of.drop_link(side, lever[side], held[side])
+            forces |= bushings
+        return Between(beam.bodies, joints, forces, (*forces,))
 
     def element(self, left: str, right: str) -> AntiRollBar | TorsionSpringDamper:
         """What twists between its two halves."""

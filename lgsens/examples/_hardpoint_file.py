@@ -87,8 +87,12 @@ class Reader:
 
     def vector(self, key: str) -> Array:
         """Three numbers as they are: a direction, moments of inertia."""
-        value = self._get(key, lambda value: _are_numbers(value, 3), "three numbers [x, y, z]")
-        return as_float(value, (3,), key)
+        return self.numbers(key, 3, "three numbers [x, y, z]")
+
+    def numbers(self, key: str, count: int, what: str = "") -> Array:
+        """So many numbers."""
+        value = self._get(key, lambda value: _are_numbers(value, count), what or f"{count} numbers [a, b, …]")
+        return as_float(value, (count,), key)
 
     def triples(self, key: str, count: int = 1) -> Array:
         """Three numbers, shape (3,); where there are two things to have them also twice three, shape (2, 3)."""

@@ -1,5 +1,7 @@
 """What bends of a suspension: a section by its shape and material, and the beams of it."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -13,6 +15,7 @@ from lgsens.model import Beam, BeamSection, upward
 
 SHAPES = {"tube": ("diameter", "thickness"), "round": ("diameter",), "rectangle": ("width", "height")}
 MATERIAL = ("young", "poisson", "density")
+GENERAL = "section"  # one by its stiffness and mass, in place of shape and material
 ELEMENTS = 4  # of a beam that does not say how many
 
 
@@ -104,26 +107,34 @@ def nearest(
     return tuple((key, int(np.clip(np.rint(elements * share(at)), 0, elements))) for key, at in sorted(points.items()))
 
 
-def read_beam(table: Reader, instead: tuple[str, ...], shapes: tuple[str, ...] = tuple(SHAPES)) -> LinkBeam:
+def read_beam(table: Reader, instead: tuple[str, ...], shapes: tuple[str, ...] = (*SHAPES, GENERAL)) -> LinkBeam:
     """The table `beam`; mass and stiffness follow from it, so that it stands for the keys `instead`."""
     key = "beam"
     for other in instead:
         if other in table:
             raise table.fail(other, f"follows from the section of `{key}`; leave one of the two out.")
     beam = table.table(key)
-    beam.only((*shapes, *MATERIAL, "damping", "elements", "up"))
+    own = ("damping", "elements", "up")
+    beam.only((*shapes, *MATERIAL, *own))
     kinds = [kind for kind in shapes if kind in beam]
     if len(kinds) != 1:
         raise table.fail(key, f"needs one section of {sorted(shapes)}, got {kinds}.")
     (kind,) = kinds
     dimensions = beam.table(kind)
-    dimensions.only(SHAPES[kind])
-    shape = {kind: {name: dimensions.number(name) for name in SHAPES[kind]}}
-    material = {name: beam.number(name, positive=name != "poisson") for name in MATERIAL}
-    if "damping" in beam:
-        material["damping"] = beam.number("damping")
-    elements = beam.count("elements") if "elements" in beam else ELEMENTS
+    damping = {"damping": beam.number("damping")} if "damping" in beam else {}
+    elements, up = beam.count("elements") if "elements" in beam else ELEMENTS, beam.direction("up")
+    of: Callable[[], BeamSection | SectionShape]
+    if kind == GENERAL:
+        beam.only((kind, *own))
+        dimensions.only(("stiffness", "mass", "inertia"))
+        rates = {"stiffness": dimensions.numbers("stiffness", 6), "inertia": dimensions.vector("inertia")}
+        of = partial(BeamSection, mass=dimensions.number("mass"), **rates, **damping)
+    else:
+        dimensions.only(SHAPES[kind])
+        shape = {kind: {name: dimensions.number(name) for name in SHAPES[kind]}}
+        material = {name: beam.number(name, positive=name != "poisson") for name in MATERIAL}
+        of = partial(SectionShape, shape, material | damping)
     try:
-        return LinkBeam(SectionShape(shape, material), elements, beam.direction("up"))
+        return LinkBeam(of(), elements, up)
     except ValueError as error:
         raise table.fail(key, str(error)) from error

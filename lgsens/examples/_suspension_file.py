@@ -11,7 +11,9 @@ y left, z up. TOML, or JSON of the same structure.
                    link_arm: directions of the arms of its universal joint, see `Link`; or in place of masses
     [links.NAME.beam]  a link with two ends bends: tube = {diameter, thickness}, round = {diameter} or rectangle =
                    {width, height} [m], a height goes along the direction up (left out: z); young [N/m²], poisson,
-                   density [kg/m³], damping [s] (left out: none), see `BeamSection`; elements (left out: 4)
+                   density [kg/m³], damping [s] (left out: none), see `BeamSection`; elements (left out: 4); or in
+                   place of shape and material section = {stiffness: [E A, k₂ G A, k₃ G A, G J, E I₂, E I₃], mass,
+                   inertia}, of axis 3 along up
     [joints.NAME]  type (cylindrical, fixed, prismatic, revolute, spherical), between = [BODY, BODY], at: a point, or
                    the two points of its line
     [knuckle], [wheel], [chassis]: centre_of_mass (wheel: centre, and bearing, its hub), mass, inertia (principal
@@ -38,6 +40,11 @@ Of an axle, in SI units; points are those of the side of the file:
                    others than those of a rod of steel, bore [m], shear_modulus [Pa]; damping [N m s/rad]; or in
                    place of all these
     [anti_roll_bar.beam]  as of a link, tube or round: the bar is a beam from lever to lever, see `Bar`
+    [twist_beam]   BODY = [x, y, z]: where the axis of the cross member of a twist-beam axle, which goes on to the
+                   mirror image of that point, is fixed to the arm, the knuckle or a link, that has one ball joint on
+                   the chassis (joints.NAME, spherical); shear_centre: of the section from its axis, forward and up
+                   [m] (left out: on it), see `TwistBeam`
+    [twist_beam.beam]  as of a link, elements of either half
     [anti_roll_bar.bushing]  the keys of a bushing: of the bearings of such a bar, left out: ball joints
     [bushings.NAME]  in place of the joint NAME, LINK_BODY of a link: stiffness, rotational_stiffness [N/m], [N m/rad],
                    damping, rotational_damping (left out: none), three numbers, or two times three of the two
@@ -50,7 +57,8 @@ Of an axle, in SI units; points are those of the side of the file:
                    rounding [m], progression [m]; see `BumpStop`
 
 A corner by itself has stops and links that bend, and of the rest what is rigid: the chassis takes the place of
-subframe and rack, joints that of bushings, and there is no anti-roll bar.
+subframe and rack, joints that of bushings, and there is no anti-roll bar. What a twist beam guides is on a hinge
+along y, about which both sides turn alike.
 """
 
 from pathlib import Path
@@ -62,14 +70,14 @@ import numpy as np
 from jaxtyping import Array
 
 from lgsens._validate import as_float
-from lgsens.examples._axle_file import CARRIERS, OF_AXLE, carried, mounts, stop
+from lgsens.examples._axle_file import CARRIERS, OF_AXLE, carried, levelled, mounts, stop
 from lgsens.examples._hardpoint_file import Reader
 from lgsens.examples._link_beam import read_beam
 from lgsens.examples._suspension_parts import ALONG_A_LINE, AT_A_POINT, Connection, Link, Part, Strut
 from lgsens.model import Sampled
 
 LEAST_RADIUS, LARGEST_RADIUS = 0.1, 2.0  # m, loaded radii of tyres
-PARTS = ("chassis", "knuckle", "wheel", *CARRIERS, "anti_roll_bar", "drop_link")
+PARTS = ("chassis", "knuckle", "wheel", *CARRIERS, "anti_roll_bar", "drop_link", "twist_beam")
 TABLES = ("name", "units", "road", "links", "joints", "chassis", "knuckle", "wheel", "spring", "damper", "tyre")
 TABLES += ("link_section", "bump", "design")
 RATES = {"spring": "stiffness", "damper": "damping"}
@@ -97,6 +105,7 @@ def members(document: dict, path: str) -> dict[str, Any]:
     carriers: dict[str, str] = {}
     links = {name: _link(name, table, bodies, kilogram, carriers) for name, table in tables.items()}
     joints = {name: _joint(name, table, bodies, carriers) for name, table in root.tables("joints").items()}
+    joints = levelled(root, links, joints)
     taken = {*OF_MODEL, *links, *(f"{name}_{body}" for name, link in links.items() for body in link.ends)}
     for name in sorted(taken & set(joints)):
         raise root.table("joints").fail(

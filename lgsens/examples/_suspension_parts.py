@@ -28,12 +28,14 @@ from lgsens.model import (
     lumped,
 )
 
+ALONG_Y: Any = (0.0, 1.0, 0.0)
 AT_A_POINT: dict[str, Any] = {"fixed": FixedJoint, "spherical": SphericalJoint}
 ALONG_A_LINE: dict[str, Any] = {
     "cylindrical": CylindricalJoint,
     "prismatic": PrismaticJoint,
     "revolute": RevoluteJoint,
 }
+LEVEL = "level"  # a hinge through a point, along y: what symmetry makes of a ball joint
 VECTORS = {"at", "arms", "axes", "ends", "centre", "arm", "link_arm", "bearing", "lever", "preload", "up"}
 AXIAL = "rotational_preload"
 # Curves of a bushing along its axes e₁, e₂, e₃ = e₁ × e₂: these become S e₁, S e₂, −S e₃, and turns change their sign.
@@ -91,6 +93,13 @@ class Part(eqx.Module):
         return Part(centre, mass, own[0] + own[1] + apart)
 
 
+def stiffened(beam: Beam) -> Part:
+    """A straight beam as one rigid body: that of its nodes."""
+    mass, centre, apart = lumped(jnp.stack([body.mass for body in beam.bodies.values()]), beam.points)
+    own = beam.axes[0] @ jnp.diag(beam.section.inertia) @ beam.axes[0].T
+    return Part(centre, mass, apart + own * (mass / beam.section.mass))
+
+
 class Connection(eqx.Module):
     """A joint between two bodies: of a kind, at a point or along the line of two [m], a universal one with its arms."""
 
@@ -102,6 +111,8 @@ class Connection(eqx.Module):
     def joint(self, named: Callable[[str], str] = itself) -> AbstractJoint:
         """The joint of a scene in which its bodies are called so."""
         between = [named(body) for body in self.between]
+        if self.kind == LEVEL:
+            return RevoluteJoint(*between, at=self.at, axis=ALONG_Y)
         if self.arms is not None:
             return UniversalJoint(*between, at=self.at, axis_a=self.arms[0], axis_b=self.arms[1])
         if self.kind in AT_A_POINT:
@@ -114,6 +125,8 @@ class Connection(eqx.Module):
         at, every, none = np.atleast_2d(np.asarray(self.at)), np.eye(3), np.zeros((0, 3))
         if self.arms is not None:
             return at[0], np.cross(np.asarray(self.arms[0]), np.asarray(self.arms[1]))[None], every
+        if self.kind == LEVEL:
+            return at[0], every[::2], every
         if self.kind in AT_A_POINT:
             return at[0], every if self.kind == "fixed" else none, every
         across = np.linalg.svd((at[1] - at[0])[None])[2][1:]
@@ -194,11 +207,7 @@ class Link(eqx.Module):
         """Its mass: its own, or that of its beam's nodes, or of a bar of this radius: m r²/2 about its axis,
         m L²/12 + m r²/4 across."""
         if self.beam is not None:
-            beam = self.bent("")
-            nodes = [body.mass for body in beam.bodies.values()]
-            mass, centre, apart = lumped(jnp.stack(nodes), beam.points)
-            own = beam.axes[0] @ jnp.diag(beam.section.inertia) @ beam.axes[0].T
-            return Part(centre, mass, apart + own * (mass / beam.section.mass))
+            return stiffened(self.bent(""))
         if self.centre is not None and self.inertia is not None:
             return Part(self.centre, self.own_mass, self.inertia)
         start, end = self.axis

@@ -101,6 +101,20 @@ class BeamSection(eqx.Module):
                 raise ValueError(f"`{name}` must have shape (…, 3), as `force` has, got {value.shape}.")
         return jnp.vectorize(self.outline.stress, signature="(3),(3)->()")(force, moment)
 
+    def sheared_at(self, centre) -> "BeamSection":
+        """The section with another shear centre: an open one, whose axis goes through its centroid.
+
+        Arguments:
+            centre: s₂, s₃ of it from the axis [m], shape (2,).
+
+        Forces there do not twist: this K is of the shears there, γ₂ − s₃ κ₁ and γ₃ + s₂ κ₁, in place of γ₂ and γ₃. G J
+        is about the shear centre, with sections that warp as they like: there is no moment of warping. Raises
+        `ValueError` for a wrong shape.
+        """
+        s = as_float(centre, (2,), "BeamSection: `centre`")
+        there = jnp.eye(6, dtype=s.dtype).at[1, 3].set(-s[1]).at[2, 3].set(s[0])
+        return eqx.tree_at(lambda section: section.stiffness, self, there.T @ self.matrix @ there)
+
     @staticmethod
     def round(diameter, *, young, poisson, density, damping=0.0) -> "BeamSection":
         """A round bar.

@@ -20,7 +20,8 @@ they are, and the links alone change the vertical forces by F′; their moment a
     h = −Σ P_y F′ / Σ F_y′     along "lateral", in phase:
 
 the definition of ISO 8855 (where a lateral force on the body does not roll it). Without compliance it is the kinematic
-one, as then F_y P_y′ + F′ P_z′ = 0 (virtual work).
+one, as then F_y P_y′ + F′ P_z′ = 0 (virtual work), of wheels that are independent. A twist beam moves the other wheel,
+too: its roll centre is this one, and the paths of single contact centres tell half of it.
 
 Anti-features. The same with longitudinal forces: the vertical force that links add per force, over what the car's
 inertia adds, h_c/l of all of it, of which this axle has a share p:
