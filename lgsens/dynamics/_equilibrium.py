@@ -104,6 +104,17 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
         stiffest = jnp.max(jnp.sum(jnp.abs(slope[:k, :k]), axis=1))
         return jnp.max(jnp.abs(left)) <= jnp.sqrt(eps) * (1.0 + largest(z)) + 16.0 * eps * stiffest
 
+    def units(slope):
+        """By which rows and columns are scaled for a shortest solution: constraints by the root of the stiffest. Of a
+        joint between two bodies that springs hold, with K each, the matrix has else the singular value 1/K, which is
+        no freedom to turn beside K."""
+        stiffest = jnp.max(jnp.sum(jnp.abs(slope[:k, :k]), axis=1), initial=1.0)
+        return jnp.where(np.arange(k + m) < k, 1.0, jnp.sqrt(lax.stop_gradient(stiffest)))
+
+    def shortest(slope, right):
+        unit = units(slope)
+        return unit * jnp.linalg.lstsq(unit[:, None] * slope * unit[None, :], unit * right, rcond=1e3 * eps)[0]
+
     inertia = system.mass_matrix() * scale[:, None] * scale[None, :] / weight
     viscous = jnp.zeros((k + m, k + m), dtype).at[:k, :k].set(lax.stop_gradient(inertia))
 
@@ -113,7 +124,7 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
         def body(carry: _Search) -> _Search:
             z, mu = carry.z, carry.mu
             slope = matrix(z)
-            step = jnp.linalg.lstsq(slope + mu * viscous, carry.left, rcond=1e3 * eps)[0]
+            step = shortest(slope + mu * viscous, carry.left)
             # Multipliers too: where joint forces alone are stiff, as in a pendulum, the first step moves nothing.
             size = jnp.max(jnp.abs(step) / jnp.where(np.arange(k + m) < k, 1.0, 1.0 + largest(z)))
             moved = jnp.max(jnp.abs(step[: k - system.num_states]))
@@ -135,11 +146,12 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
         start = _Search(begin, left_first, none, none, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
         found = while_loop(unfinished, body, start)
         # Newton is quadratic: one step from √eps is at round-off.
-        return found.z - jnp.linalg.lstsq(matrix(found.z), found.left, rcond=1e3 * eps)[0]
+        return found.z - shortest(matrix(found.z), found.left)
 
     def tangent_solve(linear, rhs):
         slope = jax.jacfwd(linear)(jnp.zeros_like(rhs))
-        return jnp.linalg.pinv(slope, rtol=1e3 * eps) @ rhs
+        unit = units(slope)
+        return unit * (jnp.linalg.pinv(unit[:, None] * slope * unit[None, :], rtol=1e3 * eps) @ (unit * rhs))
 
     z = lax.custom_root(equation, jnp.zeros(k + m, dtype), newton, tangent_solve)
     x, v, lam = split(z)

@@ -292,3 +292,18 @@ def test_a_stiff_beam_bends_far():
     found = lg.equilibrium(model).q.position[-1]
     assert found[2] > 0.4
     np.testing.assert_allclose(found, path.body("arm.2").position[-1], atol=1e-9)  # EA eps of 1e4 N on 1e5 N/m
+
+
+def test_a_joint_between_two_bodies_on_stiff_springs():
+    """Both sink by their weight over the sum of the rates, and the joint bears what one weighs more than its spring."""
+    at, rates = ([0.0, 0.0, 0.0], [0.3, 0.0, 0.0]), (1e9, 3e8)
+    bodies = {name: lg.RigidBody(1.0, (0.1, 0.1, 0.1), position=place) for name, place in zip("ab", at)}
+    hold = lambda rate: {"stiffness": [rate] * 3, "rotational_stiffness": [rate] * 3}
+    forces = {name: lg.Bushing(None, name, at=at[0], **hold(rate)) for name, rate in zip("ab", rates)}
+    forces["gravity"] = lg.Gravity((0.0, 0.0, -9.81))
+    found = lg.equilibrium(lg.Model(bodies, {"fixed": lg.FixedJoint("a", "b", at=at[0])}, forces))
+    sunk = 2 * 9.81 / sum(rates)
+    np.testing.assert_allclose(found.q.position[0], [0.0, 0.0, -sunk], rtol=0, atol=1e-6 * sunk)
+    # of the joint, along the axis of the body
+    bears = 9.81 - rates[1] * sunk
+    assert abs(float(np.abs(found.lam[2])) - abs(bears)) < 1e-6 * abs(bears)
