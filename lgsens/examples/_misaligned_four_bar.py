@@ -12,7 +12,10 @@ from lgsens.model import Beam, BeamSection, Model, Polynomial, RevoluteJoint, Ro
 THICK = (52.99e6, 16.88e6, 733.5, 1131.0, 1.997, 42.60e-6)
 THIN = (13.25e6, 4.220e6, 45.84, 70.66, 0.4992, 2.662e-6)
 POWERS = (2, 2, 4, 4, 2, 4)  # of the width
-A, B, C, D = ((0.0, 0.0, 0.0), (0.0, 0.12, 0.0), (0.24, 0.12, 0.0), (0.24, 0.0, 0.0))  # [m]
+A: Any = (0.0, 0.0, 0.0)  # [m]
+B: Any = (0.0, 0.12, 0.0)
+C: Any = (0.24, 0.12, 0.0)
+D: Any = (0.24, 0.0, 0.0)
 BARS = {"crank": (THICK, A, B), "coupler": (THICK, B, C), "rocker": (THIN, C, D)}
 _E_Z: Any = (0.0, 0.0, 1.0)
 
