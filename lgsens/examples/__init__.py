@@ -6,6 +6,7 @@ from lgsens.examples._comparison import COMPARISON as COMPARISON
 from lgsens.examples._curve_bounds import Band as Band, CurveBounds as CurveBounds
 from lgsens.examples._hardpoint_file import DEFAULT as DEFAULT, shipped as shipped
 from lgsens.examples._identification import AccelerationTest as AccelerationTest
+from lgsens.examples._leaf_spring import leaf_spring as leaf_spring
 from lgsens.examples._link_beam import SectionShape as SectionShape
 from lgsens.examples._mechanisms import (
     four_bar as four_bar,
