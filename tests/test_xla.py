@@ -74,7 +74,7 @@ def test_xla_takes_the_options(flags):
     assert found.returncode == 0, found.stderr
 
 
-@pytest.mark.parametrize("version", some_quick(["(0, 13, 0)", "(0, 10, 0)", "(0, 10, 1)", "(0, 12, 0)"]))
+@pytest.mark.parametrize("version", some_quick([((0, 13, 0),), ((0, 10, 0),), ((0, 10, 1),), ((0, 12, 0),)]))
 def test_versions_that_need_nothing_and_those_not_known_are_left_alone(version):
     found = run(f"import jax, jaxlib.version as v, os\nv.__version_info__ = {version}\nimport lgsens\n" + FLAGS)
     assert (OPTION in found.stdout) == (version == (0, 12, 0)), found.stderr
