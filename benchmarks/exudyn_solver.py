@@ -1,8 +1,13 @@
-"""Exudyn's solver as the rivals' scripts use it: without output, in one thread, with the Newton iteration asked for."""
+"""Exudyn as the rivals' scripts use it: its solver without output, in one thread, with the Newton iteration asked for,
+and its geometrically exact beam, with its mass or with that of lgsens."""
 
 import importlib
+import itertools
 import sys
+from collections.abc import Sequence
 from typing import Any
+
+import numpy as np
 
 MODIFIED, PER_STEP, FULL = "modified Newton", "modified Newton, a matrix per step", "full Newton"
 
@@ -39,3 +44,27 @@ def converges(exu: Any, mbs: Any, settings: Any) -> bool:
         return exu.SolveDynamic(mbs, settings, storeSolver=False, autoAssemble=False)
     except exu.SolverError:
         return False
+
+
+def beam_on_nodes(
+    exu: Any, mbs: Any, nodes: Sequence[Any], length: float, section: tuple, *, lumped: bool
+) -> list[Any]:
+    """Elements of this length between nodes one after the other, `ObjectBeamGeometricallyExact`.
+
+    `section`: stiffnesses, shape (6,), mass and moments of inertia per length, shape (3,). The mass is between the
+    nodes or, `lumped`, that of rigid bodies on them, as in lgsens.
+    """
+    items = importlib.import_module("exudyn.itemInterface")
+    stiffness, mass, inertia = section
+    data = exu.BeamSection()
+    data.stiffnessMatrix = np.diag(stiffness)
+    data.massPerLength, data.inertia = (0.0, np.zeros((3, 3))) if lumped else (mass, np.diag(inertia))
+    elements = [
+        mbs.AddObject(items.ObjectBeamGeometricallyExact(nodeNumbers=list(ends), length=length, sectionData=data))
+        for ends in itertools.pairwise(nodes)
+    ]
+    for i, node in enumerate(nodes if lumped else ()):
+        carried = length / 2.0 if i in (0, len(nodes) - 1) else length
+        moments = [*(carried * np.array(inertia)), 0.0, 0.0, 0.0]
+        mbs.AddObject(items.ObjectRigidBody(nodeNumber=node, physicsMass=carried * mass, physicsInertia=moments))
+    return elements

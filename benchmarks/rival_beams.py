@@ -16,7 +16,7 @@ import time
 from typing import Any
 
 import numpy as np
-from exudyn_solver import FULL, MODIFIED, PER_STEP, converges, fast, solver_settings
+from exudyn_solver import FULL, MODIFIED, PER_STEP, beam_on_nodes, converges, fast, solver_settings
 
 TOLERANCES = (1e-8, 1e-7, 1e-6)  # relative and absolute
 SPARSE, DENSE = "EigenSparse", "EXUdense"
@@ -40,23 +40,13 @@ class Beam:
         self.exu, items = fast(), importlib.import_module("exudyn.itemInterface")
         self.container = self.exu.SystemContainer()
         self.mbs = self.container.AddSystem()
-        add, length, section = self.mbs, LENGTH / elements, self.exu.BeamSection()
-        section.stiffnessMatrix = np.diag(STIFFNESS)
-        section.massPerLength, section.inertia = (0.0, np.zeros((3, 3))) if lumped else (MASS, np.diag(INERTIA))
+        add, length = self.mbs, LENGTH / elements
         kind, rotation = getattr(items, nodes), NODES[nodes]
         places = [[length * i, 0.0, 0.0, *rotation] for i in range(elements + 1)]
         self.nodes = [add.AddNode(kind(referenceCoordinates=place)) for place in places]
-        for ends in itertools.pairwise(self.nodes):
-            add.AddObject(
-                items.ObjectBeamGeometricallyExact(nodeNumbers=list(ends), length=length, sectionData=section)
-            )
+        beam_on_nodes(self.exu, add, self.nodes, length, (STIFFNESS, MASS, INERTIA), lumped=lumped)
         for i, node in enumerate(self.nodes):
             carried = length / 2.0 if i in (0, elements) else length
-            if lumped:
-                inertia = [*(carried * np.array(INERTIA)), 0.0, 0.0, 0.0]
-                add.AddObject(
-                    items.ObjectRigidBody(nodeNumber=node, physicsMass=carried * MASS, physicsInertia=inertia)
-                )
             marker = add.AddMarker(items.MarkerNodePosition(nodeNumber=node))
             add.AddLoad(items.Force(markerNumber=marker, loadVector=[0.0, -GRAVITY * MASS * carried, 0.0]))
         ground = add.AddObject(items.ObjectGround())

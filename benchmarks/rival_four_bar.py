@@ -10,13 +10,12 @@ then are the same. `fine` has four times the elements and Exudyn's distribution 
 
 import argparse
 import importlib
-import itertools
 import json
 import warnings
 from pathlib import Path
 
 import numpy as np
-from exudyn_solver import FULL, fast, solver_settings
+from exudyn_solver import FULL, beam_on_nodes, fast, solver_settings
 
 from lgsens.examples._misaligned_four_bar import BARS
 
@@ -49,9 +48,6 @@ def run(elements: tuple[int, ...], lumped: bool, tolerance: float) -> dict[str, 
         start, end = np.array(start), np.array(end)
         length = np.linalg.norm(end - start) / count
         heading[name] = np.arctan2(*(end - start)[1::-1])
-        moments, section = np.diag([2 * inertia, inertia, inertia]), exu.BeamSection()
-        section.stiffnessMatrix = np.diag([EA, GA, GA, GJ, EI, EI])
-        section.massPerLength, section.inertia = (0.0, np.zeros((3, 3))) if lumped else (mass, moments)
         for i in range(count + 1):
             place = start + (end - start) * i / count
             arm = {"crank": place, "coupler": start, "rocker": place - end}[name]
@@ -62,16 +58,9 @@ def run(elements: tuple[int, ...], lumped: bool, tolerance: float) -> dict[str, 
                     initialVelocities=[*np.cross([0.0, 0.0, RATE], arm), 0.0, 0.0, spin],
                 )
             )
-            if lumped:
-                carried = length / 2 if i in (0, count) else length
-                of_node = [*(carried * np.diag(moments)), 0.0, 0.0, 0.0]
-                mbs.AddObject(
-                    items.ObjectRigidBody(nodeNumber=nodes[name, i], physicsMass=carried * mass, physicsInertia=of_node)
-                )
-        for i, ends in enumerate(itertools.pairwise(nodes[name, j] for j in range(count + 1))):
-            beams[name, i] = mbs.AddObject(
-                items.ObjectBeamGeometricallyExact(nodeNumbers=list(ends), length=length, sectionData=section)
-            )
+        own, moments = [nodes[name, i] for i in range(count + 1)], (2 * inertia, inertia, inertia)
+        section = ((EA, GA, GA, GJ, EI, EI), mass, moments)
+        beams[name] = beam_on_nodes(exu, mbs, own, length, section, lumped=lumped)
     ground = mbs.AddObject(items.ObjectGround())
     still = mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=mbs.AddNode(items.NodePointGround()), coordinate=0))
     for coordinate in range(6):  # the crank's node at A: all held, but for its angle about e_z
@@ -100,7 +89,7 @@ def run(elements: tuple[int, ...], lumped: bool, tolerance: float) -> dict[str, 
     hinge(("crank", elements[0]), ("coupler", 0), 0.0)
     hinge(("coupler", elements[1]), ("rocker", 0), MISALIGNMENT)
     hinge(None, ("rocker", elements[2]), 0.0)
-    kinds, middle = exu.OutputVariableType, beams["coupler", elements[1] // 2]
+    kinds, middle = exu.OutputVariableType, beams["coupler"][elements[1] // 2]
     sensors = {"C": items.SensorNode(nodeNumber=nodes["coupler", elements[1]], outputVariableType=kinds.Position)}
     for name, kind in (("force", kinds.ForceLocal), ("moment", kinds.TorqueLocal)):
         sensors[name] = items.SensorBody(bodyNumber=middle, localPosition=[0.0, 0.0, 0.0], outputVariableType=kind)
