@@ -97,7 +97,6 @@ def test_bad_bounds(car, arguments, message):
         CurveBounds.around(car, **arguments)
 
 
-@pytest.mark.slow  # curves of a shipped suspension by the command are in the quick run
 def test_the_command_draws_lists_and_animates(tmp_path, capsys, car, monkeypatch):
     out = tmp_path / "out"
     arguments = ["curves", "quarter-car", "--out", str(out), "--travel", "0.06", "--points", "5", "--axle", "front"]

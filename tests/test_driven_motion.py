@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import EPS, GRAVITY
+from helpers import EPS, GRAVITY, some_quick
 from scipy.integrate import solve_ivp
 
 import lgsens as lg
@@ -36,9 +36,7 @@ def quantities(motion):
     return jnp.concatenate([*parts, motion.multiplier("motor")[-1]])
 
 
-@pytest.mark.parametrize(
-    "name", ["index 3", *(pytest.param(name, marks=pytest.mark.slow) for name in list(INTEGRATORS)[1:])]
-)
+@pytest.mark.parametrize("name", some_quick(INTEGRATORS))
 def test_driven_slider_crank_is_that_of_kinematics(name):
     model, integrator = crank(lg.Polynomial((0.2, 3.0, 2.0))), INTEGRATORS[name]
     exact = quantities(lg.kinematics(model, t=np.linspace(0.0, END, 5)))

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import says
+from helpers import says, some_quick
 
 import lgsens as lg
 from lgsens.examples import four_bar
@@ -178,7 +178,7 @@ def check_gradients(scene, p, where, tolerance, *, both_modes):
     return found["reverse"]
 
 
-@pytest.mark.parametrize("both_modes", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("both_modes", some_quick([False, True]))
 def test_gradients_of_the_door(both_modes):
     # round-off of λ, 1e-9 of 200 N, over a relative step of 1e-3
     check_gradients(door, DOOR | {"t1": jnp.asarray(0.2)}, ("door", "upper"), 1e-6, both_modes=both_modes)
@@ -266,7 +266,7 @@ def linkage(angle, coupler=0.9, rocker=0.3):
     return lg.Model(bodies, joints)
 
 
-@pytest.mark.parametrize("factor_every", [20, pytest.param(0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("factor_every", some_quick([20, 0]))
 def test_a_parallelogram_through_its_dead_centre_is_said_to_be_singular(factor_every):
     scheme = lg.GeneralizedAlpha(0.8, factor_every=factor_every)
     with pytest.raises(lg.SimulationError, match=says("passes a singular configuration", "of 100, t = 0.0")):

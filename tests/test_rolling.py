@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import rolling_disc
+from helpers import some_quick
 from scipy.integrate import solve_ivp
 
 import lgsens as lg
@@ -62,7 +63,7 @@ def exact():
     return end, -directions @ force
 
 
-@pytest.mark.parametrize("name", ["index 3", *(pytest.param(n, marks=pytest.mark.slow) for n in list(INTEGRATORS)[1:])])
+@pytest.mark.parametrize("name", some_quick(INTEGRATORS))
 def test_rolling_disc_is_that_of_its_ode(name):
     """Motion and force of the ground to the order of the scheme, energy too, and the contact does not slip."""
     run = jax.jit(lambda p, n: of_disc(disc(p, n, INTEGRATORS[name])), static_argnums=1)

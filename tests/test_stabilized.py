@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from differences import central
-from helpers import EPS, says
+from helpers import EPS, says, some_quick
 
 import lgsens as lg
 from lgsens.dynamics import State, accelerations, constraint_velocity
@@ -31,9 +31,7 @@ def violations(trajectory):
 # Runs of 50 and 100 steps of one structure: compiled once, they serve most tests below.
 
 
-@pytest.mark.parametrize(
-    ("scene", "drift"), [(lambda: spinning_top(0.7), 1e-5), pytest.param(four_bar, 1e-6, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("scene", "drift"), some_quick([(lambda: spinning_top(0.7), 1e-5), (four_bar, 1e-6)]))
 def test_velocities_satisfy_the_joints(scene, drift):
     """B v = 0 to round-off in every step; index 3 leaves h² times a constant."""
     run = lambda scheme, n: violations(lg.simulate(scene(), t1=0.1, num_steps=n, integrator=scheme))
@@ -153,9 +151,7 @@ def linkage(x):
 TOP, LINKAGE = jnp.array([0.7, 1.0, 1.0, 1.0, 1.0]), jnp.ones(2)
 
 
-@pytest.mark.parametrize(
-    ("function", "x"), [(top, TOP), pytest.param(linkage, LINKAGE, marks=pytest.mark.slow)], ids=["top", "four_bar"]
-)
+@pytest.mark.parametrize(("function", "x"), some_quick([(top, TOP), (linkage, LINKAGE)]), ids=["top", "four_bar"])
 def test_gradient(function, x):
     """Forward and reverse against each other and against finite differences."""
     value = jax.jit(function)
@@ -233,7 +229,7 @@ def test_what_is_refused():
             lg.GeneralizedAlpha(**bad)
 
 
-@pytest.mark.parametrize(("iterations", "factor_every"), [(2, 0), pytest.param(8, 20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("iterations", "factor_every"), some_quick([(2, 0), (8, 20)]))
 def test_fixed_budget(iterations, factor_every):
     """So many iterations in every step, and the motion of converged steps where they are enough.
 

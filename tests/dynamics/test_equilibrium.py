@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import EPS, GRAVITY, close
+from helpers import EPS, GRAVITY, close, some_quick
 from scipy.optimize import brentq
 
 import lgsens as lg
@@ -248,7 +248,7 @@ def test_pendulum_comes_to_hang(aside):
     close(state.q.position[0], [0.0, 0.0, -np.hypot(1.0, aside)], 32, scale=np.hypot(1.0, aside))
 
 
-@pytest.mark.parametrize("links", [3, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("links", some_quick([3, 8]))
 def test_a_level_chain_hangs(links):
     """Links of 1 m on hinges, held at one end and level at first: nothing is stiff, and folded chains rest as well. It
     hangs along gravity, so its end turns with it, d x/dg_x = −(n − ½)/g_z."""

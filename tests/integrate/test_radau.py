@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from differences import central
-from helpers import random_like, says
+from helpers import random_like, says, some_quick
 from jax.flatten_util import ravel_pytree
 from rolling_disc import scene as rolling_disc
 
@@ -116,7 +116,7 @@ def test_criteria_are_of_its_order():
     assert fine.max() < 1e-6
 
 
-@pytest.mark.parametrize("scene", [lambda: spinning_top(0.7), pytest.param(rolling_disc, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("scene", some_quick([lambda: spinning_top(0.7), rolling_disc]))
 def test_factors_are_those_of_the_equations(scene):
     """Anywhere, with μ of the size of λ: F_z times the solution, and F_n, by forward-mode autodiff of the equations."""
     model, rng = scene(), np.random.default_rng(0)

@@ -216,9 +216,7 @@ def workshop(solver=None):
     return lg.Model(bodies, joints, forces, linear_solver=solver)
 
 
-@pytest.mark.parametrize(
-    "solver", [None, *(pytest.param(solver, marks=pytest.mark.slow) for solver in (lg.DenseLU(), lg.BlockSparse()))]
-)
+@pytest.mark.parametrize("solver", some_quick([None, lg.DenseLU(), lg.BlockSparse()]))
 def test_accelerations_of_the_workshop(solver):
     model = workshop(solver)
     state = eqx.filter_jit(lg.initial_state)(model)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import equations, random_like
+from helpers import equations, random_like, some_quick
 from implicit_midpoint import ImplicitMidpoint
 
 import lgsens as lg
@@ -116,14 +116,16 @@ def linear_problem(scheme, num_steps, uneven=False):
 
 @pytest.mark.parametrize(
     ("scheme", "uneven"),
-    [
-        (ALPHA, True),
-        pytest.param(STABILIZED, False, marks=pytest.mark.slow),
-        pytest.param(ALPHA, False, marks=pytest.mark.slow),
-        pytest.param(lg.RadauIIA(), False, marks=pytest.mark.slow),
-        pytest.param(lg.RadauIIA(), True, marks=pytest.mark.slow),
-        pytest.param(lg.IndexReducedODE(), True, marks=pytest.mark.slow),
-    ],
+    some_quick(
+        [
+            (ALPHA, True),
+            (STABILIZED, False),
+            (ALPHA, False),
+            (lg.RadauIIA(), False),
+            (lg.RadauIIA(), True),
+            (lg.IndexReducedODE(), True),
+        ]
+    ),
 )
 def test_the_linear_equations_with_rows_everywhere(scheme, uneven):
     """L δ = b and Lᵀ μ = c, empty steps among others: as the sweeps, to 6 steps × round-off × 1/βh² of 1e4."""
@@ -144,11 +146,7 @@ def test_the_linear_equations_with_rows_everywhere(scheme, uneven):
 
 @pytest.mark.parametrize(
     ("scheme", "size"),
-    [
-        (ALPHA, 3 * 6 + 3),
-        pytest.param(STABILIZED, 2 * 6 + 2 * 3, marks=pytest.mark.slow),
-        pytest.param(lg.RadauIIA(), 2 * 3, marks=pytest.mark.slow),
-    ],
+    some_quick([(ALPHA, 3 * 6 + 3), (STABILIZED, 2 * 6 + 2 * 3), (lg.RadauIIA(), 2 * 3)]),
 )
 def test_a_step_hands_on_what_its_coordinates_hold(scheme, size):
     """R E = 1 and E R A = A: nothing is lost, and no matrix is larger than it need be. A has entries of 1/βh² = 1e4."""
@@ -248,8 +246,7 @@ def programs(scheme, n):
     }
 
 
-@pytest.mark.slow  # programs of two lengths
-@pytest.mark.parametrize("scheme", [ALPHA, lg.RadauIIA()])
+@pytest.mark.parametrize("scheme", some_quick([ALPHA, lg.RadauIIA()]))
 def test_depth(scheme):
     """Eight times as many steps: eight times the depth of the sweeps, and three levels more of the scan.
 
