@@ -97,23 +97,22 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
         return jnp.concatenate([upper * (scale / weight)[:, None], lower], axis=0)
 
     largest = lambda z: jnp.max(jnp.abs(z[k:]), initial=0.0)
+    stiffest = lambda slope: jnp.max(jnp.sum(jnp.abs(slope[:k, :k]), axis=1), initial=0.0)
 
     def balanced(z, left, slope):
         """To √eps of the largest joint force or moment, taken as mass scale × 1 m/s² at least; and to what stiff forces
         make of round-off of a place, 16 eps of 1 rad or the length of the scene: EA eps of a beam is more."""
-        stiffest = jnp.max(jnp.sum(jnp.abs(slope[:k, :k]), axis=1))
-        return jnp.max(jnp.abs(left)) <= jnp.sqrt(eps) * (1.0 + largest(z)) + 16.0 * eps * stiffest
+        return jnp.max(jnp.abs(left)) <= jnp.sqrt(eps) * (1.0 + largest(z)) + 16.0 * eps * stiffest(slope)
 
-    def units(slope):
-        """By which rows and columns are scaled for a shortest solution: constraints by the root of the stiffest. Of a
+    def shortest(slope, right, solve):
+        """The shortest solution, by `solve` of scaled rows and columns: constraints by the root of the stiffest. Of a
         joint between two bodies that springs hold, with K each, the matrix has else the singular value 1/K, which is
         no freedom to turn beside K."""
-        stiffest = jnp.max(jnp.sum(jnp.abs(slope[:k, :k]), axis=1), initial=1.0)
-        return jnp.where(np.arange(k + m) < k, 1.0, jnp.sqrt(lax.stop_gradient(stiffest)))
+        stiff = jnp.sqrt(jnp.maximum(lax.stop_gradient(stiffest(slope)), 1.0))
+        unit = jnp.where(np.arange(k + m) < k, 1.0, stiff)
+        return unit * solve(unit[:, None] * slope * unit[None, :], unit * right)
 
-    def shortest(slope, right):
-        unit = units(slope)
-        return unit * jnp.linalg.lstsq(unit[:, None] * slope * unit[None, :], unit * right, rcond=1e3 * eps)[0]
+    least_squares = lambda slope, right: jnp.linalg.lstsq(slope, right, rcond=1e3 * eps)[0]
 
     inertia = system.mass_matrix() * scale[:, None] * scale[None, :] / weight
     viscous = jnp.zeros((k + m, k + m), dtype).at[:k, :k].set(lax.stop_gradient(inertia))
@@ -124,7 +123,7 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
         def body(carry: _Search) -> _Search:
             z, mu = carry.z, carry.mu
             slope = matrix(z)
-            step = shortest(slope + mu * viscous, carry.left)
+            step = shortest(slope + mu * viscous, carry.left, least_squares)
             # Multipliers too: where joint forces alone are stiff, as in a pendulum, the first step moves nothing.
             size = jnp.max(jnp.abs(step) / jnp.where(np.arange(k + m) < k, 1.0, 1.0 + largest(z)))
             moved = jnp.max(jnp.abs(step[: k - system.num_states]))
@@ -146,12 +145,11 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
         start = _Search(begin, left_first, none, none, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
         found = while_loop(unfinished, body, start)
         # Newton is quadratic: one step from √eps is at round-off.
-        return found.z - shortest(matrix(found.z), found.left)
+        return found.z - shortest(matrix(found.z), found.left, least_squares)
 
     def tangent_solve(linear, rhs):
         slope = jax.jacfwd(linear)(jnp.zeros_like(rhs))
-        unit = units(slope)
-        return unit * (jnp.linalg.pinv(unit[:, None] * slope * unit[None, :], rtol=1e3 * eps) @ (unit * rhs))
+        return shortest(slope, rhs, lambda slope, rhs: jnp.linalg.pinv(slope, rtol=1e3 * eps) @ rhs)
 
     z = lax.custom_root(equation, jnp.zeros(k + m, dtype), newton, tangent_solve)
     x, v, lam = split(z)

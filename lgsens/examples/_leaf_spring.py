@@ -8,6 +8,7 @@ from lgsens._validate import as_count
 from lgsens.model import AppliedForce, Beam, BeamSection, DistanceJoint, FixedJoint, Model, RevoluteJoint, RigidBody
 
 _E_Y: Any = (0.0, 1.0, 0.0)
+_UP: Any = (0.0, 0.0, 1.0)  # [N]
 
 
 def leaf_spring(
@@ -43,8 +44,8 @@ def leaf_spring(
     less 1/(4 (elements/2)²) of the first term; camber and shackle change it as they turn. Stress in a leaf is that of
     the n-th part of `SectionState.moment`. All numbers but counts may be traced.
 
-    Raises `ValueError` for an odd number of elements. Source: SAE HS-788, Spring Design Manual (1996), part 1; the
-    closed form is that of a simply supported beam.
+    Raises `ValueError` for an odd number of elements. Source: SAE HS-788, Manual on Design and Application
+    of Leaf Springs; the closed form is that of a beam on two supports.
     """
     leaves, elements = (
         as_count(of, name, " (it is static)") for of, name in ((leaves, "leaves"), (elements, "elements"))
@@ -54,7 +55,7 @@ def leaf_spring(
     one = BeamSection.rectangle(width, thickness, young=young, poisson=poisson, density=density)
     pack = BeamSection(leaves * one.stiffness, leaves * one.mass, leaves * one.inertia, damping)
     share = jnp.linspace(-1.0, 1.0, elements + 1)
-    points = jnp.stack([0.5 * length * share, 0.0 * share, camber * share**2], axis=1)
+    points = jnp.stack([0.5 * length * share, jnp.zeros_like(share), camber * share**2], axis=1)
     beam = Beam("leaf", pack, points)
     eye, middle, end = points[0], points[elements // 2], points[-1]
     angle = jnp.asarray(shackle_angle)
@@ -66,5 +67,5 @@ def leaf_spring(
     }
     # of a tube of 80 mm across the car, a metre of it: the axle turns with the leaf, and hardly moves otherwise
     axle = RigidBody(mass, (mass / 12.0, mass * 8e-4, mass / 12.0), middle)
-    load = AppliedForce("axle", at=middle, force=(0.0, 0.0, 1.0))
+    load = AppliedForce("axle", at=middle, force=_UP)
     return Model(beam.bodies | {"axle": axle}, joints, beam.forces | {"load": load}, merge_fixed=True)

@@ -65,8 +65,9 @@ def elimination(solver: AbstractLinearSolver | None, graph: Graph, by_joints: Gr
     dense, best = Elimination([], size), _cheapest(graph)
     if solver is None and _cost(dense) <= _cost(best):
         return None
-    steps, once = _with_loop(best, tuned.LOOP_COST), _with_loop(_cheapest(by_joints), math.inf)
-    return Elimination(steps.levels, size, steps.looped, once)
+    at_once = best if by_joints.neighbours == graph.neighbours else _cheapest(by_joints)
+    steps, once = _with_loop(best, tuned.LOOP_COST), _with_loop(at_once, math.inf)
+    return best if once is best else Elimination(steps.levels, size, steps.looped, once)
 
 
 def _cheapest(graph: Graph) -> Elimination:

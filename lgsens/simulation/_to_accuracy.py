@@ -112,10 +112,10 @@ def _reached(results, tried, distance, extrapolated, accuracy: float, order: int
         return results[-1], Reached(accuracy, float(error), n, False, history)
     if extrapolated is None or not clear:
         return None
-    *_, coarse, fine = pairs = [extrapolated(*pair) for pair in itertools.pairwise(results)]
+    coarse, fine = (extrapolated(*pair) for pair in itertools.pairwise(results[-3:]))
     error = distance(coarse, fine)
-    if len(pairs) > 2 and _clear(distances[-3] / before, order) and error > 0.0:
-        ratio = distance(pairs[0], coarse) / error
+    if len(results) > 3 and _clear(distances[-3] / before, order) and error > 0.0:
+        ratio = distance(extrapolated(*results[:2]), coarse) / error
         error = _SAFETY * error / (min(ratio, 2.0**4) - 1.0) if _clear(ratio, 4) else error
     return (fine, Reached(accuracy, float(error), n, True, history)) if error <= accuracy else None
 
