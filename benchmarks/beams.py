@@ -1,6 +1,6 @@
 """Beams: what elements cost, how fast they converge, and which links of a suspension have to bend.
 
-    python benchmarks/beams.py [--elements 8 32 128] [--repeats 5] [--exudyn] [--picture] [--out benchmarks/results]
+    python benchmarks/beams.py [--elements 8 32 128 256] [--repeats 5] [--exudyn] [--picture] [--out benchmarks/results]
 
 Cost: a beam on a hinge falls, h = 1 ms; the gradient is that of the height of its tip by the stiffnesses of its
 section, in reverse mode. Time per step as in chain.py, the difference of two runs; to compile, the least processor time
@@ -58,6 +58,7 @@ def cost(elements: int, repeats: int) -> dict:
         few, many = (times[name, steps].wall for steps in STEPS)
         taken = statistics.median(long - short for short, long in zip(few, many))
         found[f"{name}_us_per_step"] = taken / (STEPS[1] - STEPS[0]) * 1e6
+    jax.clear_caches()  # programs hold memory maps, of which a process has only so many
     return found
 
 
@@ -206,7 +207,7 @@ def rival_table(found: dict) -> list[str]:
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--elements", nargs="+", type=int, default=[8, 32, 128])
+    parser.add_argument("--elements", nargs="+", type=int, default=[8, 32, 128, 256])
     parser.add_argument("--exudyn", action="store_true", help="beside Exudyn, nothing else; skipped without it")
     parser.add_argument("--picture", action="store_true", help="draws beams.png, nothing else")
     arguments = parser.parse_args()
