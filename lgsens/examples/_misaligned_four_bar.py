@@ -38,7 +38,11 @@ def misaligned_four_bar(misalignment=0.08726646259971647, rate=-0.6, width=8e-3,
     Source: O. Bauchau et al., Validation of flexible multibody dynamics beam formulations using benchmark problems,
     Multibody Syst. Dyn. 37 (2016), 29–48, doi:10.1007/s11044-016-9514-y, whose results are curves; numbers of an
     independent program are in tests/data/misaligned_four_bar.json.
+
+    Raises `ValueError` for other than three numbers of elements, and as `BeamSection` and `Beam`.
     """
+    if len(elements) != len(BARS):
+        raise ValueError(f"`elements` must be three, those of crank, coupler and rocker, got {elements!r}.")
     turning = jnp.asarray(rate) * jnp.asarray(_E_Z)
     bodies, forces, end = {}, {}, {}
     for (name, (numbers, *points)), count in zip(BARS.items(), elements):

@@ -204,6 +204,13 @@ def linkage(t1, p=None, elements=(4, 8, 4), scheme=None):
     return {"C": run.body(f"coupler.{elements[1]}").position, "force": section.force, "moment": section.moment}
 
 
+def test_a_linkage_has_three_bars():
+    with pytest.raises(ValueError, match=r"`elements` must be three, .* got \(4, 8\)"):
+        misaligned_four_bar(elements=(4, 8))
+    with pytest.raises(ValueError, match="must be positive"):
+        misaligned_four_bar(width=0.0)
+
+
 def agrees(found, numbers, tolerances):
     for name, tolerance in tolerances.items():
         every = FOUR_BAR["num_steps"] // (len(numbers["t"]) - 1)
