@@ -1,6 +1,6 @@
 """The rotation group SO(3)."""
 
-from functools import partial
+from functools import partial, reduce
 
 import jax
 import jax.numpy as jnp
@@ -24,20 +24,24 @@ _QUATERNION[1:, 1:] = _EYE[:, None, :, None] * _EYE[None, :, None, :] + _EYE[:, 
 _QUATERNION[1:, 1:] -= _EYE[:, :, None, None] * _EYE[None, None, :, :]
 
 
-@partial(jax.jit, inline=True)  # else each scene that is made outside of `jit` compiles the loop again
 def nearest_rotation(R: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
     """The rotation matrix nearest to `R`, for a matrix that is one but for a small error (an optimizer's step, say).
 
     The orthogonal factor of the polar decomposition by Newton-Schulz, `R <- R (3 I - R^T R) / 2`: four steps take an
     error of 0.1 below round-off, and leave a rotation as it is. The derivative is the projection on the tangent space.
-    Source: Higham, Functions of Matrices (2008), eq. (8.20).
+    Source: Higham, Functions of Matrices (2008), eq. (8.20). Of NumPy's arrays by NumPy: nothing is compiled.
     """
-    eye = jnp.broadcast_to(jnp.eye(3, dtype=R.dtype), R.shape)
+    return reduce(lambda R, _: _nearer(R), range(4), R) if isinstance(R, np.ndarray) else _nearest(R)
 
-    def step(R, _):
-        return 0.5 * R @ (3.0 * eye - jnp.swapaxes(R, -1, -2) @ R), None
 
-    return lax.scan(step, R, length=4)[0]
+def _nearer(R):
+    eye = np.broadcast_to(np.eye(3, dtype=R.dtype), R.shape)
+    return 0.5 * R @ (3.0 * eye - R.swapaxes(-1, -2) @ R)
+
+
+@partial(jax.jit, inline=True)  # else each scene that is made outside of `jit` compiles the loop again
+def _nearest(R):
+    return lax.scan(lambda R, _: (_nearer(R), None), R, length=4)[0]
 
 
 def _components(x):

@@ -14,6 +14,7 @@ from lgsens._validate import as_count, as_float, is_concrete, point_field, requi
 from lgsens.model._beam_load import element
 from lgsens.model._beam_sections import BeamSection
 from lgsens.model._body import RigidBody
+from lgsens.model._evaluate_by_kind import unstacked
 from lgsens.model._forces import AbstractConnection
 from lgsens.model._joints import FixedJoint
 
@@ -55,7 +56,7 @@ class BeamElement(AbstractConnection):
             raise ValueError(f"BeamElement: `section` must be a BeamSection, got {self.section!r}.")
         require(
             lambda a, b: np.any(a != b),
-            f"BeamElement: `at_a` and `at_b` are the same point, {self.at_a}; an element has a length.",
+            lambda: f"BeamElement: `at_a` and `at_b` are the same point, {self.at_a}; an element has a length.",
             self.at_a,
             self.at_b,
         )
@@ -142,9 +143,9 @@ class Beam(eqx.Module):
     @property
     def forces(self) -> dict[str, BeamElement]:
         """Its elements by name: that from node i to node i + 1 has the name of node i."""
-        points, axes = map(list, _known(self.points, self.axes))
-        place = lambda i, end: {f"at_{end}": points[i], f"axes_{end}": axes[i]}
         with jax.ensure_compile_time_eval():
+            points, axes = map(unstacked, (self.points, self.axes))
+            place = lambda i, end: {f"at_{end}": points[i], f"axes_{end}": axes[i]}
             return {
                 a: BeamElement(a, b, **place(i, "a"), **place(i + 1, "b"), section=self.section)
                 for i, (a, b) in enumerate(pairwise(self.nodes))
@@ -157,9 +158,10 @@ class Beam(eqx.Module):
         lengths = _norm(points[1:] - points[:-1])[:, 0]
         none, xp = 0.0 * lengths[:1], _module(points)
         carried = (xp.concatenate([none, lengths]) + xp.concatenate([lengths, none])) / 2.0
-        numbers = zip(*map(list, (carried * mass, carried[:, None] * inertia[None], points, axes)))
+        numbers = carried * mass, carried[:, None] * inertia[None], points, axes
         with jax.ensure_compile_time_eval():
-            return {node: RigidBody(*own) for node, own in zip(self.nodes, numbers)}
+            at_rest = jnp.zeros(3, self.points.dtype)
+            return {node: RigidBody(*own, at_rest, at_rest) for node, *own in zip(self.nodes, *map(unstacked, numbers))}
 
 
 def _known(*arrays) -> tuple[Any, ...]:

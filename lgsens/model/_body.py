@@ -92,9 +92,11 @@ class RigidBody(eqx.Module):
         if self.inertia is not None:
             require(
                 _is_physical,
-                f"RigidBody: `inertia` {self.inertia} kg m² is not the inertia of a body: it must be symmetric and "
-                "positive definite, and each principal moment at most the sum of the other two (check units, "
-                "axes and the centre of mass).",
+                lambda: (
+                    f"RigidBody: `inertia` {self.inertia} kg m² is not the inertia of a body: it must be symmetric "
+                    "and positive definite, and each principal moment at most the sum of the other two (check units, "
+                    "axes and the centre of mass)."
+                ),
                 self.inertia,
             )
         require(
@@ -107,7 +109,7 @@ class RigidBody(eqx.Module):
     def __check_init__(self):
         require(
             lambda mass: mass > 0 and np.isfinite(mass),
-            f"RigidBody: `mass` must be positive, got {self.mass} kg.",
+            lambda: f"RigidBody: `mass` must be positive, got {self.mass} kg.",
             self.mass,
         )
         if self.inertia is None and {*self.free} & {*ROTATIONS}:

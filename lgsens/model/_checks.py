@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float, is_concrete, leaf_name
+from lgsens._validate import as_float, is_concrete, is_float_array, leaf_name
 
 
 def strong(element: Any) -> Any:
@@ -38,10 +38,10 @@ def checked(what: str, element: Any) -> Any:
     """
 
     def number(path, leaf):
-        field = f"{what}: `{leaf_name(path, type(element).__name__)}`"
-        array = as_float(leaf, None, field)
+        field = lambda: f"{what}: `{leaf_name(path, type(element).__name__)}`"
+        array = leaf if is_float_array(leaf) else as_float(leaf, None, field())
         if is_concrete(array) and not np.isfinite(array).all():
-            raise ValueError(f"{field} must be finite, got {np.asarray(leaf)}; bound what an optimizer may change.")
+            raise ValueError(f"{field()} must be finite, got {np.asarray(leaf)}; bound what an optimizer may change.")
         return array
 
     element = jax.tree_util.tree_map_with_path(number, element)

@@ -7,6 +7,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from lgsens._brief import listed, roster
@@ -17,7 +18,7 @@ from lgsens.model._assemble import assemble, assemble_merged
 from lgsens.model._beam_sections import BeamSection
 from lgsens.model._body import RigidBody
 from lgsens.model._checks import checked, far_from_rotation, is_inertia, strong
-from lgsens.model._evaluate_by_kind import stacked
+from lgsens.model._evaluate_by_kind import stacked, unstacked
 from lgsens.model._flexible import flexible
 from lgsens.model._forces import AbstractForce
 from lgsens.model._frames import Frame
@@ -173,12 +174,11 @@ class Model(eqx.Module):
         """
         names, self = sorted(self.bodies), self._checked()
         # An optimizer that updates a whole model leaves SO(3) by the square of its step.
-        rotations = nearest_rotation(stacked([self.bodies[name].orientation for name in names]))
-        bodies = {
-            name: eqx.tree_at(lambda body: body.orientation, self.bodies[name], rotations[i])
-            for i, name in enumerate(names)
-        }
-        frames = Frame(stacked([bodies[name].frame.position for name in names]), rotations)
+        orientations = lambda bodies: [bodies[name].orientation for name in names]
+        found = orientations(self.bodies)
+        rotations = nearest_rotation(np.stack(found) if is_concrete(found) else stacked(found))
+        bodies = eqx.tree_at(orientations, dict(self.bodies), unstacked(rotations))
+        frames = Frame(stacked([bodies[name].frame.position for name in names]), jnp.asarray(rotations))
         if self._groups is None:
             system = assemble(bodies, frames, self.joints, self.forces)
         else:
@@ -199,18 +199,7 @@ class Model(eqx.Module):
             for what, of in (("Body", self.bodies), ("Joint", self.joints), ("Force", self.forces))
         ]
         for name, body in members[0].items():
-            require(
-                lambda inertia: is_inertia(np.diag(inertia) if inertia.ndim == 1 else inertia),
-                f"Body {name!r}: `inertia` {body.inertia} is not that of a body: a principal moment is negative, or "
-                "larger than the sum of the others; bound what an optimizer may change.",
-                np.zeros(3) if body.inertia is None else body.inertia,
-            )
-            require(
-                lambda orientation: not far_from_rotation(orientation),
-                f"Body {name!r}: `orientation` {body.orientation} is far from a rotation; leave it to the model "
-                "(`equinox.partition`), or take smaller steps.",
-                body.orientation,
-            )
+            _check_body(name, body)
         return eqx.tree_at(lambda model: (model.bodies, model.joints, model.forces), self, tuple(members))
 
     @property
@@ -300,6 +289,25 @@ def _check_connection(what: str, ends: tuple[str | None, ...], bodies: Mapping[s
     if len(ends) == 2 and ends[0] == ends[1]:
         where = "the ground" if ends[0] is None else f"body {ends[0]!r}"
         raise ValueError(f"{what} connects {where} to itself; name two different bodies.")
+
+
+def _check_body(name: str, body: RigidBody) -> None:
+    require(
+        lambda inertia: is_inertia(np.diag(inertia) if inertia.ndim == 1 else inertia),
+        lambda: (
+            f"Body {name!r}: `inertia` {body.inertia} is not that of a body: a principal moment is negative, or larger "
+            "than the sum of the others; bound what an optimizer may change."
+        ),
+        np.zeros(3) if body.inertia is None else body.inertia,
+    )
+    require(
+        lambda orientation: not far_from_rotation(orientation),
+        lambda: (
+            f"Body {name!r}: `orientation` {body.orientation} is far from a rotation; leave it to the model "
+            "(`equinox.partition`), or take smaller steps."
+        ),
+        body.orientation,
+    )
 
 
 def _is_same_connection(one: AbstractJoint, other: AbstractJoint) -> bool:
