@@ -24,7 +24,7 @@ _QUATERNION[1:, 1:] = _EYE[:, None, :, None] * _EYE[None, :, None, :] + _EYE[:, 
 _QUATERNION[1:, 1:] -= _EYE[:, :, None, None] * _EYE[None, None, :, :]
 
 
-def nearest_rotation(R: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
+def nearest_rotation(R: Float[Array | np.ndarray, "... 3 3"]) -> Float[Array | np.ndarray, "... 3 3"]:
     """The rotation matrix nearest to `R`, for a matrix that is one but for a small error (an optimizer's step, say).
 
     The orthogonal factor of the polar decomposition by Newton-Schulz, `R <- R (3 I - R^T R) / 2`: four steps take an

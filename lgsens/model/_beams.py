@@ -160,8 +160,8 @@ class Beam(eqx.Module):
         carried = (xp.concatenate([none, lengths]) + xp.concatenate([lengths, none])) / 2.0
         numbers = carried * mass, carried[:, None] * inertia[None], points, axes
         with jax.ensure_compile_time_eval():
-            at_rest = jnp.zeros(3, self.points.dtype)
-            return {node: RigidBody(*own, at_rest, at_rest) for node, *own in zip(self.nodes, *map(unstacked, numbers))}
+            at_rest = dict.fromkeys(("velocity", "angular_velocity"), jnp.zeros(3, self.points.dtype))
+            return {node: RigidBody(*own, **at_rest) for node, *own in zip(self.nodes, *map(unstacked, numbers))}
 
 
 def _known(*arrays) -> tuple[Any, ...]:
