@@ -12,6 +12,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+_NUMBERS = (jax.Array, np.ndarray, float, int)
+
 
 def as_float(value: Any, shape: tuple[int, ...] | None, what: str) -> Array:
     """`value` as a strongly typed float array of `shape` (None: any shape).
@@ -33,7 +35,9 @@ def as_float(value: Any, shape: tuple[int, ...] | None, what: str) -> Array:
 
 def is_float_array(value: Any) -> bool:
     """Whether `as_float` takes it as it is."""
-    return isinstance(value, jax.Array) and value.dtype == jnp.result_type(float) and not value.weak_type
+    # what `jnp.result_type(float)` is, in a tenth of its 6 µs
+    dtype = jax.dtypes.canonicalize_dtype(float)
+    return isinstance(value, jax.Array) and value.dtype == dtype and not value.weak_type
 
 
 def as_count(value: Any, name: str, why: str = "") -> int:
@@ -50,9 +54,7 @@ def as_count(value: Any, name: str, why: str = "") -> int:
 def is_concrete(*values: Any) -> bool:
     """Whether every array in `values` has values that Python can look at now."""
     leaves = jax.tree.leaves(values)
-    return not any(isinstance(leaf, Tracer) for leaf in leaves) and all(
-        isinstance(leaf, jax.Array | np.ndarray | float | int) for leaf in leaves
-    )
+    return not any(isinstance(leaf, Tracer) for leaf in leaves) and all(isinstance(leaf, _NUMBERS) for leaf in leaves)
 
 
 def require(condition: Callable[..., Any], message: str | Callable[[], str], *values: Any) -> None:

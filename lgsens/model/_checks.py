@@ -15,9 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float, is_concrete, is_float_array, leaf_name
+from lgsens._validate import as_float, is_float_array, leaf_name
 
 
 def strong(element: Any) -> Any:
@@ -40,7 +41,7 @@ def checked(what: str, element: Any) -> Any:
     def number(path, leaf):
         field = lambda: f"{what}: `{leaf_name(path, type(element).__name__)}`"
         array = leaf if is_float_array(leaf) else as_float(leaf, None, field())
-        if is_concrete(array) and not np.isfinite(array).all():
+        if not isinstance(array, Tracer) and not np.isfinite(array).all():
             raise ValueError(f"{field()} must be finite, got {np.asarray(leaf)}; bound what an optimizer may change.")
         return array
 

@@ -1,7 +1,7 @@
 """The scene: bodies, joints and forces by name."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lgsens._brief import listed, roster
-from lgsens._validate import is_concrete, require
+from lgsens._validate import is_concrete
 from lgsens.liegroups import nearest_rotation
 from lgsens.linear import AbstractLinearSolver, BlockSparse
 from lgsens.model._assemble import assemble, assemble_merged
@@ -198,9 +198,8 @@ class Model(eqx.Module):
             {name: checked(f"{what} {name!r}", member) for name, member in of.items()}
             for what, of in (("Body", self.bodies), ("Joint", self.joints), ("Force", self.forces))
         ]
-        for name, body in members[0].items():
-            _check_body(name, body)
-        return eqx.tree_at(lambda model: (model.bodies, model.joints, model.forces), self, tuple(members))
+        _check_bodies(members[0])
+        return jax.tree.unflatten(jax.tree.structure(self), jax.tree.leaves(members))  # numbers alone have changed
 
     @property
     def _groups(self) -> tuple[Group, ...] | None:
@@ -291,23 +290,31 @@ def _check_connection(what: str, ends: tuple[str | None, ...], bodies: Mapping[s
         raise ValueError(f"{what} connects {where} to itself; name two different bodies.")
 
 
-def _check_body(name: str, body: RigidBody) -> None:
-    require(
-        lambda inertia: is_inertia(np.diag(inertia) if inertia.ndim == 1 else inertia),
-        lambda: (
-            f"Body {name!r}: `inertia` {body.inertia} is not that of a body: a principal moment is negative, or larger "
-            "than the sum of the others; bound what an optimizer may change."
-        ),
-        np.zeros(3) if body.inertia is None else body.inertia,
-    )
-    require(
-        lambda orientation: not far_from_rotation(orientation),
-        lambda: (
-            f"Body {name!r}: `orientation` {body.orientation} is far from a rotation; leave it to the model "
+def _check_bodies(bodies: Mapping[str, RigidBody]) -> None:
+    """All of them at once: a hundred are checked in the time of three."""
+    full = lambda inertia: np.diag(inertia) if inertia.ndim == 1 else inertia
+    inertias = {name: full(np.asarray(body.inertia)) for name, body in bodies.items() if _is_known(body.inertia)}
+    if name := _first_wrong(inertias, is_inertia):
+        raise ValueError(
+            f"Body {name!r}: `inertia` {bodies[name].inertia} is not that of a body: a principal moment is negative, "
+            "or larger than the sum of the others; bound what an optimizer may change."
+        )
+    orientations = {name: np.asarray(body.orientation) for name, body in bodies.items() if _is_known(body.orientation)}
+    if name := _first_wrong(orientations, lambda orientation: ~far_from_rotation(orientation)):
+        raise ValueError(
+            f"Body {name!r}: `orientation` {bodies[name].orientation} is far from a rotation; leave it to the model "
             "(`equinox.partition`), or take smaller steps."
-        ),
-        body.orientation,
-    )
+        )
+
+
+def _is_known(value) -> bool:
+    return value is not None and is_concrete(value)
+
+
+def _first_wrong(matrices: Mapping[str, np.ndarray], right: Callable) -> str | None:
+    """The first name whose matrix is not right."""
+    found = right(np.stack(list(matrices.values()))) if matrices else []
+    return next((name for name, is_right in zip(matrices, found) if not is_right), None)
 
 
 def _is_same_connection(one: AbstractJoint, other: AbstractJoint) -> bool:
