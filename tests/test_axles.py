@@ -183,6 +183,7 @@ def trailing():
     return move(np.concatenate([TRAVEL, TRAVEL]), np.concatenate([TRAVEL, -TRAVEL]))
 
 
+@pytest.mark.slow  # small version: test_mirror_image_of_curves
 def test_alike_both_wheels_move_as_those_of_corners(trailing):
     corner = QuarterCar.load("semi_trailing_arm").travel(TRAVEL).body("wheel")
     left, right = (trailing.body(f"{side}_wheel") for side in ("left", "right"))

@@ -200,6 +200,7 @@ M, L, J1, J3 = 2.0, 0.25, 0.05, 0.02  # of the top, and the moment about its fix
 ABOUT = J1 + M * L**2
 
 
+@pytest.mark.slow  # small version: test_rotor_on_springs
 def test_sleeping_top():
     """A ζ'' − i J₃ω ζ' − mgl ζ = 0 of the complex tilt: λ = i (J₃ω ± √(J₃²ω² − 4 A m g l))/2A, and two zeros."""
 

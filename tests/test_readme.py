@@ -20,8 +20,9 @@ def blocks(text, language="python"):
 
 PAGES = [path for path in sorted((ROOT / "notebooks").rglob("*.md")) if blocks(path.read_text(encoding="utf-8"))]
 # Not in the quick run, whose small versions are `test_fidelity.py`, `test_step_jacobians.py`, `test_linearize.py`,
-# `test_certify.py`, `test_flexible.py`, `test_suspension_files.py` and, of choosing, `test_differentiate.py`.
-LONG = {"choosing", "control", "flexible", "fidelity", "small_motions", "suspension", "trust"}
+# `test_certify.py`, `test_flexible.py`, `test_suspension_files.py`, `test_own_elements.py`, `test_sweep.py` and, of
+# choosing, `test_differentiate.py`.
+LONG = {"choosing", "control", "flexible", "fidelity", "own_elements", "small_motions", "suspension", "sweeps", "trust"}
 WHOLE = [pytest.param(path, marks=[pytest.mark.slow] * (path.stem in LONG), id=path.stem) for path in PAGES]
 
 

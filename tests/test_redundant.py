@@ -266,6 +266,7 @@ def linkage(angle, coupler=0.9, rocker=0.3):
     return lg.Model(bodies, joints)
 
 
+@pytest.mark.slow  # small version: test_a_reference_that_lies_flat_is_singular
 @pytest.mark.parametrize("factor_every", some_quick([20, 0]))
 def test_a_parallelogram_through_its_dead_centre_is_said_to_be_singular(factor_every):
     scheme = lg.GeneralizedAlpha(0.8, factor_every=factor_every)

@@ -57,6 +57,7 @@ def test_adjoint_variable_method():
     np.testing.assert_allclose(found, jax.grad(lambda alpha: total(of_trajectory(alpha)))(0.7), rtol=1e-9)
 
 
+@pytest.mark.slow  # two programs, for their memory
 def test_batch_stores_what_was_asked():
     """In a batch the memory of a run is that of its outputs and statistics, not of its states (33 numbers a step)."""
     side = lambda s: s.body("top").position[0]

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import GRAVITY, close, factorizations, says
+from helpers import GRAVITY, close, factorizations, says, some_quick
 from scipy.optimize import brentq
 
 import lgsens as lg
@@ -79,23 +79,25 @@ def test_positions_and_responses(found):
     np.testing.assert_allclose(found[1], rates, rtol=0, atol=1e-14)
 
 
-def test_derivatives_of_equilibria_and_responses(found):
-    forward, backward = jax.jit(jax.jacfwd(of_lever))(NUMBERS), jax.jit(jax.jacrev(of_lever))(NUMBERS)
+@pytest.mark.parametrize("modes", some_quick([[jax.jacrev], [jax.jacfwd, jax.jacrev]]))
+def test_derivatives_of_equilibria_and_responses(found, modes):
+    derivatives = [jax.jit(mode(of_lever))(NUMBERS) for mode in modes]
     for i, step in enumerate((10.0, 1e-3)):
         numbers = lambda h, i=i: np.asarray(NUMBERS.at[i].add(h))
         height = lambda h, numbers=numbers: [-0.5 * np.sin(angle(p, *numbers(h))) for p in PUSH]
         slope = lambda h, numbers=numbers: [
             differences(lambda d, p=p: -0.5 * np.sin(angle(p + d, *numbers(h))), 2.0) for p in PUSH
         ]
-        for value, expected in zip((forward[0], forward[1]), (height, slope)):
+        for value, expected in zip(derivatives[0], (height, slope)):
             # Differences leave (h/p)⁴ = (1e-3/0.4)⁴, 4e-11, by the load 3e-10, and 1e-16/h of round-off twice.
             scale = np.abs(value[:, i]).max()
             np.testing.assert_allclose(value[:, i], differences(expected, step), rtol=0, atol=1e-8 * scale)
-    for one, other in zip(forward, backward):
+    for one, other in zip(derivatives[0], derivatives[-1]):
         close(one, other, 100)  # one linear operator and its transpose, of condition 10
 
 
-def test_series_parallel_and_starts():
+@pytest.mark.parametrize("starts", some_quick([((3,),), ((),)]))
+def test_series_parallel_and_starts(starts):
     """Springs in series and parallel, driven: λ = −k₁(k₂ + k₃)/(k₁ + k₂ + k₃) s, whichever point each begins from."""
     stiffness = {"one": 3e4, "two": 5e4, "three": 2e4}
     bodies = {
@@ -111,12 +113,11 @@ def test_series_parallel_and_starts():
     model = lg.Model(bodies, {"driver": driver}, forces)
     way = np.array([0.0, 0.1, 0.2, -0.1, -0.2])
     rate = 1.0 / (1.0 / 3e4 + 1.0 / 7e4)
-    for starts in ((), (3,)):
-        found = lg.statics(model, {"driver": way}, starts=starts, rates=[{"driver": 1.0}, {"driver": 2.0}])
-        np.testing.assert_allclose(found.multiplier("driver")[:, 0], -rate * way, rtol=0, atol=1e-8 * rate * 0.2)
-        for i in (0, 1):
-            slopes = found.along(i).multiplier("driver")[:, 0]
-            np.testing.assert_allclose(slopes, np.full(5, -(i + 1) * rate), rtol=1e-8)
+    found = lg.statics(model, {"driver": way}, starts=starts, rates=[{"driver": 1.0}, {"driver": 2.0}])
+    np.testing.assert_allclose(found.multiplier("driver")[:, 0], -rate * way, rtol=0, atol=1e-8 * rate * 0.2)
+    for i in (0, 1):
+        slopes = found.along(i).multiplier("driver")[:, 0]
+        np.testing.assert_allclose(slopes, np.full(5, -(i + 1) * rate), rtol=1e-8)
     assert found.body("low").velocity.max() == 0.0  # at rest
 
 

@@ -1,11 +1,13 @@
 """A and B of single steps: Radau's stability function, products along rollouts, differences, what is refused."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import says
+from helpers import says, some_quick
 from rolling_disc import scene as disc
 
 import lgsens as lg
@@ -15,20 +17,23 @@ H, RADAU = 0.05, lg.RadauIIA()
 MASS, STIFFNESS, DAMPING = 2.0, 300.0, 4.0
 
 
-def oscillator(u):
-    """A mass on a spring and damper, pulled by u."""
-    joints = {"rail": lg.PrismaticJoint(None, "mass", at=ORIGIN, axis=X)}
+def oscillator(u, free=None):
+    """A mass on a spring and damper, pulled by u; on a rail, or free along it alone."""
+    joints = {} if free else {"rail": lg.PrismaticJoint(None, "mass", at=ORIGIN, axis=X)}
     spring = lg.SpringDamper(
         None, "mass", at_a=(-1.0, 0.0, 0.0), at_b=ORIGIN, stiffness=STIFFNESS, damping=DAMPING, free_length=1.0
     )
     forces = {"spring": spring, "pull": lg.AppliedForce("mass", force=u[0] * jnp.array(X))}
-    return lg.Model({"mass": lg.RigidBody(MASS, (1.0, 1.0, 1.0), velocity=(0.3, 0.0, 0.0))}, joints, forces)
+    body = lg.RigidBody(MASS, (1.0, 1.0, 1.0), velocity=(0.3, 0.0, 0.0), free=free)
+    return lg.Model({"mass": body}, joints, forces)
 
 
-def test_of_a_linear_mechanism():
+@pytest.mark.parametrize("free", some_quick(["x", None]))
+def test_of_a_linear_mechanism(free):
     """A = R(h A_c) with Radau's stability function, B = A_c⁻¹ (A − 1) B_c, of [√m x; √m ẋ]."""
-    states = jax.tree.map(lambda leaf: jnp.stack([leaf] * 4), lg.initial_state(oscillator(jnp.zeros(1))))
-    found = lg.step_jacobians(oscillator, states, jnp.zeros((3, 1)), H * np.arange(4))
+    build = partial(oscillator, free=free)
+    states = jax.tree.map(lambda leaf: jnp.stack([leaf] * 4), lg.initial_state(build(jnp.zeros(1))))
+    found = lg.step_jacobians(build, states, jnp.zeros((3, 1)), H * np.arange(4))
     continuous = np.array([[0.0, 1.0], [-STIFFNESS / MASS, -DAMPING / MASS]])
     z = H * continuous
     one = np.eye(2)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import close
+from helpers import close, some_quick
 from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
@@ -137,7 +137,8 @@ def test_rates_agree_with_differences_of_the_closure(curves):
         np.testing.assert_allclose(curves.roll_centre_height[i], y * rate[3] / rate[4], rtol=0, atol=1e-9)
 
 
-def test_gradients_agree_with_differences_of_the_closure(car):
+@pytest.mark.parametrize("modes", some_quick([[jax.jacrev], [jax.jacfwd, jax.jacrev]]))
+def test_gradients_agree_with_differences_of_the_closure(car, modes):
     """Each of the 15 coordinates of the hardpoints on the chassis, both modes."""
     travel = jnp.asarray(TRAVEL[[2, 11]])
 
@@ -147,9 +148,9 @@ def test_gradients_agree_with_differences_of_the_closure(car):
         return jnp.stack([found.camber, found.toe, found.track_change, found.spring_length, found.roll_centre_height])
 
     points = jnp.stack([car.links[name].chassis for name in NAMES])
-    forward, backward = jax.jit(jax.jacfwd(of))(points), jax.jit(jax.jacrev(of))(points)
-    close(forward, backward, 1000)  # one linear operator and its transpose, of condition 1e2
-    assert forward.shape == (5, 2, 5, 3)
+    found, other = (jax.jit(mode(of))(points) for mode in (modes[0], modes[-1]))
+    close(found, other, 1000)  # one linear operator and its transpose, of condition 1e2
+    assert found.shape == (5, 2, 5, 3)
 
     def at(shift):
         closure = Closure(shift)
@@ -166,8 +167,8 @@ def test_gradients_agree_with_differences_of_the_closure(car):
         unit[link, axis] = 1.0
         expected = differences(lambda h, unit=unit: at(h * unit), 2e-3)
         # As above, per metre: 1e-12/h of round-off; the roll centre's own differences, 5e-9, over h in the last row.
-        np.testing.assert_allclose(forward[:4, :, link, axis], expected[:4], rtol=0, atol=1e-7)
-        np.testing.assert_allclose(forward[4, :, link, axis], expected[4], rtol=0, atol=1e-5)
+        np.testing.assert_allclose(found[:4, :, link, axis], expected[:4], rtol=0, atol=1e-7)
+        np.testing.assert_allclose(found[4, :, link, axis], expected[4], rtol=0, atol=1e-5)
 
 
 @pytest.mark.slow  # two programs; both against the closure and the files' curves are in the quick run

@@ -45,7 +45,7 @@ def differences(function, step):
     return (a - 8 * b + 8 * c - d) / (12 * step)
 
 
-@pytest.mark.parametrize("name", some_quick(SCENES[:4], 2))
+@pytest.mark.parametrize("name", some_quick(SCENES[:4]))
 def test_curves_agree_with_the_closure(name, load):
     """Positions by SciPy's root of hand-written distances, motion ratios by its differences and by virtual work."""
     scene = document(name)

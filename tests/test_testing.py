@@ -250,7 +250,7 @@ class Level(Weight):
         return (6, 7)
 
 
-def test_wrong_potential_and_what_has_no_reaction():
+def test_wrong_potential():
     spring = SpringDamperLoad(*map(jnp.asarray, (POINT, AXIS, 3.0, 0.2, 0.4, 1.0)))
 
     def energy(factor):
@@ -262,8 +262,11 @@ def test_wrong_potential_and_what_has_no_reaction():
 
     assert check_force(spring, potential=energy(0.5))
     assert failed(check_force(spring, potential=energy(1.0))) == {("Q at rest", "given, −∂E/∂q")}
-    gravity = lg.Gravity((0.0, 0.0, -9.81))
-    assert check_force(gravity)
+
+
+@pytest.mark.slow  # small version: test_wrong_load
+def test_what_has_no_reaction_or_varies():
+    assert check_force(lg.Gravity((0.0, 0.0, -9.81)))
     assert failed(check_force(Level(jnp.asarray(2.0), jnp.asarray(AXIS)), balanced=False)) == {("Q", "elsewhere, 0")}
     assert check_force(lg.AppliedForce("b", at=POINT, force=AXIS, signal=lg.BumpRoad(height=0.1, duration=0.5)))
 

@@ -114,18 +114,17 @@ def linear_problem(scheme, num_steps, uneven=False):
     return scheme, states, parameters, *(random_like((Variation.none(states), parameters), rng) for _ in range(2))
 
 
+@pytest.mark.slow  # small version: test_depth, test_right_hand_sides_share_the_products
 @pytest.mark.parametrize(
     ("scheme", "uneven"),
-    some_quick(
-        [
-            (ALPHA, True),
-            (STABILIZED, False),
-            (ALPHA, False),
-            (lg.RadauIIA(), False),
-            (lg.RadauIIA(), True),
-            (lg.IndexReducedODE(), True),
-        ]
-    ),
+    [
+        (ALPHA, True),
+        (STABILIZED, False),
+        (ALPHA, False),
+        (lg.RadauIIA(), False),
+        (lg.RadauIIA(), True),
+        (lg.IndexReducedODE(), True),
+    ],
 )
 def test_the_linear_equations_with_rows_everywhere(scheme, uneven):
     """L δ = b and Lᵀ μ = c, empty steps among others: as the sweeps, to 6 steps × round-off × 1/βh² of 1e4."""

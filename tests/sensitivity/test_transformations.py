@@ -186,6 +186,7 @@ def test_closed_over_parameter_is_never_silently_constant(sensitivity, mode):
         mode(value)(3.0)
 
 
+@pytest.mark.slow  # small version: test_eager_gradients_share_their_programs
 def test_optimizer_loop_compiles_once():
     """A whole model is optimized; the update keeps every leaf's dtype and strong type."""
     traces = 0
@@ -215,6 +216,7 @@ def test_optimizer_loop_compiles_once():
     assert values[-1] < values[0]
 
 
+@pytest.mark.slow  # small version: test_one_factorization_for_all_parameters_and_criteria
 def test_one_unbatched_factorization_per_step():
     """Forward: one LU in Newton's loop, modified or full; each sweep: one for its block of four steps, whatever the
     number of parameters or criteria."""
