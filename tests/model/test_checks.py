@@ -103,7 +103,7 @@ def test_traced_numbers_end_a_run():
 
 
 def test_times_in_the_wrong_order():
-    trajectory = traced(scene(), -END)
+    trajectory = traced(scene(), -10 * END)
     assert trajectory.result == lg.RESULTS.invalid_numbers
     with pytest.raises(ValueError, match=says("`t1` is not later than `t0`", "Found: t0 = 0 s, t1 = -1 s")):
         lg.raise_if_failed(trajectory)
