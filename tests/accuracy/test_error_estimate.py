@@ -154,17 +154,25 @@ def test_bad_input():
         error_estimate(lg.simulate(build(P), t1=T1, num_steps=2))
 
 
-def test_what_is_not_by_the_scheme_is_nan_under_jit():
-    def trajectory(sizes):
-        return lg.simulate(build(P), t1=T1, num_steps=4, integrator=lg.GivenSteps(jnp.asarray(sizes)))
+def in_steps(*sizes):
+    return lg.simulate(build(P), t1=T1, num_steps=4, integrator=lg.GivenSteps(jnp.asarray(sizes)))
 
-    equal, uneven = trajectory([1.0, 1.0, 1.0, 1.0]), trajectory([2.0, 3.0, 2.0, 3.0])
+
+def test_what_is_not_by_the_scheme_is_nan_under_jit():
+    equal, uneven = in_steps(1.0, 1.0, 1.0, 1.0), in_steps(2.0, 3.0, 2.0, 3.0)
     traced = jax.jit(error_estimate)
     for found, expected in zip(jax.tree.leaves(traced(equal)), jax.tree.leaves(error_estimate(equal))):
         np.testing.assert_allclose(found, expected, rtol=1e-12)  # the same operations, fused otherwise
     assert all(jnp.isnan(leaf).all() for leaf in jax.tree.leaves(traced(uneven)))
     with pytest.raises(ValueError, match="in equal steps"):
         error_estimate(uneven)
+    given = error_estimate(uneven, lg.GivenSteps.of(uneven))
+    assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(given))
+
+
+@pytest.mark.slow  # small version: test_what_is_not_by_the_scheme_is_nan_under_jit
+def test_steps_that_are_given_under_jit():
+    uneven = in_steps(2.0, 3.0, 2.0, 3.0)
     grid = lg.GivenSteps.of(uneven)
     found = jax.jit(lambda run: error_estimate(run, grid))(uneven)
     for traced, expected in zip(jax.tree.leaves(found), jax.tree.leaves(error_estimate(uneven, grid))):

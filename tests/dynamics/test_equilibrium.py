@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import EPS, GRAVITY, close, some_quick
+from helpers import EPS, GRAVITY, close
 from scipy.optimize import brentq
 
 import lgsens as lg
@@ -210,6 +210,7 @@ def settled(car, lengths, rate):
     return jax.jvp(height, (rate,), (jnp.ones_like(rate),), has_aux=True)
 
 
+@pytest.mark.slow  # small versions: test_platform_on_two_springs, test_preloads_hold_the_car_at_its_design_position
 def test_quarter_car_rests_at_its_design_position(car, design):
     """On its hinge, with the free lengths that the preloads amount to."""
     model = design["hinged"][0]
@@ -228,6 +229,7 @@ def test_quarter_car_rests_at_its_design_position(car, design):
     assert np.abs(system.constraint(state.q, 0.0)).max() < 1e-13  # some hundred round-offs of 1 m
 
 
+@pytest.mark.slow  # small version: test_platform_on_two_springs
 def test_quarter_car_settles_on_a_spring_of_another_rate(car, design):
     lengths, k = free_lengths(car, design["hinged"][0]), car.spring.rate
     z, rate, _ = settled(car, lengths, 0.9 * k)
@@ -248,7 +250,8 @@ def test_pendulum_comes_to_hang(aside):
     close(state.q.position[0], [0.0, 0.0, -np.hypot(1.0, aside)], 32, scale=np.hypot(1.0, aside))
 
 
-@pytest.mark.parametrize("links", some_quick([3, 8]))
+@pytest.mark.slow  # small version: test_pendulum_comes_to_hang
+@pytest.mark.parametrize("links", [3, 8])
 def test_a_level_chain_hangs(links):
     """Links of 1 m on hinges, held at one end and level at first: nothing is stiff, and folded chains rest as well. It
     hangs along gravity, so its end turns with it, d x/dg_x = −(n − ½)/g_z."""

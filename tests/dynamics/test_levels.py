@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import rolling_disc
-from helpers import close, says, some_quick
+from helpers import close, says
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
@@ -28,7 +28,8 @@ from lgsens.testing import check_joint
 ZERO = np.zeros(())
 
 
-@pytest.mark.parametrize("ground", some_quick(["a", None]))
+@pytest.mark.slow  # small version: test_multiplier_rows_and_tangents
+@pytest.mark.parametrize("ground", ["a", None])
 def test_every_derivative_of_the_joint(ground):
     point = {"point": (0.3, 0.0, 0.1)} if ground else {}
     joint = lg.Rolling(

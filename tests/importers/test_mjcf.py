@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -131,11 +132,25 @@ def by_hand(mass=2.5, drive=0.7):
     return lg.Model(bodies, joints, forces)
 
 
+def test_the_loop_of_a_four_bar():
+    """A ball joint in a plane, closed where it is read."""
+    imported = lg.importers.mjcf(DATA / "four_bar.xml", ctrl=[0.7])
+    assert imported.report.loops == {"closure": "SphericalJoint"}
+    assert any("repeat others" in note for note in imported.report.notes)
+    system = imported.model.system()
+    q, v = system.reference()
+    violation, jacobian = jax.jit(lambda system: (system.constraint(q, 0.0), system.constraint_jacobian(q, 0.0)))(
+        system
+    )
+    assert np.abs(violation).max() < 1e-13 and np.abs(jacobian @ v).max() < 1e-13
+    rank = np.linalg.matrix_rank(jacobian, tol=1e-8)  # three bars and a rotor, one freedom
+    assert len(v) - rank == 1 and rank < len(jacobian)
+
+
+@pytest.mark.slow  # small versions: test_the_loop_of_a_four_bar, test_equalities_of_joints
 def test_four_bar_is_that_by_hand():
     """Accelerations at rest, in the plane; of MuJoCo to what its soft loop allows."""
     imported = lg.importers.mjcf(DATA / "four_bar.xml", ctrl=[0.7])
-    assert imported.report.loops == {"closure": "SphericalJoint"}
-    assert any("repeat others" in note for note in imported.report.notes)  # a ball joint in a plane
     (ours, _, _, of_ours), (own, _, _, of_own) = start(imported.model), start(by_hand())
     ours_at, own_at = ours.twists(of_ours), own.twists(of_own)
     assert np.abs(ours_at).max() > 1.0

@@ -68,8 +68,9 @@ def test_starts_on_a_damper_that_no_step_resolves():
     damper = lg.SpringDamper(None, "arm", at_a=(0.1, 0.02, 0.3), at_b=(0.1, 0, 0), stiffness=1e6, damping=1e5)
     forces = {"gravity": lg.Gravity((0, 0, -9.81)), "damper": damper}
     model = lg.Model({"arm": arm}, {"pivot": lg.SphericalJoint(None, "arm", at=(0, 0, 0))}, forces)
-    run, fine = (lg.simulate(model, t1=0.1, num_steps=n) for n in (100, 2000))
-    coarse, exact = (np.asarray(run.body("arm").position) for run in (run, fine))
+    # one program: of 2,000 steps, the first hundred of them as long as twenty
+    run = jax.jit(lambda t1: lg.simulate(model, t1=t1, num_steps=2000, throw=False).body("arm").position)
+    coarse, exact = np.asarray(run(2.0))[:101], np.asarray(run(0.1))
     moved = np.abs(exact - exact[0]).max()
     assert moved > 2e-3  # it swings on the damper
     assert np.abs(coarse - exact[::20]).max() < 2e-5 * moved  # (h w)²/12, w = 14 rad/s, and the h³ of the first step
@@ -129,7 +130,7 @@ def test_a_failed_step_ends_the_run():
 
 
 @pytest.mark.parametrize("factor_every", some_quick([7, 1, 1000]))
-@pytest.mark.parametrize("scene", [lambda: spinning_top(0.7), heavy_top, lambda: spatial_chain(2)])
+@pytest.mark.parametrize("scene", some_quick([heavy_top, lambda: spinning_top(0.7), lambda: spatial_chain(2)]))
 def test_modified_newton_is_full_newton(scene, factor_every):
     """The age of the matrix changes the iterations, not the motion; the heavy top turns 0.15 rad in a step."""
     full, modified = (

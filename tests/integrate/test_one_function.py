@@ -20,7 +20,11 @@ def psi(angle):
     return lg.time_integral(trajectory.t, trajectory.body("top").position[:, 0] ** 2)
 
 
-@pytest.mark.parametrize("scene", [lambda: spinning_top(0.7), lambda: QuarterCar.load().model(wheel="locked")])
+def car():
+    return QuarterCar.load().model(wheel="locked")
+
+
+@pytest.mark.parametrize("scene", [lambda: spinning_top(0.7), pytest.param(car, marks=pytest.mark.slow)])
 def test_an_iteration_has_neither_scatter_nor_factorization(scene):
     """Nor a triangular solve: what XLA does not make part of a function on a CPU."""
     from helpers import equations  # not found where this file is a program

@@ -45,6 +45,7 @@ def branched(links: int = 3) -> lg.Model:
 
 
 SCENES = {"chain": lambda: spatial_chain(9), "four_bar": four_bar, "branched": branched}
+SCENES |= {"one body": lambda: spinning_top(0.7)}
 
 
 def systems(name: str):
@@ -55,7 +56,7 @@ def systems(name: str):
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("chain", "four_bar")]
 
 
-@pytest.fixture(scope="module", params=["branched", *SLOW])
+@pytest.fixture(scope="module", params=["one body", "branched", *SLOW])
 def pair(request):
     """A system, dense and sparse, and a point off its constraints."""
     dense, sparse = systems(request.param)
@@ -104,16 +105,19 @@ def test_factors_solve_with_the_iteration_matrix_and_its_transpose(pair, kind):
     dense, sparse, point = pair
     scheme, rng = lg.GeneralizedAlpha(), np.random.default_rng(3)
     x = jnp.asarray(0.1 * rng.normal(size=len(point[1])))
-    factors = [
-        factorize_iteration_matrix(scheme, system, tangents(system, *point), mass, x, H, kind)
-        for system, mass in ((dense, dense.mass_matrix()), (sparse, sparse.sparse_mass_matrix()))
-    ]
     columns = [jnp.asarray(rng.normal(size=(size, 2))) for size in (len(point[1]), len(point[3]))]
-    for transposed in (False, True):
-        expected, actual = (np.concatenate(f.solve(*columns, transposed=transposed)) for f in factors)
+
+    @eqx.filter_jit
+    def solved(system, mass):
+        """As it is and transposed, of two columns and of one."""
+        factors = factorize_iteration_matrix(scheme, system, tangents(system, *point), mass, x, H, kind)
+        of = lambda *rhs: [jnp.concatenate(factors.solve(*rhs, transposed=transposed)) for transposed in (False, True)]
+        return of(*columns), of(*(c[:, 0] for c in columns))
+
+    expected, _ = solved(dense, dense.mass_matrix())
+    for wanted, actual, single in zip(expected, *solved(sparse, sparse.sparse_mass_matrix())):
         # the scaled matrix has a condition below 1e5 in these scenes
-        close(actual, expected, ulps=1e5)
-        single = np.concatenate(factors[1].solve(*(c[:, 0] for c in columns), transposed=transposed))
+        close(actual, wanted, ulps=1e5)
         close(single, actual[:, 0], ulps=1e4)
 
 
@@ -141,10 +145,16 @@ def test_levels_in_a_loop(first, kind):
     mass, jacobian = system.sparse_mass_matrix(), system.sparse_constraint_jacobian(q, 0.0)
     # not symmetric: K and its transpose exchange X and Y
     dynamic = mass + 0.3 * tangents(system, q, v, v, jnp.ones(jacobian.shape[0]), jnp.zeros(())).stiffness
-    factors = [Factors.of(dynamic, jacobian.T, jacobian, jnp.ones(()), plan=p, kind=kind) for p in (plan, looped)]
     columns = [jnp.asarray(rng.normal(size=(size, 2))) for size in (len(v), jacobian.shape[0])]
-    for transposed in (False, True):
-        expected, actual = (np.concatenate(f.solve(*columns, transposed=transposed)) for f in factors)
+
+    @eqx.filter_jit
+    def solved(dynamic, jacobian):
+        factors = [Factors.of(dynamic, jacobian.T, jacobian, jnp.ones(()), plan=p, kind=kind) for p in (plan, looped)]
+        return [
+            [jnp.concatenate(f.solve(*columns, transposed=transposed)) for f in factors] for transposed in (False, True)
+        ]
+
+    for transposed, (expected, actual) in zip((False, True), solved(dynamic, jacobian)):
         close(actual, expected, ulps=1e5)  # condition, as above
         b = jacobian.dense()
         full = np.block([[dynamic.dense(), b.T], [b, np.zeros((len(b), len(b)))]])
@@ -232,6 +242,7 @@ def test_gradient_of_every_number(name, body):
         np.testing.assert_allclose(actual, leaf, rtol=1e-7, atol=1e-8 * largest)
 
 
+@pytest.mark.slow  # small version: test_factors_solve_with_the_iteration_matrix_and_its_transpose[one body]
 def test_one_body():
     """Its only level leaves nothing for the LU of the rest."""
     top = spinning_top(0.7).system()

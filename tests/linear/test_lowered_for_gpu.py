@@ -51,10 +51,23 @@ class Program:
         return [loop for loop in self.loops if loop]
 
 
-def criterion(damping, integrator):
-    car = eqx.tree_at(lambda car: car.damper.rate, QuarterCar.load(), damping)
-    trajectory = lg.simulate(car.model(), t1=0.02, num_steps=8, integrator=integrator)
-    return lg.time_integral(trajectory.t, trajectory.body("chassis").acceleration[:, 2] ** 2)
+def car(damping):
+    return eqx.tree_at(lambda car: car.damper.rate, QuarterCar.load(), damping).model(), "chassis"
+
+
+def swing(damping):
+    """A bar on a hinge, on a damper."""
+    bar = lg.RigidBody(1.0, (0.1, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    hinge = lg.RevoluteJoint(None, "bar", at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+    ends = {"at_a": (1.0, 0.0, 1.0), "at_b": (1.0, 0.0, 0.0)}
+    damper = lg.SpringDamper(None, "bar", **ends, stiffness=10.0, damping=damping)
+    return lg.Model({"bar": bar}, {"hinge": hinge}, {"damper": damper}), "bar"
+
+
+def criterion(damping, scene, integrator):
+    model, body = scene(damping)
+    trajectory = lg.simulate(model, t1=0.02, num_steps=8, integrator=integrator)
+    return lg.time_integral(trajectory.t, trajectory.body(body).acceleration[:, 2] ** 2)
 
 
 NEWTON = [[[], []]]  # rounds: a new matrix where one is due; iterations
@@ -63,19 +76,25 @@ SWEEP = [[]]  # blocks of steps: steps
 
 
 @pytest.mark.parametrize(
-    "integrator, step",
-    some_quick([(lg.GeneralizedAlpha(), NEWTON), (lg.GeneralizedAlpha(iterations=4), FIXED)]),
-    ids=["until converged", "fixed iterations"],
+    "scene, integrator, step",
+    some_quick(
+        [
+            (swing, lg.GeneralizedAlpha(), NEWTON),
+            (car, lg.GeneralizedAlpha(), NEWTON),
+            (car, lg.GeneralizedAlpha(iterations=4), FIXED),
+        ]
+    ),
+    ids=["small", "until converged", "fixed iterations"],
 )
-def test_loops_over_steps_are_those_of_newton_and_of_the_sweep(integrator, step):
-    program = Program(jax.value_and_grad(lambda damping: criterion(damping, integrator)), "cuda")
+def test_loops_over_steps_are_those_of_newton_and_of_the_sweep(scene, integrator, step):
+    program = Program(jax.value_and_grad(lambda damping: criterion(damping, scene, integrator)), "cuda")
     assert program.nested == [step, SWEEP]
     assert program.calls <= OF_A_GPU
 
 
 def test_loops_over_rows_are_seen():
     """On a CPU there are some: it takes them at once, and LAPACK."""
-    program = Program(lambda damping: criterion(damping, lg.GeneralizedAlpha()), "cpu")
+    program = Program(lambda damping: criterion(damping, swing, lg.GeneralizedAlpha()), "cpu")
     (step,) = program.nested
     assert step != NEWTON
     assert any("lapack" in call for call in program.calls)

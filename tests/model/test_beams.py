@@ -10,8 +10,10 @@ import pytest
 import scipy.integrate
 import scipy.linalg
 import scipy.optimize
+from helpers import central_difference, close, moved
 
 import lgsens as lg
+from lgsens.model import load_tangents
 from lgsens.testing import check_force
 
 STEEL = {"young": 2.1e11, "poisson": 0.3, "density": 7850.0}
@@ -43,15 +45,15 @@ def potential(load, a, b, t):
     return load.length * (load.preload @ strain + 0.5 * strain @ load.stiffness @ strain)
 
 
-def test_element_is_the_gradient_of_its_energy():
-    """Also tangents, action and reaction, damping that takes energy, and derivatives by every number."""
+def element():
+    """With axes that are not those of its bodies, and a preload."""
     rotation = lambda w: lg.liegroups.SO3().exp(jnp.asarray(w))
     bodies = {
         "a": lg.RigidBody(1.0, (1.0, 1.0, 1.0), (0.1, 0.0, 0.2), rotation([0.3, -0.2, 0.1])),
         "b": lg.RigidBody(1.0, (1.0, 1.0, 1.0), (0.9, 0.1, -0.1), rotation([-0.1, 0.4, 0.2])),
     }
     axes = {"axes_a": rotation([0.1, 0.2, 0.0]), "axes_b": rotation([0.2, 0.1, 0.3])}
-    element = lg.BeamElement(
+    beam = lg.BeamElement(
         "a",
         "b",
         at_a=[0.2, 0.1, 0.0],
@@ -60,8 +62,37 @@ def test_element_is_the_gradient_of_its_energy():
         section=UNIT,
         preload=[0.3, -0.1, 0.2, 0.1, -0.2, 0.1],
     )
-    report = check_force(element, potential=potential, bodies=bodies, length=0.3)
+    return bodies, beam
+
+
+@pytest.mark.slow  # small version: test_tangents_of_an_element
+def test_element_is_the_gradient_of_its_energy():
+    """Also tangents, action and reaction, damping that takes energy, and derivatives by every number."""
+    bodies, beam = element()
+    report = check_force(beam, potential=potential, bodies=bodies, length=0.3)
     assert report.passed, report
+
+
+def test_tangents_of_an_element():
+    """Those of its force by autodiff, which at rest is the gradient of its energy."""
+    bodies, beam = element()
+    ((load, *_),) = beam.loads(bodies)
+    rng, t, zero = np.random.default_rng(0), jnp.zeros(()), jnp.zeros(12)
+    frames = [moved(body.frame, 0.2 * rng.normal(size=6)) for body in bodies.values()]
+
+    @jax.jit
+    def given_and_expected(load, a, b, v):
+        displaced = lambda x: (moved(a, x[:6]), moved(b, x[6:]))
+        force = lambda x, v: load.force(*displaced(x), v[:6], v[6:], t)
+        given = load_tangents(load, a, b, v[:6], v[6:], t)
+        return given, (jax.jacfwd(force)(zero, v), jax.jacfwd(force, 1)(zero, v)), force(zero, zero)
+
+    given, expected, at_rest = given_and_expected(load, *frames, jnp.asarray(rng.normal(size=12)))
+    for found, wanted in zip(given, expected):
+        close(found, wanted, 200)  # some ten products
+    energy = jax.jit(lambda x: potential(load, *(moved(f, p) for f, p in zip(frames, jnp.split(x, 2))), t))
+    # of third derivatives of up to 10 4e-11; round-off of the root of H is 64 ε, and over a step of 6e-6
+    np.testing.assert_allclose(at_rest, -central_difference(energy, 12), rtol=0, atol=4e-9)
 
 
 def tip(model, node):
@@ -225,7 +256,7 @@ def test_free_flight_keeps_momenta():
         {},
         beam.forces,
     )
-    run = lg.simulate(still, t1=1.0, num_steps=20)
+    run = lg.simulate(still, t1=1.0, num_steps=100)
     assert np.abs(run.force("b.1").strain).max() < 1e-13  # positions of 3 m to round-off
     kicked = with_velocity(still, "b.3", jnp.asarray([0.0, 5.0, 1.0]))
     run = lg.simulate(kicked, t1=1.0, num_steps=100)

@@ -1,5 +1,6 @@
 """Bushings along axes of their own, and how many of them share a load at rest."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -31,18 +32,18 @@ def test_six_rates_along_its_axes():
     loaded = lg.Bushing(None, "b", at=(0, 0, 0), axes=AXES, preload=preload, rotational_preload=moment, **RATES)
     (attached,), (more,) = (one.loads({"b": body}) for one in (bushing, loaded))
     ground = Frame(jnp.zeros(3), jnp.eye(3))
-    tangents = load_tangents(attached.load, ground, body.frame, rest, rest, 0.0)
+    tangents = jax.jit(load_tangents)(attached.load, ground, body.frame, rest, rest, 0.0)
     whole = lambda rates, about: np.block(
         [[(r * rates) @ r.T, np.zeros((3, 3))], [np.zeros((3, 3)), (r * about) @ r.T]]
     )
     close(-tangents.position[6:, 6:], whole(K, K_R), 50)
     close(-tangents.velocity[6:, 6:], whole(C, C_R), 50)
+    force = jax.jit(lambda load, frame: load.force(ground, frame, rest, rest, 0.0)[6:])
     for i, e in enumerate(r.T):
         turned = Frame(jnp.asarray(0.1 * e), jnp.asarray(Rotation.from_rotvec(0.7 * e).as_matrix()))
         expected = np.concatenate([-0.1 * K[i] * e, -0.7 * K_R[i] * e])
-        close(attached.load.force(ground, turned, rest, rest, 0.0)[6:], expected, 100)
-    at_rest = more.load.force(ground, body.frame, rest, rest, 0.0)[6:]
-    close(at_rest, -np.concatenate([r @ preload, r @ moment]), 50)
+        close(force(attached.load, turned), expected, 100)
+    close(force(more.load, body.frame), -np.concatenate([r @ preload, r @ moment]), 50)
 
 
 @pytest.mark.parametrize("axes", [[[1.0, 0.0, 0.0], [-2.0, 0.0, 0.0]], np.zeros((2, 3))])

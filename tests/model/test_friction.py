@@ -47,7 +47,11 @@ SPIN, SPEED, MOMENT = np.array([3.0, -2.0, 1.0]), 0.7, 1.3
 ARM_RATES = (3.0, -2.0)
 
 
-def rubbing(solver=None):
+EVERY = ("block", "wheel", "sleeve", "ball", "puck", "cross")
+FEW = ("block", "ball")
+
+
+def rubbing(names=EVERY, solver=None):
     body = lambda y, **more: lg.RigidBody(MASS, INERTIA, position=(0.0, y, 0.0), **more)
     spinning = lambda e: {"angular_velocity": tuple(5.0 * np.array(e))}
     bodies = {
@@ -67,9 +71,10 @@ def rubbing(solver=None):
         "puck": lg.PlanarJoint(None, "puck", at=at(4.0), axis=Z),
         "cross": lg.UniversalJoint(None, "cross", at=at(5.0), axis_a=X, axis_b=Y),
     }
-    options = {name: {"radius": RADIUS} for name in joints} | {"block": {"arm": ARM}}
-    options["wheel"] |= {"viscous": VISCOUS, "preload": 3.0}
-    forces = {f"{name} rubs": lg.JointFriction(name, **LAW, **options[name]) for name in joints}
+    bodies, joints = ({name: own[name] for name in names} for own in (bodies, joints))
+    options = {"block": {"arm": ARM}, "wheel": {"radius": RADIUS, "viscous": VISCOUS, "preload": 3.0}}
+    of = lambda name: options.get(name, {"radius": RADIUS})
+    forces = {f"{name} rubs": lg.JointFriction(name, **LAW, **of(name)) for name in joints}
     forces |= {
         "gravity": lg.Gravity((0.0, 0.0, -G)),
         "tilt": lg.AppliedForce("block", moment=(0.0, MOMENT, 0.0)),
@@ -83,8 +88,9 @@ def rubbed(load, slip):
     return -MU * load * slip / np.sqrt(slip @ slip + W_0**2)
 
 
-def test_accelerations_of_what_rubs():
-    model = rubbing()
+@pytest.mark.parametrize("names", some_quick([(FEW,), (EVERY,)]))
+def test_accelerations_of_what_rubs(names):
+    model = rubbing(names)
     state = eqx.filter_jit(lg.initial_state)(model)
     found = dict(zip(model.system().body_names, np.asarray(state.vdot).reshape(-1, 6)))
     weight, free = MASS * G, np.zeros(3)
@@ -104,14 +110,16 @@ def test_accelerations_of_what_rubs():
         *(RADIUS * rubbed(weight, RADIUS * np.array(ARM_RATES)) / INERTIA[:2]),
         np.prod(ARM_RATES),
     ]
-    for name, rates in expected.items():
-        np.testing.assert_allclose(found[name], rates, rtol=1e-10, atol=1e-10)  # condition of 1e5 round-offs
+    for name in names:
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-10, atol=1e-10)  # condition of 1e5 round-offs
 
 
-@pytest.mark.parametrize("solver", some_quick([lg.DenseLU(), lg.BlockSparse()]))
-def test_forces_by_multipliers(solver):
+@pytest.mark.parametrize(
+    ("names", "solver"), some_quick([(FEW, lg.DenseLU()), (EVERY, lg.DenseLU()), (EVERY, lg.BlockSparse())])
+)
+def test_forces_by_multipliers(names, solver):
     """∂r/∂λ is that of the residual by differences, which Jᵀ is not; nothing else makes it of another kind."""
-    system = rubbing(solver).system()
+    system = rubbing(names, solver).system()
     q, v = system.reference()
     lam = jnp.asarray(np.random.default_rng(0).uniform(3.0, 5.0, len(system.constraint_names)))
     jacobian, t = system.constraint_jacobian(q, 0.0), jnp.zeros(())

@@ -218,6 +218,7 @@ def test_spring_damper_with_curves():
     close(residual(more), (3.0 - 10.0 * 0.5 - 50.0 * 0.125) * np.array([0.0, 0.6, 0.8]), 20)
 
 
+@pytest.mark.slow  # small versions: test_tangents_equal_autodiff[curve], test_spring_damper_with_curves
 def test_every_number_of_spring_and_damper_curves():
     """Points and values of the curves, ends, free length and preload: derivatives, balance, dissipation."""
     spring = lg.Sampled((-1.0, -0.2, 0.3, 1.0), (-5.0, -1.0, 1.0, 9.0), "monotone")

@@ -115,7 +115,7 @@ def test_names_leaves_and_structure_are_those_of_the_model(scenes):
     separate, merged = scenes
     assert [leaf.shape for leaf in jax.tree.leaves(merged)] == [leaf.shape for leaf in jax.tree.leaves(separate)]
     assert set(merged.bodies) == set(BODIES) | set("ghi")
-    gradient = jax.grad(lambda model: model.system().mass_matrix().sum())(merged)
+    gradient = jax.jit(jax.grad(lambda model: model.system().mass_matrix().sum()))(merged)
     assert isinstance(gradient, lg.Model) and gradient.merge_fixed
 
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import close, says
+from helpers import close, moved, random_rotation, says
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
@@ -40,12 +40,28 @@ JOINTS = {
 }
 
 
-QUICK = ("rack by a curve",)
-
-
-@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in JOINTS])
+@pytest.mark.slow  # small version: test_tangents_of_a_rack
+@pytest.mark.parametrize("name", JOINTS)
 def test_joints_are_what_they_say(name):
     check_joint(JOINTS[name], t=0.7).raise_if_failed()
+
+
+def test_tangents_of_a_rack():
+    """B, Bᵀλ and K = ∂(Bᵀλ)/∂x in closed form, with the bend of its curve, against autodiff of Φ."""
+    rng, t, lam, zero = np.random.default_rng(0), jnp.asarray(0.7), jnp.array([1.3]), jnp.zeros(12)
+    ends = [Frame(jnp.asarray(rng.normal(size=3)), jnp.asarray(random_rotation(rng))) for _ in "ab"]
+    (element,) = JOINTS["rack by a curve"].constraints(*ends)
+
+    @jax.jit
+    def closed_and_differentiated(a, b):
+        displaced = lambda x, a=a, b=b: (moved(a, x[:6]), moved(b, x[6:]))
+        jacobian = lambda a, b: jax.jacfwd(lambda x: element.value(*displaced(x, a, b), t))(zero)
+        stiffness = jax.jacfwd(lambda x: lam @ jacobian(*displaced(x)))(zero)
+        closed = element.jacobian(a, b, t), element.force(a, b, lam, t), element.geometric_stiffness(a, b, lam, t)
+        return closed, (jacobian(a, b), lam @ jacobian(a, b), stiffness)
+
+    for found, expected in zip(*closed_and_differentiated(*(moved(end, rng.normal(size=6)) for end in ends))):
+        close(found, expected, 200)  # some ten products of matrices
 
 
 def test_values_over_many_turns():

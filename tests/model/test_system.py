@@ -42,6 +42,7 @@ def system():
 ULPS = 500
 
 
+@pytest.mark.slow  # small version: test_tangents_equal_central_differences
 @pytest.mark.parametrize("seed", range(3))
 def test_tangents_equal_autodiff(system, seed):
     point = random_point(system, np.random.default_rng(seed))

@@ -24,7 +24,8 @@ JOINTS = {
 }
 
 
-@pytest.mark.parametrize("name", some_quick(JOINTS))
+@pytest.mark.slow  # small versions: test_accelerations_of_the_workshop, test_ratios.py::test_tangents_of_a_rack
+@pytest.mark.parametrize("name", JOINTS)
 def test_joints_are_what_they_say(name):
     check_joint(JOINTS[name]).raise_if_failed()
 

@@ -300,8 +300,8 @@ def test_sensitivities_along_a_trajectory():
         return lg.simulate(spinning_top(alpha), t1=0.3, num_steps=30)
 
     alpha, h = jnp.asarray(0.7), 3e-5
-    trajectory, derivative = jax.jvp(motion, (alpha,), (jnp.ones(()),))
-    ahead, behind = motion(alpha + h), motion(alpha - h)
+    run = jax.jit(lambda alpha: jax.jvp(motion, (alpha,), (jnp.ones(()),)))
+    (trajectory, derivative), (ahead, _), (behind, _) = (run(alpha + s) for s in (0.0, h, -h))
     fig = plotting.sensitivities(trajectory, derivative, "α₀ [rad]")
     titles = [axes.get_title() for axes in fig.axes]
     assert titles == [

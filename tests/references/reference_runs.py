@@ -47,6 +47,13 @@ def runs(name: str) -> tuple[Evaluation, Evaluation]:
     return coarse, fine
 
 
+def first_quarter(name: str) -> list[lg.Trajectory]:
+    """The motion alone, over a quarter of the time of the problem: at its own step and at half of it."""
+    problem = PROBLEMS[name]
+    simulate = lambda n: problem.simulate(problem.parameters, t1=problem.t1 / 4, num_steps=n)
+    return [simulate(factor * problem.num_steps // 4) for factor in (1, 2)]
+
+
 def extrapolated(coarse, fine):
     """Richardson: the h² parts cancel."""
     return (4 * np.asarray(fine) - np.asarray(coarse)) / 3
@@ -81,19 +88,19 @@ def check_criteria(name: str):
             assert abs(order - 2.0) <= ORDER, f"{entry}: order {order:.3f}, errors {errors[:, i]}"
 
 
-def check_states(name: str, states, observe, expect):
-    """The states of the file: `observe(trajectory)` and `expect(state)` give the same quantities by name.
+def check_states(name: str, states, observe, expect, trajectories=None):
+    """The states of the file: `observe(trajectory)` and `expect(state)` give the same quantities by name; as far as the
+    trajectories go, those of `runs` or two others.
 
     Each quantity by its largest error over its components and the times, which is of second order, and of which
     extrapolation leaves a tenth at most, wherever the largest error is.
     """
-    problem = PROBLEMS[name]
     observe = jax.jit(observe)  # one compilation instead of one for every operation
     coarse, fine = (
-        (np.asarray(run.trajectory.t), {key: np.asarray(value) for key, value in observe(run.trajectory).items()})
-        for run in runs(name)
+        (np.asarray(trajectory.t), {key: np.asarray(value) for key, value in observe(trajectory).items()})
+        for trajectory in trajectories or [run.trajectory for run in runs(name)]
     )
-    states = [state for state in states if 0 < state["t"] <= problem.t1]
+    states = [state for state in states if 0 < state["t"] < fine[0][-1] * (1.0 + 1e-12)]
     assert states
     wanted = {key: np.stack([expect(state)[key] for state in states]) for key in expect(states[0])}
     assert wanted.keys() == coarse[1].keys()
@@ -110,9 +117,9 @@ def check_states(name: str, states, observe, expect):
         assert left <= ORDER * errors[1], f"{key}: {left:.2e} left by extrapolation of {errors[1]:.2e}"
 
 
-def check_invariants(name: str, observe, wanted):
+def check_invariants(name: str, observe, wanted, trajectories=None):
     """The largest departure of conserved quantities from their exact values, over all times, is of second order."""
-    coarse, fine = map(jax.jit(observe), [run.trajectory for run in runs(name)])
+    coarse, fine = map(jax.jit(observe), trajectories or [run.trajectory for run in runs(name)])
     assert coarse.keys() == wanted.keys()
     for key, value in wanted.items():
         errors = [float(np.abs(np.asarray(found[key]) - value).max()) for found in (coarse, fine)]

@@ -5,7 +5,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference_runs import check_criteria, check_invariants, check_states, document, extrapolated, rotation, runs
+from reference_runs import (
+    check_criteria,
+    check_invariants,
+    check_states,
+    document,
+    extrapolated,
+    first_quarter,
+    rotation,
+    runs,
+)
 
 import lgsens as lg
 from lgsens.examples import PROBLEMS, free_rigid_body, heavy_top
@@ -23,7 +32,15 @@ LONG = (  # as others, at other numbers
     "heavy_top_bruls2012.to_2s",
     "lagrange_top_analytic.nutating",
     "lagrange_top_analytic.simo_wong",
+    "free_rigid_body.asymmetric",
+    "free_rigid_body.dzhanibekov",
+    "free_rigid_body.symmetric_kynema",
 )
+
+
+def in_part(first, *others):
+    """Cases of a motion, and whether of its first quarter: that of the first ones in the quick run."""
+    return [*((case, True) for case in first), *(pytest.param(c, False, marks=pytest.mark.slow) for c in others)]
 
 
 @pytest.mark.parametrize(
@@ -82,11 +99,11 @@ def test_motion_of_the_heavy_top():
     check_invariants(name, energy_of_top(PROBLEMS[name].parameters), {"energy": HEAVY["states"][0]["energy"]})
 
 
-@pytest.mark.parametrize("case", [pytest.param("nutating", marks=pytest.mark.slow), "simo_wong"])
-def test_motion_of_the_lagrange_top(case):
+@pytest.mark.parametrize(("case", "quarter"), in_part(["simo_wong"], "nutating", "simo_wong"))
+def test_motion_of_the_lagrange_top(case, quarter):
     """The closed form, and its three integrals: energy, vertical angular momentum, spin."""
     name = f"lagrange_top_analytic.{case}"
-    p = PROBLEMS[name].parameters
+    p, trajectories = PROBLEMS[name].parameters, first_quarter(name) if quarter else None
     about_pivot = p["J1"] + p["m"] * p["l"] ** 2  # A
 
     def observe(trajectory):
@@ -109,14 +126,16 @@ def test_motion_of_the_lagrange_top(case):
             "vertical momentum": jnp.sum(body.orientation[:, 2] * momentum, axis=1),
         }
 
-    check_states(name, LAGRANGE["states"][case], observe, expect)
+    check_states(name, LAGRANGE["states"][case], observe, expect, trajectories)
     vertical, potential = np.cos(p["theta0"]), p["m"] * p["g"] * p["l"] * np.cos(p["theta0"])
     wanted = {"energy": p["J3"] * p["w3"] ** 2 / 2 + potential, "vertical momentum": p["J3"] * p["w3"] * vertical}
-    check_invariants(name, integrals, wanted)
+    check_invariants(name, integrals, wanted, trajectories)
 
 
-@pytest.mark.parametrize("case", ["asymmetric", "dzhanibekov", "symmetric_kynema"])
-def test_motion_of_the_free_body(case):
+@pytest.mark.parametrize(
+    ("case", "quarter"), in_part(["asymmetric", "symmetric_kynema"], "asymmetric", "dzhanibekov", "symmetric_kynema")
+)
+def test_motion_of_the_free_body(case, quarter):
     """The closed form of Euler's equations; spatial angular momentum and energy are tested with the integrator."""
 
     def observe(trajectory):
@@ -126,7 +145,8 @@ def test_motion_of_the_free_body(case):
     def expect(state):
         return {"R": np.array(state["R"]), "Omega": np.array(state["Omega_closed_form"])}
 
-    check_states(f"free_rigid_body.{case}", FREE["states"][case], observe, expect)
+    name = f"free_rigid_body.{case}"
+    check_states(name, FREE["states"][case], observe, expect, first_quarter(name) if quarter else None)
 
 
 def test_published_sensitivity_of_the_paper():
@@ -173,12 +193,10 @@ def heavy_runs():
     model = heavy_top()
     state = lg.initial_state(model)
     theirs = jnp.array([0.0, 0.0, -0.654, -692.307, 0.0, 0.0])  # dynamic_heavy_top.cpp
-    found = []
-    for num_steps in (10000, 20000):
-        run = jax.jit(lambda s, n=num_steps: lg.simulate(model, t1=2.0, num_steps=n, state0=s))
-        starts = (started_with(state, theirs), state)
-        found.append([np.asarray(run(start).body("top").position[-1]) for start in starts])
-    return np.array(found)
+    # one program: 20,000 steps, of which the first half at twice the step
+    run = jax.jit(lambda s, t1: lg.simulate(model, t1=t1, num_steps=20000, state0=s).body("top").position)
+    starts = (started_with(state, theirs), state)
+    return np.array([[np.asarray(run(start, t1)[n]) for start in starts] for t1, n in ((4.0, 10000), (2.0, 20000))])
 
 
 def test_published_position_of_the_heavy_top(heavy_runs):
