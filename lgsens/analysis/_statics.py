@@ -104,7 +104,7 @@ def statics(
             f"{sorted(factored)}. One equilibrium is `lgsens.equilibrium(model)`."
         )
     shape, names = of_one_length(given, ", `loads` as well"), list(given)
-    wrong = [at for at in starts if not 0 <= at < shape[0]]
+    wrong = [at for at in starts if not (isinstance(at, int | np.integer) and 0 <= at < shape[0])]
     if wrong:
         raise ValueError(f"`starts` must be indices of the {shape[0]} points, got {wrong}.")
     directions = [rates] if rates is None or isinstance(rates, Mapping) else list(rates)
