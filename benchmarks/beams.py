@@ -1,17 +1,19 @@
 """Beams: what elements cost, how fast they converge, and which links of a suspension have to bend.
 
-    python benchmarks/beams.py [--elements 8 32 128 256] [--repeats 5] [--exudyn] [--picture] [--out benchmarks/results]
+    python benchmarks/beams.py [--elements 8 32 128 256] [--repeats 5] [--exudyn] [--compile] [--picture]
+        [--out benchmarks/results]
 
 Cost: a beam on a hinge falls, h = 1 ms; the gradient is that of the height of its tip by the stiffnesses of its
-section, in reverse mode. Time per step as in chain.py, the difference of two runs; to compile, the least processor time
-of two programs. Convergence: the Princeton beam, loaded at 45° by 8.896 N, its tip against that of 16 and 32 elements
-extrapolated. Links: the five-link quarter-car with its strut, which carries spring and damper, and its trailing arm as
-steel tubes of 30 × 3 mm in four elements each; what bending changes of its comfort and the gradient, predicted by one
-program of the rich scene and run. Writes beams.json and prints tables, and draws beams.png: an anti-roll bar before and
-under a load, in the colours of its stress.
+section, in reverse mode. Time per step as in chain.py, the difference of two runs. Convergence: the Princeton beam,
+loaded at 45° by 8.896 N, its tip against that of 16 and 32 elements extrapolated. Links: the five-link quarter-car with
+its strut, which carries spring and damper, and its trailing arm as steel tubes of 30 × 3 mm in four elements each; what
+bending changes of its comfort and the gradient, predicted by one program of the rich scene and run. Writes beams.json
+and prints tables, and draws beams.png: an anti-roll bar before and under a load, in the colours of its stress.
 
-With `--picture` that picture alone. With `--exudyn` this alone: the simulation beside the fastest program of Exudyn's
-geometrically exact beam (`rival_beams.py`), timed in the same rounds on the same beam without damping. It joins what
+With `--picture` that picture alone. With `--compile` the time to compile the first and the last number of elements
+alone: processor time to trace, lower and compile, in processes of their own without a cache, taken in turns, to be run
+on one core (`taskset -c 0`). With `--exudyn` this alone: the simulation beside the fastest program of Exudyn's
+geometrically exact beam (`rival_beams.py`), timed in the same rounds on the same beam without damping. Both join what
 beams.json has already.
 """
 
@@ -20,6 +22,8 @@ import json
 import math
 import os
 import statistics
+import subprocess
+import sys
 import time
 
 import rival_beams
@@ -27,6 +31,7 @@ from benchmark import SINGLE_THREAD, circumstances, environment, interleaved, op
 from rival_beams import GRAVITY, INERTIA, LENGTH, MASS, STIFFNESS
 
 STEPS, H = (20, 100), 1e-3
+NAMES = ("simulate", "gradient")
 STEEL = {"young": 2.1e11, "poisson": 0.3, "density": 7850.0}
 
 
@@ -41,20 +46,57 @@ def height(stiffness, elements: int, steps: int, damping: float):
     return lg.simulate(model, t1=steps * H, num_steps=steps).body(beam.nodes[-1]).position[-1, 1]
 
 
+def lowered(name: str, elements: int, steps: int):
+    """The program of the height, or of its gradient."""
+    import jax
+    import jax.numpy as jnp
+
+    function = {"simulate": height, "gradient": jax.grad(height)}[name]
+    return jax.jit(function, static_argnums=(1, 2, 3)).lower(jnp.array(STIFFNESS), elements, steps, 1e-4)
+
+
+def compilation(sizes: list[int], repeats: int) -> dict:
+    """Processor times of processes of their own, in turns: a machine is not as fast in one minute as in the next."""
+    times = {(elements, name): [] for elements in sizes for name in NAMES}
+    for _ in range(repeats):
+        for (elements, name), taken in times.items():
+            command = [sys.executable, __file__, "--elements", str(elements), "--one", name]
+            own = os.environ | SINGLE_THREAD | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
+            taken.append(float(subprocess.check_output(command, env=own, text=True)))
+            print(f"{elements} elements, {name}: {taken[-1]:.1f} s", flush=True)
+    rows = [{"elements": elements, "program": name, "cpu_s": taken} for (elements, name), taken in times.items()]
+    return {"environment": environment(SINGLE_THREAD), "rows": rows}
+
+
+def compile_table(found: dict) -> list[str]:
+    lines = ["", "| elements | program | trace, lower and compile [s of processor]: median | least | largest |"]
+    lines += ["|---|---|---|---|---|"]
+    lines += [
+        f"| {row['elements']} | {row['program']} | {statistics.median(row['cpu_s']):.1f} | {min(row['cpu_s']):.1f} "
+        f"| {max(row['cpu_s']):.1f} |"
+        for row in found["rows"]
+    ]
+    few, *_, many = sorted({row["elements"] for row in found["rows"]})
+    taken = {(row["elements"], row["program"]): row["cpu_s"] for row in found["rows"]}
+    ratio = lambda by, name: by(taken[many, name]) / by(taken[few, name])
+    said = [f"{name} {ratio(statistics.median, name):.2f} and {ratio(min, name):.2f}" for name in NAMES]
+    count = len(taken[few, NAMES[0]])
+    lines += ["", f"{many} elements over {few}, medians and least of {count} processes: {', '.join(said)}."]
+    lines += ["", circumstances(found["environment"])]
+    return lines
+
+
 def cost(elements: int, repeats: int) -> dict:
     import jax
     import jax.numpy as jnp
 
     stiffness, found, calls = jnp.array(STIFFNESS), {"elements": elements}, {}
-    for steps, (name, function) in itertools.product(STEPS, (("simulate", height), ("gradient", jax.grad(height)))):
-        started = time.process_time()
-        compiled = jax.jit(function, static_argnums=(1, 2, 3)).lower(stiffness, elements, steps, 1e-4).compile()
-        taken = time.process_time() - started
-        found[f"{name}_compile_s"] = min(taken, found.get(f"{name}_compile_s", taken))
+    for steps, name in itertools.product(STEPS, NAMES):
+        compiled = lowered(name, elements, steps).compile()
         calls[name, steps] = lambda compiled=compiled: jax.block_until_ready(compiled(stiffness))
         calls[name, steps]()
     times = interleaved(calls, repeats, seconds=3.0)
-    for name in ("simulate", "gradient"):
+    for name in NAMES:
         few, many = (times[name, steps].wall for steps in STEPS)
         taken = statistics.median(long - short for short, long in zip(few, many))
         found[f"{name}_us_per_step"] = taken / (STEPS[1] - STEPS[0]) * 1e6
@@ -156,11 +198,10 @@ def picture(path) -> None:
 
 def table(document: dict) -> str:
     lines = [circumstances(document["environment"]), ""]
-    lines += ["| elements | simulate [µs/step] | with gradient [µs/step] | compile: simulate, gradient [s] |"]
-    lines += ["|---|---|---|---|"]
+    lines += ["| elements | simulate [µs/step] | with gradient [µs/step] |"]
+    lines += ["|---|---|---|"]
     lines += [
-        f"| {row['elements']} | {row['simulate_us_per_step']:.0f} | {row['gradient_us_per_step']:.0f} "
-        f"| {row['simulate_compile_s']:.1f}, {row['gradient_compile_s']:.1f} |"
+        f"| {row['elements']} | {row['simulate_us_per_step']:.0f} | {row['gradient_us_per_step']:.0f} |"
         for row in document["cost"]
     ]
     for short, long in itertools.pairwise(document["cost"]):
@@ -173,12 +214,8 @@ def table(document: dict) -> str:
             f"\nSlope from {short['elements']} to {long['elements']} elements: simulate {slopes[0]:.2f}, with gradient "
             f"{slopes[1]:.2f}."
         )
-    first, last = document["cost"][0], document["cost"][-1]
-    longer = [last[f"{name}_compile_s"] / first[f"{name}_compile_s"] for name in ("simulate", "gradient")]
-    lines.append(
-        f"\nProcessor time to trace and compile {last['elements']} elements over that for {first['elements']}: "
-        f"simulate {longer[0]:.2f}, with gradient {longer[1]:.2f}."
-    )
+    if "compile" in document:
+        lines += compile_table(document["compile"])
     lines += ["", "| elements | error of the tip, over its deflection |", "|---|---|"]
     lines += [f"| {row['elements']} | {row['error']:.1e} |" for row in document["convergence"]]
     lines += ["", "| rigid | of Ψ, predicted | run | of dΨ/dp, predicted | run |", "|---|---|---|---|---|"]
@@ -209,6 +246,8 @@ def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--elements", nargs="+", type=int, default=[8, 32, 128, 256])
     parser.add_argument("--exudyn", action="store_true", help="beside Exudyn, nothing else; skipped without it")
+    parser.add_argument("--compile", action="store_true", help="time to compile, nothing else")
+    parser.add_argument("--one", choices=NAMES, help="compiles one program in this process, and prints the time")
     parser.add_argument("--picture", action="store_true", help="draws beams.png, nothing else")
     arguments = parser.parse_args()
     path = arguments.out / "beams.json"
@@ -216,10 +255,22 @@ def main() -> None:
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    if arguments.one:
+        import lgsens  # noqa: F401  imports are no part of it
+
+        started = time.process_time()
+        lowered(arguments.one, arguments.elements[0], STEPS[1]).compile()
+        print(time.process_time() - started)
+        return
     if arguments.picture:
         picture(path.with_suffix(".png"))
         return
     document: dict = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    if arguments.compile:
+        document["compile"] = compilation([arguments.elements[0], arguments.elements[-1]], arguments.repeats)
+        write(path, document)
+        print("\n".join(compile_table(document["compile"])))
+        return
     if arguments.exudyn:
         if not rival_beams.available():
             print("Exudyn is not installed (benchmarks/requirements.txt); skipped.")

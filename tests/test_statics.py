@@ -165,6 +165,7 @@ def test_out_of_reach():
         ({"loads": {"push": 1.0}}, says("must hold vectors of one length", "()")),
         ({"rates": {"pull": 1.0}}, says("`rates`: ['pull'] are not among the driven ones ['push']")),
         ({"starts": (9,)}, says("`starts` must be indices of the 7 points, got [9]")),
+        ({"starts": [(3,)]}, says("`starts` must be indices of the 7 points, got [(3,)]")),
         ({"model": 3.0}, says("`model` must be a Model, got float")),
     ],
 )
