@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import GRAVITY, close, equations, random_body, says, some_quick
+from helpers import GRAVITY, close, equations, random_body, says
 
 import lgsens as lg
 from lgsens.dynamics import (
@@ -79,7 +79,29 @@ def driven(value) -> lg.Model:
     return lg.Model(model.bodies, model.joints | {"motor": motor}, model.forces | {"weight": lg.Gravity(GRAVITY)})
 
 
-@pytest.mark.parametrize("t", some_quick([TIME, 0.0]))
+def test_start_of_a_driven_crank():
+    """By hand: its centre on a circle, and the moment of the motor, (J + m r²) times the acceleration."""
+    body = lg.RigidBody(2.0, (0.1, 0.2, 0.3), position=(0.5, 0.0, 0.0))
+    axis = (0.0, 0.0, 1.0)
+    joints = {
+        "hinge": lg.RevoluteJoint(None, "crank", at=(0.0, 0.0, 0.0), axis=axis),
+        "motor": lg.RotationDriver(None, "crank", axis=axis, value=TURN),
+    }
+    system = lg.Model({"crank": body}, joints, {"weight": lg.Gravity(GRAVITY)}).system()
+    start = jax.jit(initial_state)(system, jnp.asarray(TIME))
+    assert start.result == lg.RESULTS.successful
+    angle, rate, change = 0.3 + 2.0 * TIME + 1.5 * TIME**2, 2.0 + 3.0 * TIME, 3.0
+    along, across = np.array([[np.cos(angle), np.sin(angle), 0.0], [-np.sin(angle), np.cos(angle), 0.0]])
+    state = start.state
+    close(state.q.position[0], 0.5 * along, 64, scale=1.0)
+    close(state.q.orientation[0], np.stack([along, across, axis], axis=1), 64)
+    close(state.v, [*(0.5 * rate * across), 0.0, 0.0, rate], 64, scale=4.0)
+    close(state.vdot, [*(0.5 * (change * across - rate**2 * along)), 0.0, 0.0, change], 256, scale=10.0)
+    close(state.lam[system.multiplier_rows("motor")], [-(0.3 + 2.0 * 0.5**2) * change], 256, scale=20.0)
+
+
+@pytest.mark.slow  # small version: test_start_of_a_driven_crank
+@pytest.mark.parametrize("t", [TIME, 0.0])
 def test_start_of_a_driven_slider_crank(t):
     """q, v, v̇ and λ that the crank's angle, rate and acceleration determine, though no body was given a velocity."""
     model = driven(TURN)

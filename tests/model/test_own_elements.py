@@ -160,8 +160,12 @@ class Half(AbstractConstraint):
 def test_what_an_element_says_of_its_numbers_is_checked():
     """On a part of a merged body a declared element is rewritten; others see the frame of the part."""
     check_joint(Level(TIP, -TIP)).raise_if_failed()
-    check_force(StrapLoad(TIP, -TIP, *jnp.arange(1.0, 4.0))).raise_if_failed()
     assert {failure.compared for failure in check_joint(Half(TIP, -TIP)).failures} == {"on a part, in its frame"}
+
+
+@pytest.mark.slow  # small version: test_a_spring_of_ones_own_has_a_preload
+def test_what_a_load_says_of_its_numbers_is_checked():
+    check_force(StrapLoad(TIP, -TIP, *jnp.arange(1.0, 4.0))).raise_if_failed()
 
 
 def reduced(free, plain=False) -> lg.Model:
