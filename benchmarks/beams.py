@@ -267,6 +267,8 @@ def main() -> None:
         return
     document: dict = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     if arguments.compile:
+        if len({*arguments.elements}) < 2:
+            parser.error("--compile compares two numbers of --elements.")
         document["compile"] = compilation([arguments.elements[0], arguments.elements[-1]], arguments.repeats)
         write(path, document)
         print("\n".join(compile_table(document["compile"])))

@@ -81,18 +81,18 @@ def test_positions_and_responses(found):
 
 @pytest.mark.parametrize("modes", some_quick([[jax.jacrev], [jax.jacfwd, jax.jacrev]]))
 def test_derivatives_of_equilibria_and_responses(found, modes):
-    derivatives = [jax.jit(mode(of_lever))(NUMBERS) for mode in modes]
+    derivative, *others = (jax.jit(mode(of_lever))(NUMBERS) for mode in modes)
     for i, step in enumerate((10.0, 1e-3)):
         numbers = lambda h, i=i: np.asarray(NUMBERS.at[i].add(h))
         height = lambda h, numbers=numbers: [-0.5 * np.sin(angle(p, *numbers(h))) for p in PUSH]
         slope = lambda h, numbers=numbers: [
             differences(lambda d, p=p: -0.5 * np.sin(angle(p + d, *numbers(h))), 2.0) for p in PUSH
         ]
-        for value, expected in zip(derivatives[0], (height, slope)):
+        for value, expected in zip(derivative, (height, slope)):
             # Differences leave (h/p)⁴ = (1e-3/0.4)⁴, 4e-11, by the load 3e-10, and 1e-16/h of round-off twice.
             scale = np.abs(value[:, i]).max()
             np.testing.assert_allclose(value[:, i], differences(expected, step), rtol=0, atol=1e-8 * scale)
-    for one, other in zip(derivatives[0], derivatives[-1]):
+    for one, other in [pair for same in others for pair in zip(derivative, same)]:
         close(one, other, 100)  # one linear operator and its transpose, of condition 10
 
 

@@ -292,29 +292,25 @@ def _check_connection(what: str, ends: tuple[str | None, ...], bodies: Mapping[s
 
 def _check_bodies(bodies: Mapping[str, RigidBody]) -> None:
     """All of them at once: a hundred are checked in the time of three."""
-    full = lambda inertia: np.diag(inertia) if inertia.ndim == 1 else inertia
-    inertias = {name: full(np.asarray(body.inertia)) for name, body in bodies.items() if _is_known(body.inertia)}
-    if name := _first_wrong(inertias, is_inertia):
+
+    def first_wrong(field: str, right: Callable) -> str | None:
+        """The first body whose known matrix of a field is not right."""
+        given = {name: getattr(body, field) for name, body in bodies.items()}
+        known = {name: np.asarray(value) for name, value in given.items() if value is not None and is_concrete(value)}
+        matrices = [np.diag(value) if value.ndim == 1 else value for value in known.values()]
+        found = right(np.stack(matrices)) if matrices else []
+        return next((name for name, is_right in zip(known, found) if not is_right), None)
+
+    if name := first_wrong("inertia", is_inertia):
         raise ValueError(
             f"Body {name!r}: `inertia` {bodies[name].inertia} is not that of a body: a principal moment is negative, "
             "or larger than the sum of the others; bound what an optimizer may change."
         )
-    orientations = {name: np.asarray(body.orientation) for name, body in bodies.items() if _is_known(body.orientation)}
-    if name := _first_wrong(orientations, lambda orientation: ~far_from_rotation(orientation)):
+    if name := first_wrong("orientation", lambda orientation: ~far_from_rotation(orientation)):
         raise ValueError(
             f"Body {name!r}: `orientation` {bodies[name].orientation} is far from a rotation; leave it to the model "
             "(`equinox.partition`), or take smaller steps."
         )
-
-
-def _is_known(value) -> bool:
-    return value is not None and is_concrete(value)
-
-
-def _first_wrong(matrices: Mapping[str, np.ndarray], right: Callable) -> str | None:
-    """The first name whose matrix is not right."""
-    found = right(np.stack(list(matrices.values()))) if matrices else []
-    return next((name for name, is_right in zip(matrices, found) if not is_right), None)
 
 
 def _is_same_connection(one: AbstractJoint, other: AbstractJoint) -> bool:

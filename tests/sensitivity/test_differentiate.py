@@ -67,7 +67,6 @@ def test_structures_and_explicit_parameters(method, by_jax):
             )
 
 
-@pytest.mark.slow  # small version: test_every_leaf_of_a_simulation
 def test_with_respect_to_a_whole_model():
     """p may be a Model; the gradient is again one."""
     model = spinning_top(jnp.asarray(0.7))

@@ -114,7 +114,7 @@ def linear_problem(scheme, num_steps, uneven=False):
     return scheme, states, parameters, *(random_like((Variation.none(states), parameters), rng) for _ in range(2))
 
 
-@pytest.mark.slow  # small version: test_depth, test_right_hand_sides_share_the_products
+@pytest.mark.slow  # small versions: test_depth, test_right_hand_sides_share_the_products
 @pytest.mark.parametrize(
     ("scheme", "uneven"),
     [
