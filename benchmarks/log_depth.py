@@ -5,7 +5,7 @@
 At the states of a run, which are found before: the forward solution for as many parameters as the scene has in an
 optimization, and the transposed one for one criterion; the simulation itself for comparison. Medians of `--repeats`
 rounds after a warm-up, the programs of a scene in turns, compilation apart; on one thread of a CPU, or with `--device`
-as JAX finds it. Memory is what the compiled program says of its temporaries. Writes log_depth.json.
+as JAX finds it. Memory is what the compiled program says of its temporaries. Writes log_depth.json, device by device.
 """
 
 import json
@@ -13,7 +13,7 @@ import os
 import statistics
 import time
 
-from benchmark import SINGLE_THREAD, circumstances, environment, interleaved, options, write
+from benchmark import SINGLE_THREAD, circumstances, environment, grid, interleaved, options, write
 
 SCENES = ("top", "top_radau", "quarter_car")
 
@@ -100,25 +100,22 @@ def measure(name: str, steps: int, repeats: int) -> dict:
     return {"scene": name, "steps": steps, "matrix_rows": size, "simulation_ms": simulated, "modes": rows}
 
 
-def table(document: dict) -> str:
+def table(documents: dict) -> str:
     head = "scene | rows of A | mode | right-hand sides | sweep [ms] | scan [ms] | ratio | memory [MB] | difference"
-    lines = [circumstances(document["environment"]), "", f"| {head} |", "|---" * 9 + "|"]
-    for scene in document["scenes"].values():
-        for row in scene["modes"]:
-            sweep, scan = row["sweep"], row["scan"]
-            cells = (
-                f"{scene['scene']}, {scene['steps']} steps",
-                scene["matrix_rows"],
-                row["mode"],
-                row["right_hand_sides"],
-                f"{sweep['ms']:.1f}",
-                f"{scan['ms']:.1f}",
-                f"{scan['ms'] / sweep['ms']:.1f}",
-                f"{sweep['temporary_mb']:.0f}, {scan['temporary_mb']:.0f}",
-                f"{row['difference']:.0e}",
-            )
-            lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join(lines)
+    parts = []
+    for document in documents.values():
+        rows = []
+        for scene in document["scenes"].values():
+            for row in scene["modes"]:
+                sweep, scan = row["sweep"], row["scan"]
+                memory = ", ".join(f"{kind['temporary_mb']:.0f}" for kind in (sweep, scan))
+                cells = f"{sweep['ms']:.1f}", f"{scan['ms']:.1f}", f"{scan['ms'] / sweep['ms']:.1f}", memory
+                what = f"{scene['scene']}, {scene['steps']} steps", scene["matrix_rows"], row["mode"]
+                rows.append((*what, row["right_hand_sides"], *cells, f"{row['difference']:.0e}"))
+        found = document["environment"]
+        on = "" if found["device"] == "cpu" else f"{found['device']}; "
+        parts += [on + circumstances(found), grid(head, rows)]
+    return "\n\n".join(parts)
 
 
 def main() -> None:
@@ -133,13 +130,14 @@ def main() -> None:
 
     jax.config.update("jax_enable_x64", True)
     found = environment(threads) | {"device": jax.devices()[0].device_kind}
-    scenes = {}
-    for name in arguments.scenes:
-        scenes[name] = measure(name, arguments.steps, arguments.repeats)
-        print(name, flush=True)
     path = arguments.out / "log_depth.json"
-    write(path, {"environment": found, "scenes": scenes})
-    print(table(json.loads(path.read_text(encoding="utf-8"))))
+    documents = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    documents[found["device"]] = {"environment": found, "scenes": {}}
+    for name in arguments.scenes:
+        documents[found["device"]]["scenes"][name] = measure(name, arguments.steps, arguments.repeats)
+        write(path, documents)
+        print(name, flush=True)
+    print(table(documents))
 
 
 if __name__ == "__main__":

@@ -3,8 +3,8 @@
     python benchmarks/sweep.py [--scenes …] [--sizes …] [--devices 2] [--out benchmarks/results]
 
 Each size is a compiled batch, which runs until `--designs` are done; medians of `--repeats` rounds after a warm-up,
-compilation apart. `--devices 2` splits the processor into that many devices of JAX. Writes sweep.json, scene by scene,
-and prints a table.
+compilation apart. `--devices 2` splits the processor into that many devices of JAX; `--accelerator` is one device that
+JAX finds, with sizes of its own. Writes sweep.json, scene by scene, and prints a table.
 """
 
 import json
@@ -26,13 +26,14 @@ from lgsens.sweeps._batches import compile_batch, trace
 
 
 class Scene(NamedTuple):
-    """A criterion of one number, the numbers, the sizes of batches."""
+    """A criterion of one number, the numbers, the sizes of batches on a processor and on an accelerator."""
 
     criterion: Callable
     low: float
     high: float
     steps: int
     sizes: tuple[int, ...]
+    on_accelerator: tuple[int, ...]
 
 
 def top(angle):
@@ -47,13 +48,18 @@ def quarter_car(damping, steps: int = 100):
 
 
 SCENES = {
-    "top": Scene(top, 0.5, 1.0, 200, (1, 16, 64, 128, 256, 1024)),
-    "quarter_car": Scene(quarter_car, 2000.0, 8000.0, 100, (1, 16, 26, 128, 1024)),
+    "top": Scene(top, 0.5, 1.0, 200, (1, 16, 64, 128, 256, 1024), (256, 8192)),
+    "quarter_car": Scene(quarter_car, 2000.0, 8000.0, 100, (1, 16, 26, 128, 1024), (64, 1024, 8192)),
 }
 
 
 KINDS = {"value": lambda criterion: criterion, "value and gradient": jax.value_and_grad}
-UNITS = {"designs/s": "designs_per_second", "µs per step": "us_per_step", "kB per design": "kilobytes_per_design"}
+UNITS = {
+    "designs/s": "designs_per_second",
+    "µs per step": "us_per_step",
+    "kB per design": "kilobytes_per_design",
+    "compile [s]": "compile_seconds",
+}
 
 
 def measure(scene: Scene, kind: str, devices, repeats: int, total: int) -> list[dict]:
@@ -88,41 +94,52 @@ def measure(scene: Scene, kind: str, devices, repeats: int, total: int) -> list[
 
 
 def table(scenes: dict) -> str:
-    head = ("scene", "JAX", "devices", "batch", *(f"{kind}: {unit}" for kind in KINDS for unit in UNITS))
+    head = ("scene", "JAX", "on", "batch", *(f"{kind}: {unit}" for kind in KINDS for unit in UNITS))
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for scene in scenes.values():
         for value, gradient in zip(*scene["rows"].values()):
             cells = [f"{row[key]:.3g}" for row in (value, gradient) for key in UNITS.values()]
             version = scene["environment"]["versions"]["jax"]
-            lines.append(
-                f"| {scene['name']} | {version} | {scene['devices']} | {value['size']} | {' | '.join(cells)} |"
-            )
+            on = scene.get("accelerator") or f"{scene['devices']} of a CPU"
+            lines.append(f"| {scene['name']} | {version} | {on} | {value['size']} | {' | '.join(cells)} |")
     notes = [f"{name}: {circumstances(scene['environment'])}" for name, scene in scenes.items()]
     return "\n".join([*lines, "", *notes])
 
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--devices", type=int, default=1, help="devices of JAX on this processor")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--devices", type=int, default=1, help="devices of JAX on this processor")
+    where.add_argument("--accelerator", action="store_true", help="the first device that JAX finds, not a processor")
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
     parser.add_argument("--sizes", nargs="+", type=int, help="sizes of batches, in place of each scene's own")
     parser.add_argument("--designs", type=int, default=1024, help="designs of each row (default: %(default)s)")
     arguments = parser.parse_args()
     path = arguments.out / "sweep.json"
     scenes = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    settings = WHOLE_LOOPS | {"PJRT_NPROC": str(arguments.devices)}  # a thread for each
+    settings = (
+        {} if arguments.accelerator else WHOLE_LOOPS | {"PJRT_NPROC": str(arguments.devices)}
+    )  # a thread for each
     os.environ.update(settings)  # before the first computation
     jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_num_cpu_devices", arguments.devices)
+    if not arguments.accelerator:
+        jax.config.update("jax_platforms", "cpu")
+        jax.config.update("jax_num_cpu_devices", arguments.devices)
+    elif jax.default_backend() == "cpu":
+        parser.error("--accelerator: JAX finds none, only a CPU")
+    devices = jax.devices()[: arguments.devices]
+    accelerator = devices[0].device_kind if arguments.accelerator else None
     for name in arguments.scenes:
         scene = SCENES[name]
-        if arguments.sizes:
-            scene = scene._replace(sizes=tuple(arguments.sizes))
-        scenes[f"{name}, {arguments.devices} device(s), JAX {jax.__version__}"] = {
+        sizes = arguments.sizes or (scene.on_accelerator if accelerator else scene.sizes)
+        scene = scene._replace(sizes=tuple(sizes))
+        kinds = {kind: measure(scene, kind, devices, arguments.repeats, arguments.designs) for kind in KINDS}
+        scenes[f"{name}, {accelerator or f'{arguments.devices} device(s)'}, JAX {jax.__version__}"] = {
             "name": name,
             "devices": arguments.devices,
+            "accelerator": accelerator,
             "environment": environment(settings),
-            "rows": {kind: measure(scene, kind, jax.devices(), arguments.repeats, arguments.designs) for kind in KINDS},
+            "rows": kinds,
         }
         write(path, scenes)
     print(table(scenes))

@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import random_like, says
+from helpers import close, random_like, says
 from random_roads import INTENSITY, SPEED, compared
 
 import lgsens as lg
+from lgsens.analysis._random_road import lyapunov
 from lgsens.cli import main
 from lgsens.examples import DesignLimits, QuarterCar, RoadLimits, SuspensionDesign
 
@@ -26,6 +27,33 @@ def test_samples_of_a_random_road():
     assert abs(np.mean(steps[1:] * steps[:-1])) < 0.04 and abs(np.mean(steps)) < 0.04
     of = lambda g: lg.SampledRoad.random(jax.random.key(3), times, roughness=g, speed=SPEED).heights
     np.testing.assert_allclose(jax.jacfwd(of)(64e-6), road.heights / (2 * 64e-6), rtol=1e-10)  # z goes by the root
+
+
+@pytest.mark.parametrize("fastest", [1.0, 1e4])
+def test_lyapunov_equation_of_a_known_covariance(fastest):
+    """A = −(Q/2 + K) P⁻¹ with a skew K has the covariance P under a load Q, and settles: P is chosen first.
+
+    Deviations are of two sizes, as those of displacements and velocities are.
+    """
+    rng = np.random.default_rng(5)
+    size = np.array([1.0, 1.0, 1.0, fastest, fastest, fastest])
+    root, skew = rng.normal(size=(2, 6, 6))
+    load = rng.normal(size=6)
+    p = np.outer(size, size) * (root @ root.T + np.eye(6))
+    q = np.outer(size * load, size * load)
+    a = -(q / 2.0 + np.outer(size, size) * (skew - skew.T)) @ np.linalg.inv(p)
+    found = lyapunov(jnp.asarray(a), jnp.asarray(q)) / np.outer(size, size)
+    # how far round-off in A moves P: by as much as the equation's inverse is large, in the units of `size`
+    scaled = a * size / size[:, None]
+    equation = np.kron(scaled, np.eye(6)) + np.kron(np.eye(6), scaled)
+    condition = np.linalg.norm(np.linalg.inv(equation), 2) * np.linalg.norm(scaled, 2)
+    close(found, p / np.outer(size, size), ulps=10.0 * condition)
+
+
+def test_a_random_road_is_lowered_for_a_gpu():
+    """What only LAPACK has is not lowered for one, Schur's form for example."""
+    of = jax.jit(jax.vmap(jax.grad(lambda a: lyapunov(a, jnp.eye(3))[0, 0])))
+    of.trace(jnp.zeros((2, 3, 3))).lower(lowering_platforms=("cuda",))
 
 
 @pytest.fixture(scope="module")

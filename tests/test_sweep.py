@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import says
+from helpers import on_a_cpu, says
 from sweep_job import BATCH, COUNT, designs, psi
 
 import lgsens as lg
@@ -49,6 +49,7 @@ def finish(process, code=0):
     assert process.returncode == code, output
 
 
+@on_a_cpu  # one batch of as many elsewhere
 def test_thousands_of_designs_are_single_runs_in_one_compilation(single):
     compilations, traces = [], []
     listener = lambda event, duration, **_: compilations.append(event) if "backend_compile" in event else None
@@ -218,6 +219,7 @@ def test_batches_are_even(count, largest, devices, size):
     assert _batches.even(count, largest, devices) == size
 
 
+@on_a_cpu
 def test_batches_fit_into_caches():
     """A loop that carries 100 kB, reads 8 B of what it scans, and has a smaller one in it."""
 
@@ -232,6 +234,7 @@ def test_batches_fit_into_caches():
     assert found.batch_size == 15  # two batches of at most 2 MiB/100 kB = 20
 
 
+@on_a_cpu
 def test_batches_fit_into_memory(monkeypatch):
     """A program for 256 lanes of 8 kB and more, and a machine with 200 kB, half of which a batch may take."""
     free = 200e3
@@ -246,6 +249,7 @@ def test_batches_fit_into_memory(monkeypatch):
     np.testing.assert_array_equal(found.values, 499500.0)
 
 
+@on_a_cpu
 def test_free_memory_is_shared_by_the_devices_of_a_machine():
     device = jax.devices()[0]
     one, four = _batches.free_memory([device]), _batches.free_memory([device] * 4)

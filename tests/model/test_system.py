@@ -13,6 +13,7 @@ from helpers import (
     close,
     displaced,
     everything,
+    on_a_cpu,
     random_body,
     random_point,
 )
@@ -142,6 +143,7 @@ def test_gyroscopic_force_is_lagranges():
 # Order.
 
 
+@on_a_cpu  # bit by bit, and products elsewhere are rounded by where they are
 def test_bodies_are_numbered_by_name_and_not_by_insertion(system):
     point = random_point(system, np.random.default_rng(5))
     model = everything()
