@@ -101,7 +101,7 @@ def measure(name: str, steps: int, repeats: int) -> dict:
 
 
 def table(documents: dict) -> str:
-    head = "scene | rows of A | mode | right-hand sides | sweep [ms] | scan [ms] | ratio | memory [MB] | difference"
+    head = "scene | rows of A | simulation [ms] | mode | right-hand sides | sweep [ms] | scan [ms] | ratio | memory [MB] | difference"
     parts = []
     for document in documents.values():
         rows = []
@@ -109,8 +109,13 @@ def table(documents: dict) -> str:
             for row in scene["modes"]:
                 sweep, scan = row["sweep"], row["scan"]
                 memory = ", ".join(f"{kind['temporary_mb']:.0f}" for kind in (sweep, scan))
-                cells = f"{sweep['ms']:.1f}", f"{scan['ms']:.1f}", f"{scan['ms'] / sweep['ms']:.1f}", memory
-                what = f"{scene['scene']}, {scene['steps']} steps", scene["matrix_rows"], row["mode"]
+                cells = f"{sweep['ms']:.1f}", f"{scan['ms']:.1f}", f"{scan['ms'] / sweep['ms']:.2g}", memory
+                what = (
+                    f"{scene['scene']}, {scene['steps']} steps",
+                    scene["matrix_rows"],
+                    f"{scene['simulation_ms']:.1f}",
+                    row["mode"],
+                )
                 rows.append((*what, row["right_hand_sides"], *cells, f"{row['difference']:.0e}"))
         found = document["environment"]
         on = "" if found["device"] == "cpu" else f"{found['device']}; "

@@ -87,6 +87,32 @@ def _permutation(pivots: Int[Array, " n"], *, inverse: bool = False) -> Int[Arra
     return fori_loop(0, size, exchange, places) if size else places
 
 
+def _eliminated(matrix):
+    """S⁻¹ by Gauss–Jordan elimination in place, with exchanges of rows for the largest pivot.
+
+    That is (P S)⁻¹ in the end, and S⁻¹ = (P S)⁻¹ P: its column k is the one of the place to which row k of S has gone.
+    As exact as an LU and its solution: S⁻¹ S − I is 3e-15 … 6e-15 of 12 to 64 random rows, 3e-15 … 1e-14 by LAPACK.
+    """
+    size = matrix.shape[0]
+    places = jnp.arange(size)
+
+    def eliminate(j, carry):
+        matrix, gone = carry
+        here, column = places == j, matrix[:, j]
+        other = jnp.argmax(jnp.where(places < j, -jnp.ones_like(column), jnp.abs(column)))
+        there = places == other
+        pivot = 1.0 / column[other]
+        row = jnp.where(here, pivot, matrix[other] * pivot)
+        exchanged = jnp.where(there[:, None], matrix[j][None, :], matrix)
+        rest = jnp.where(here[None, :], jnp.zeros_like(matrix), exchanged)
+        rest = rest - jnp.where(there, column[j], column)[:, None] * row[None, :]
+        gone = jnp.where(gone == j, other, jnp.where(gone == other, j, gone))
+        return jnp.where(here[:, None], row[None, :], rest), gone
+
+    matrix, gone = fori_loop(0, size, eliminate, (matrix, places))
+    return matrix[:, gone]
+
+
 class Inverse(eqx.Module):
     """S⁻¹ itself, for the iterations of many steps: a product with it costs a tenth of two triangular solves.
 
@@ -98,7 +124,10 @@ class Inverse(eqx.Module):
 
     @classmethod
     def of(cls, matrix) -> "Inverse":
-        return cls(LU.of(matrix).solve(jnp.eye(matrix.shape[0], dtype=matrix.dtype), transposed=True))
+        by_lu = lambda matrix: LU.of(matrix).solve(jnp.eye(matrix.shape[0], dtype=matrix.dtype), transposed=True)
+        if 0 < matrix.shape[0] <= tuned.ELIMINATED_ROWS:
+            return cls(lax.platform_dependent(matrix, cpu=lambda matrix: _eliminated(matrix.T), default=by_lu))
+        return cls(by_lu(matrix))
 
     def solve(self, rhs, *, transposed: bool = False):
         """S⁻¹ rhs or S⁻ᵀ rhs, one column or several."""

@@ -30,6 +30,13 @@ DENSE_ONCE = 200
 # itself: the gradient of the quarter-car (37 rows left) takes 0.92 of the time. Not measured beyond.
 SUBSTITUTED_ROWS = 64
 
+# Rows up to which an inverse is one loop of our own instead of LAPACK's LU and solution (`_dense`). It takes as long
+# (of 37 rows 48 … 78 instead of 63 … 82 µs, of 64 rows 1.4 of the time), but LAPACK's solution of 37 columns takes all
+# threads of OpenBLAS, which then wait at full speed and keep the cores from XLA. Unless OPENBLAS_NUM_THREADS is 1,
+# value and gradient of the quarter-car take 0.78 of the time (JAX 0.11) and 0.88 (0.10), of the top 0.74 and 0.87,
+# batches 1.0 and 0.8; if it is, nothing changes.
+ELIMINATED_ROWS = 48
+
 # Numbers in an inverse from which on it is rounded to single precision (`_factors`): a quarter of a megabyte, that of
 # 70 links. Steps of chains of 128 and 512 links then take 0.96 and 0.91 of the time; small ones gain only where
 # inverses of many runs share the caches of a core: batches of quarter-cars (3769 numbers) take 0.9 of the time,
