@@ -101,7 +101,8 @@ def measure(name: str, steps: int, repeats: int) -> dict:
 
 
 def table(documents: dict) -> str:
-    head = "scene | rows of A | simulation [ms] | mode | right-hand sides | sweep [ms] | scan [ms] | ratio | memory [MB] | difference"
+    head = "scene | rows of A | simulation [ms] | mode | right-hand sides | sweep [ms] | scan [ms] | ratio"
+    head += " | memory [MB] | difference"
     parts = []
     for document in documents.values():
         rows = []
