@@ -17,7 +17,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from benchmark import WHOLE_LOOPS, circumstances, environment, options, write
+from benchmark import WHOLE_LOOPS, circumstances, environment, grid, options, write
 from tqdm import tqdm
 
 import lgsens as lg
@@ -95,15 +95,15 @@ def measure(scene: Scene, kind: str, devices, repeats: int, total: int) -> list[
 
 def table(scenes: dict) -> str:
     head = ("scene", "JAX", "on", "batch", *(f"{kind}: {unit}" for kind in KINDS for unit in UNITS))
-    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
+    rows = []
     for scene in scenes.values():
+        on = scene.get("accelerator") or f"{scene['devices']} of a CPU"
+        where = scene["name"], scene["environment"]["versions"]["jax"], on
         for value, gradient in zip(*scene["rows"].values()):
             cells = [f"{row[key]:.3g}" for row in (value, gradient) for key in UNITS.values()]
-            version = scene["environment"]["versions"]["jax"]
-            on = scene.get("accelerator") or f"{scene['devices']} of a CPU"
-            lines.append(f"| {scene['name']} | {version} | {on} | {value['size']} | {' | '.join(cells)} |")
+            rows.append((*where, value["size"], *cells))
     notes = [f"{name}: {circumstances(scene['environment'])}" for name, scene in scenes.items()]
-    return "\n".join([*lines, "", *notes])
+    return "\n".join([grid(" | ".join(head), rows), "", *notes])
 
 
 def main() -> None:
@@ -117,12 +117,11 @@ def main() -> None:
     arguments = parser.parse_args()
     path = arguments.out / "sweep.json"
     scenes = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    settings = (
-        {} if arguments.accelerator else WHOLE_LOOPS | {"PJRT_NPROC": str(arguments.devices)}
-    )  # a thread for each
-    os.environ.update(settings)  # before the first computation
+    settings = {}
     jax.config.update("jax_enable_x64", True)
     if not arguments.accelerator:
+        settings = WHOLE_LOOPS | {"PJRT_NPROC": str(arguments.devices)}  # a thread for each
+        os.environ.update(settings)  # before the first computation
         jax.config.update("jax_platforms", "cpu")
         jax.config.update("jax_num_cpu_devices", arguments.devices)
     elif jax.default_backend() == "cpu":

@@ -18,7 +18,7 @@ from lgsens.model import AbstractForce, AbstractLoad, Attached, Frame
 
 EPS = float(np.finfo(np.float64).eps)
 GRAVITY = (0.0, 0.0, -9.81)
-# The others hold on a GPU too, where JAX finds one, but for `test_rotation.py` in float32, where its sine is another.
+# Of tests that a GPU, where JAX finds one, cannot pass: sizes of batches, equality bit by bit, what is not lowered.
 on_a_cpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="says what holds on a CPU alone")
 
 

@@ -88,7 +88,8 @@ def _permutation(pivots: Int[Array, " n"], *, inverse: bool = False) -> Int[Arra
 
 
 def _eliminated(matrix):
-    """S⁻¹ by Gauss–Jordan elimination in place, with exchanges of rows for the largest pivot.
+    """S⁻¹ by Gauss–Jordan elimination in place, with exchanges of rows for the largest pivot; without these and of many
+    at once `_block_factors.inverses`.
 
     That is (P S)⁻¹ in the end, and S⁻¹ = (P S)⁻¹ P: its column k is the one of the place to which row k of S has gone.
     As exact as an LU and its solution: S⁻¹ S − I is 3e-15 … 6e-15 of 12 to 64 random rows, 3e-15 … 1e-14 by LAPACK.
