@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import lgsens as lg
 from lgsens.dynamics import unsteady_rate
+from lgsens.examples import heavy_top
 
 H, STEPS = 6.3e-4, 20  # s
 TILTED = np.array([0.6, 0.48, 0.64])
@@ -89,6 +90,28 @@ def test_a_pendulum_that_turns_over_is_not_resolved():
     scene = lg.Model({"bob": body}, {"hinge": hinge}, {"gravity": lg.Gravity((0.0, -9.81, 0.0))})
     found = lg.simulate(scene, t1=STEPS * H, num_steps=STEPS, throw=False)
     assert found.result == lg.RESULTS.turn_not_resolved
+
+
+def test_error_control_resolves_turns_whatever_the_tolerance():
+    """An error of 1000 rad and steps of any length are allowed: before, one of them turned the top by 10 rad."""
+    settings = lg.AdaptiveSteps(tolerance=1e3, longest=1.0)
+    found = run(0.5, num_steps=20, integrator=settings)
+    sizes = np.diff(found.t)
+    rates = unsteady_rate(found.system, found.states.v[1:], found.states.vdot[1:])
+    # at most a quarter turn in each, and no more steps than four fifths of one make of 10 rad but for the first two
+    assert np.all(sizes * rates <= np.pi / 2)
+    assert 10.0 / (np.pi / 2) <= int(found.stats.steps) <= 2 + 10.0 / (0.8 * np.pi / 2)
+
+
+@pytest.mark.slow  # of three stages; the small one is above
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
+def test_a_spinning_top_by_radau_at_coarse_tolerances(tolerance):
+    """150 rad/s for 2 s; by errors alone steps turned it by 3 to 4 rad."""
+    end = lambda tolerance: lg.simulate(
+        heavy_top(), t1=2.0, num_steps=1000, integrator=lg.AdaptiveSteps(lg.RadauIIA(), tolerance=tolerance)
+    ).body("top").position[-1]  # fmt: skip
+    # quarter turns at order 5 leave 2e-3 (seen), the tolerance in each of 240 steps allows more
+    np.testing.assert_allclose(end(tolerance), end(1e-8), rtol=0, atol=5e-3)
 
 
 def test_the_rate_is_that_of_the_fastest_unsteady_body():

@@ -18,6 +18,9 @@ Sizes so chosen change smoothly, which matters to index 3: in the constraint dir
 O(h²) that belongs to the step size (see `_start.py`), and where this changes by a factor r multipliers are off by
 O(r² − 1) h.
 
+From π in a step on the samples of an unsteady body, and with them the estimate of the error, say nothing of its motion
+(`dynamics._turning`): no step turns one by more than half of it, whatever its error.
+
 The derivative is that of the scheme on the grid found, so nothing here is differentiated.
 
 Sources: Géradin & Cardona, Flexible Multibody Dynamics (2001), §11; Söderlind, ACM Transactions on Mathematical
@@ -37,7 +40,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._validate import as_float, is_concrete, require, require_setting
 from lgsens._xla import scan, while_loop
-from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk
+from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk, unsteady_rate
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
 from lgsens.integrate._grid import UnevenGrid, with_first
 from lgsens.integrate._lanes import in_any_lane
@@ -48,6 +51,7 @@ from lgsens.integrate._scheme import AbstractIntegrator, AbstractScheme, Laid, S
 _AIM = 0.5  # θ: few steps are rejected
 _LIMIT = 1.0  # κ: no step is more than 2.6 times as long as the one before
 _ATTEMPTS = 20  # at one step
+_TURN = math.pi / 2  # rad, what an unsteady body may turn by in a step
 _LEAST = 1e-6  # errors below this fraction of the tolerance count as so large
 
 
@@ -246,8 +250,10 @@ def _controlled_steps(
             node = Node(t0 + elapsed, t0 + (elapsed + h), h)
             done, stats = walk.take(start, begun, node, trial.trying)
             error = relative(scheme.step_error(system, begun, done.state, done.memory, node), h)
-            accepted = stats.converged & (error <= 1.0)
-            shorter = jnp.where(stats.converged, jnp.clip(0.8 * error ** (-1.0 / power), 0.1, 0.8), 0.25)
+            turn = h * unsteady_rate(system, done.state.v, done.state.vdot)
+            accepted = stats.converged & (error <= 1.0) & ~(turn > _TURN)
+            allowed = jnp.minimum(error ** (-1.0 / power), _TURN / turn)
+            shorter = jnp.where(stats.converged, jnp.clip(0.8 * allowed, 0.1, 0.8), 0.25)
             rejected = trial.rejected + (~accepted).astype(jnp.int32)
             again = ~accepted & (rejected < _ATTEMPTS)
             given_up = ~accepted & ~again
@@ -271,6 +277,7 @@ def _controlled_steps(
         error = jnp.maximum(trial.error, _LEAST)
         rho = (_AIM / error * _AIM / before) ** (1.0 / (4 * power)) * (size / trial.h) ** 0.25
         grown = trial.h * (1.0 + _LIMIT * jnp.arctan((rho - 1.0) / _LIMIT))
+        grown = jnp.minimum(grown, 0.8 * _TURN / unsteady_rate(system, progress.state.v, progress.state.vdot))
         elapsed = jnp.where(active, jnp.where(trial.h >= remaining, total, elapsed + trial.h), elapsed)
         h_taken = jnp.where(active | ~progress.running, trial.h, 0.0)
         carry = (progress, jnp.where(active, trial.h, size), grown, error, elapsed)

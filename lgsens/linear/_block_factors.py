@@ -20,7 +20,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens._xla import fori_loop, scan
+from lgsens._xla import fori_loop, scan, while_loop
+from lgsens.linear import tuned
 from lgsens.linear._elimination import Elimination, Loop
 from lgsens.linear._sparse import added, chosen
 
@@ -141,18 +142,22 @@ def _solved_in_loop(loop: Loop, levels: Eliminated, b, rest: Callable):
     def down(b, at):
         level, start, boundary = at
         own = lax.dynamic_slice_in_dim(b, start, size).reshape(loop.own)
-        return b.at[boundary].add(-_product(level.left, own), mode="drop"), own
+        return b.at[boundary].add(-_summed(level.left, own), mode="drop"), own
 
     b, known = scan(down, b, (levels, starts, boundaries))
 
-    def up(x, at):
+    def up(carry):
+        # not a scan in reverse: XLA takes three rounds over all loops around it to see that its last index is constant
+        x, i = carry
+        at = jax.tree.map(lambda rows: lax.dynamic_index_in_dim(rows, i, keepdims=False), every)
         level, own, start, boundary = at
-        own = _product(level.inverse, own) - _product(level.right, x[boundary])
-        return lax.dynamic_update_slice_in_dim(x, own.ravel(), start, 0), None
+        own = _summed(level.inverse, own) - _summed(level.right, x[boundary])
+        return lax.dynamic_update_slice_in_dim(x, own.ravel(), start, 0), i - 1
 
     end = jnp.concatenate([rest(b[count * size :]), jnp.zeros(1, b.dtype)])  # the last one is what fills up
     x = jnp.concatenate([jnp.zeros(count * size, b.dtype), end])
-    return scan(up, x, (levels, known, starts, boundaries), reverse=True)[0][:-1]
+    every = levels, known, jnp.asarray(starts), jnp.asarray(boundaries)
+    return while_loop(lambda carry: carry[1] >= 0, up, (x, jnp.asarray(count - 1, jnp.int32)))[0][:-1]
 
 
 def inverses(blocks: Float[Array, "c p p"]) -> Float[Array, "c p p"]:
@@ -188,3 +193,10 @@ def _turned(blocks):
 
 def _product(blocks, x):
     return jnp.einsum("cij,cj->ci", blocks, x)
+
+
+def _summed(blocks, x):
+    """The same in a loop that XLA fuses with what takes the blocks out of those of all levels."""
+    if x.shape[1] > tuned.SUMMED_COLUMNS:
+        return _product(blocks, x)
+    return jnp.sum(blocks * x[:, None, :], axis=-1)
