@@ -115,7 +115,8 @@ def test_redundant_constraints(case):
     model = lg.Model({"bob": BODY}, joints)
     parts = (
         "constrain the same motion twice",
-        "Replace one of the joints",
+        "free='x y rz'",
+        "replace one of the joints",
         "spherical",
         f"Joints involved: {names}",
     )

@@ -285,3 +285,58 @@ def test_degrees_of_freedom_must_be_driven():
     under = lg.Model({"bar": bar}, {"one": motor["one"]})
     with pytest.raises(ValueError, match=says("6 coordinates and 1 equations", "['one'] included", "Drive more")):
         lg.kinematics(under, {"one": [0.1]})
+
+
+def hinged_four_bar(length, *, planar: bool) -> lg.Model:
+    """Of four hinges with parallel axes: three of their equations are redundant where bodies are not `planar`."""
+    at = jnp.asarray([[0.0, 0.0, 0.0], [0.1, 0.3, 0.0], [0.7, 0.5, 0.0], [0.8, 0.0, 0.0]])
+    at, axis = at.at[2, 0].add(length), (0.0, 0.0, 1.0)
+    names, free = ("crank", "coupler", "rocker"), "x y rz" if planar else None
+    bodies = {
+        name: lg.RigidBody(1.0, (0.01, 0.02, 0.025), position=(at[i] + at[i + 1]) / 2, free=free)
+        for i, name in enumerate(names)
+    }
+    ends = [(None, "crank"), ("crank", "coupler"), ("coupler", "rocker"), ("rocker", None)]
+    joints = {f"hinge{i}": lg.RevoluteJoint(*pair, at=at[i], axis=axis) for i, pair in enumerate(ends)}
+    joints["motor"] = lg.RotationDriver(None, "crank", axis=axis)
+    redundant = "refuse" if planar else "minimum_norm"
+    return lg.Model(bodies, joints, {"gravity": lg.Gravity((0.0, -9.81, 0.0))}, redundant=redundant)
+
+
+def looked_at(found):
+    rocker = found.body("rocker")
+    parts = rocker.position, rocker.orientation, rocker.acceleration, found.multiplier("motor")
+    return jnp.concatenate([part.ravel() for part in parts])
+
+
+def run_hinged(length, *, planar):
+    angles = np.linspace(0.0, 1.5, 4)
+    return lg.kinematics(hinged_four_bar(length, planar=planar), {"motor": angles}, rates={"motor": RATE})
+
+
+def test_redundant_hinges():
+    """The motion and what is unique of the forces are those of the same mechanism without the equations too many."""
+    found, step = run_hinged(0.0, planar=False), 1e-5
+    # round-off in bars of 0.3 to 1 m, times ω² of up to 15² 1/s² in accelerations
+    np.testing.assert_allclose(looked_at(found), looked_at(run_hinged(0.0, planar=True)), rtol=1e-11, atol=1e-11)
+    # what hinges share they need not bear: no moments, and no forces out of the plane
+    forces = jnp.stack([found.multiplier(f"hinge{i}") for i in range(4)])
+    np.testing.assert_allclose(forces[..., 2:], 0.0, atol=1e-11 * float(jnp.max(jnp.abs(forces))))
+    gradient = jax.jacrev(lambda length: looked_at(run_hinged(length, planar=False)))(0.0)
+    after, before = (looked_at(run_hinged(sign * step, planar=True)) for sign in (1.0, -1.0))
+    # h² times third derivatives over the 0.1 m of the shortest distance, cubed, and round-off over h
+    np.testing.assert_allclose(gradient, (after - before) / (2 * step), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.slow  # two more programs
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_gradients_of_redundant_hinges_are_exact(mode):
+    redundant, planar = (mode(lambda length, of=of: looked_at(run_hinged(length, planar=of)))(0.0) for of in (0, 1))
+    np.testing.assert_allclose(redundant, planar, rtol=1e-11, atol=1e-11)  # as above
+
+
+def test_redundant_hinges_are_refused_unless_asked_for():
+    model = hinged_four_bar(0.0, planar=False)
+    refusing = lg.Model(model.bodies, model.joints, model.forces)
+    with pytest.raises(ValueError, match=says("18 coordinates and 21 equations", "free='x y rz'", "minimum_norm")):
+        lg.kinematics(refusing, {"motor": [0.1]})

@@ -57,7 +57,8 @@ def kinematics(
     what it takes to drive.
 
     Arguments:
-        model: the scene. `RigidBody(free=…)` and joints leave as many degrees of freedom as are driven.
+        model: the scene. `RigidBody(free=…)` and joints leave as many degrees of freedom as are driven. Joints may
+            repeat each other with `redundant="minimum_norm"`, which says what their multipliers are then.
         driven: values by name of a `TranslationDriver` (displacement [m]), a `RotationDriver` (angle [rad]) or a
             `DistanceJoint` (length [m]), in place of its own number or signal, shape (n,) each. The first position is
             found from the reference configuration, each other one from that before: begin near it, and take steps
@@ -92,14 +93,15 @@ def kinematics(
     system = with_numbers(model, start, names).system()
     refuse_history(system)
     unknowns, equations = system.group.dim, len(system.constraint_names)
-    if unknowns != equations:
+    if unknowns > equations or (unknowns < equations and model.redundant != "minimum_norm"):
         raise ValueError(
             f"`driven`: the mechanism has {unknowns} coordinates and {equations} equations, those of the drivers "
             f"{names or sorted(where)} included; kinematics needs as many. "
             + (
                 "Drive more coordinates, hold bodies by `free`, or lock joints."
                 if unknowns > equations
-                else "Drive fewer coordinates, or remove joints that repeat each other."
+                else "Drive fewer coordinates; or joints say the same twice, as hinges of a planar mechanism do: give "
+                "its bodies free='x y rz', or Model(…, redundant='minimum_norm')."
             )
         )
     where = drivers(system)

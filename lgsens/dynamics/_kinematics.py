@@ -20,6 +20,14 @@ Velocity and acceleration. With s moving at constant rates ṡ (of t 1, or 0 whe
     A v + Φ_s ṡ = 0,     A v̇ + Γ = 0,     Γ = d/dt (DΦ·(q ṽ) + Φ_s ṡ) at fixed v.
 
 Forces. Inverse dynamics: r(q, v, v̇, λ, t) = r(q, v, v̇, 0, t) + Aᵀλ = 0 determines λ, as A is square.
+
+Redundant constraints (`_redundant`) are more equations than coordinates, of which as many as there are coordinates are
+independent: A has full column rank, and b on the right-hand sides above is in its range. A⁻¹b and A⁻ᵀf are x and λ of
+
+    [[I, A], [Aᵀ, 0]] [λ; x] = [b; 0],     [[I, A], [Aᵀ, 0]] [λ; x] = [0; f],
+
+least squares and least norm by the factors of one matrix. Where an iterate is not a solution the first is the
+Gauss–Newton step, as fast, since Φ = 0 in the end; the norm of λ is the right one (`least_norm`) where it is read.
 """
 
 import abc
@@ -38,7 +46,8 @@ _MAX_ITERATIONS = 40
 
 
 class AbstractDrive(eqx.Module):
-    """A system some of whose constraints prescribe d numbers s, so that it has as many constraints as coordinates."""
+    """A system some of whose constraints prescribe d numbers s, so that it has as many constraints as coordinates, or
+    more where they may be redundant."""
 
     system: eqx.AbstractVar[AbstractSystem]
 
@@ -52,7 +61,19 @@ class Positions(NamedTuple):
 
     q: Any  # stacked along a leading axis n
     found: Bool[Array, " n"]  # whether Newton's iteration converged
-    violation: Float[Array, "n k"]  # Φ there
+    violation: Float[Array, "n m"]  # Φ there
+
+
+def _solved(matrix: Float[Array, "m k"], rhs: Array, *, transposed: bool = False) -> Array:
+    """A⁻¹ b, shape (k,), or A⁻ᵀ f, shape (m,)."""
+    m, k = matrix.shape
+    if m == k:
+        return jnp.linalg.solve(matrix.T if transposed else matrix, rhs)
+    # not a QR: two of LAPACK's at once, of many matrices each, can wait for each other for ever (jaxlib 0.10)
+    least = jnp.block([[jnp.eye(m, dtype=matrix.dtype), matrix], [matrix.T, jnp.zeros((k, k), matrix.dtype)]])
+    none = jnp.zeros(m if transposed else k, matrix.dtype)
+    found = jnp.linalg.solve(least, jnp.concatenate([none, rhs] if transposed else [rhs, none]))
+    return found[:m] if transposed else found[m:]
 
 
 def _newton(drive: AbstractDrive, q, values, t):
@@ -61,7 +82,7 @@ def _newton(drive: AbstractDrive, q, values, t):
     scale = drive.system.coordinate_scale()
 
     def step(q):
-        return jnp.linalg.solve(system.constraint_jacobian(q, t), system.constraint(q, t))
+        return _solved(system.constraint_jacobian(q, t), system.constraint(q, t))
 
     def body(carry):
         q, _, iteration = carry
@@ -102,7 +123,7 @@ def _configurations_jvp(primals, tangents):
     def tangent(q, row, row_dot):
         violation = lambda drive, s, t: drive.at(s).constraint(q, t)
         _, violation_dot = jax.jvp(violation, (drive, *row), (tangents[0], *row_dot))
-        w = -jnp.linalg.solve(drive.at(row[0]).constraint_jacobian(q, row[1]), violation_dot)
+        w = -_solved(drive.at(row[0]).constraint_jacobian(q, row[1]), violation_dot)
         return drive.system.group.to_ambient(q, w)
 
     return (q, size), (jax.vmap(tangent)(q, given, list(tangents[1:])), jnp.zeros_like(size))
@@ -130,12 +151,13 @@ def forces_of_motion(
     jacobian = system.constraint_jacobian(q, t)
     at = lambda q, driven: drive.at(driven[0]).constraint(q, driven[1])
     _, along = jax.jvp(lambda driven: at(q, driven), (driven,), (rates,))
-    v = -jnp.linalg.solve(jacobian, along)
+    v = -_solved(jacobian, along)
 
     def rate(q, driven):
         return jax.jvp(at, (q, driven), (group.to_ambient(q, v), rates))[1]
 
     _, change = jax.jvp(rate, (q, driven), (group.to_ambient(q, v), rates))
-    vdot = -jnp.linalg.solve(jacobian, change)
-    lam = -jnp.linalg.solve(jacobian.T, system.residual(q, v, vdot, jnp.zeros_like(v), t))
+    vdot = -_solved(jacobian, change)
+    none = jnp.zeros(jacobian.shape[0], v.dtype)
+    lam = -_solved(jacobian, system.residual(q, v, vdot, none, t), transposed=True)
     return State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)

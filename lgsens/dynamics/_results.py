@@ -34,11 +34,11 @@ _MESSAGES = {
         "satisfies all joints. Check lengths, hardpoints and axes of the joints named, or start closer."
     ),
     RESULTS.redundant_constraints: (
-        "The joints constrain the same motion twice, so the multipliers are not unique. Replace one of the "
-        "joints named by one with fewer equations (a revolute by a spherical or a cylindrical joint, say), or "
-        "remove it where the `free` coordinates of its bodies satisfy it anyway. Or keep them and take the multipliers "
-        "of least norm: Model(…, redundant='minimum_norm'), unless they do so in this configuration only, "
-        "a singular one: `constraint_rank` tells."
+        "The joints constrain the same motion twice, so the multipliers are not unique. Give the bodies of a planar "
+        "mechanism free='x y rz', replace one of the joints named by one with fewer equations (a revolute by a "
+        "spherical or a cylindrical joint, say), or remove it where the `free` coordinates of its bodies satisfy it "
+        "anyway. Or keep them and take the multipliers of least norm: Model(…, redundant='minimum_norm'), unless they "
+        "do so in this configuration only, a singular one: `constraint_rank` tells."
     ),
     RESULTS.newton_failed: (
         "Newton's iteration did not converge. Try a smaller step (more `num_steps`), more "
