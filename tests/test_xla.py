@@ -94,3 +94,13 @@ def test_what_is_traced_sets_the_collector_back():
         assert gc.get_threshold()[0] > before[0] or before[0] >= 100_000
         raise ValueError("of the user's")
     assert gc.get_threshold() == before
+
+
+@pytest.mark.parametrize("cores, own, threads", [(2, None, "1"), (2, "2", "2"), (16, None, "None")])
+def test_few_cores_get_one_thread_unless_the_user_says_otherwise(cores, own, threads):
+    """On two, batched factorizations at once wait for each other for ever."""
+    given = {name: value for name, value in os.environ.items() if name != "PJRT_NPROC"}
+    given |= {} if own is None else {"PJRT_NPROC": own}
+    code = f"import os; os.cpu_count = lambda: {cores}; import lgsens; print(os.environ.get('PJRT_NPROC'))"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=given, check=True)
+    assert found.stdout.split() == [threads]
