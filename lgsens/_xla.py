@@ -35,10 +35,11 @@ no slower). Both are keys of `--xla_backend_extra_options`, of which XLA ignores
 Third, on two cores jaxlib 0.10 to 0.12 can wait for ever. A LAPACK call with a batch of matrices hands them to XLA's
 threads and waits for them on one of these. Where the two threads of two cores are both at such a call, nobody is left:
 `vmap` of 26 quarter-cars stood still at the second call in two factorizations that do not depend on each other, the
-batched gradient of `random_road` in a QR and an LU. With one thread (`PJRT_NPROC=1`, which XLA reads when it starts) a
-batch is done where it is asked for. So that is set on machines of one or two cores unless the user has set it; with
-more cores as many such calls would have to meet. One quarter-car or top is faster with it, a batch of 256 tops takes
-83 instead of 66 ms. (`lgsens.sweep` takes its factorizations apart by itself, `sweeps._one_by_one`.)
+batched gradient of `random_road` in a QR and an LU (0.12: it stood still too, where was not looked at). With one thread
+(`PJRT_NPROC=1`, which XLA reads when it starts) a batch is done where it is asked for. So that is set on machines of
+one or two cores unless the user has set it; with more cores as many such calls would have to meet. One quarter-car or
+top is faster with it, a batch of 256 tops takes 83 instead of 66 ms. (`lgsens.sweep` takes its factorizations apart by
+itself, `sweeps._one_by_one`.)
 """
 
 import contextlib

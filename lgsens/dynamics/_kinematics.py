@@ -69,7 +69,7 @@ def _solved(matrix: Float[Array, "m k"], rhs: Array, *, transposed: bool = False
     m, k = matrix.shape
     if m == k:
         return jnp.linalg.solve(matrix.T if transposed else matrix, rhs)
-    # not a QR: two of LAPACK's at once, of many matrices each, can wait for each other for ever (jaxlib 0.10)
+    # not a QR, whose derivative adds batched LAPACK calls that do not depend on each other (`lgsens._xla`)
     least = jnp.block([[jnp.eye(m, dtype=matrix.dtype), matrix], [matrix.T, jnp.zeros((k, k), matrix.dtype)]])
     none = jnp.zeros(m if transposed else k, matrix.dtype)
     found = jnp.linalg.solve(least, jnp.concatenate([none, rhs] if transposed else [rhs, none]))

@@ -124,7 +124,8 @@ class AdaptiveSteps(AbstractIntegrator):
 
     with e = h^p c as the scheme estimates it: of generalized-α, and of schemes that say nothing else, the part of the
     increment (27) that it misses, p = 3, c = (1/6 − β − Δ/2) v̈ + ad(v) v̇/12, Δ = α_m − α_f, v̈ ≈ (a_{n+1} − a_n)/h;
-    of Radau IIA the largest error within the step, p = 4.
+    of Radau IIA the largest error within the step, p = 4. Whatever it is, no step turns a body whose angular velocity
+    changes by more than π/2.
 
     Arguments:
         integrator: the scheme, `GeneralizedAlpha` or another one.
