@@ -98,7 +98,7 @@ def doctor(
             rank.redundant,
             0.0,
             joints,
-            "Take a joint with fewer equations, or Model(redundant='minimum_norm').",
+            "Take a joint with fewer equations, or Model(redundant='remove').",
         )
     )
     trajectory = simulate(model, throw=False, **settings)

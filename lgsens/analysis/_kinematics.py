@@ -58,7 +58,7 @@ def kinematics(
 
     Arguments:
         model: the scene. `RigidBody(free=…)` and joints leave as many degrees of freedom as are driven. Joints may
-            repeat each other with `redundant="minimum_norm"`, which says what their multipliers are then.
+            repeat each other with `redundant="minimum_norm"`, which says what their multipliers are then, or "remove".
         driven: values by name of a `TranslationDriver` (displacement [m]), a `RotationDriver` (angle [rad]) or a
             `DistanceJoint` (length [m]), in place of its own number or signal, shape (n,) each. The first position is
             found from the reference configuration, each other one from that before: begin near it, and take steps
@@ -101,7 +101,7 @@ def kinematics(
                 "Drive more coordinates, hold bodies by `free`, or lock joints."
                 if unknowns > equations
                 else "Drive fewer coordinates; or joints say the same twice, as hinges of a planar mechanism do: give "
-                "its bodies free='x y rz', or Model(…, redundant='minimum_norm')."
+                "its bodies free='x y rz', or Model(…, redundant='remove')."
             )
         )
     where = drivers(system)

@@ -183,8 +183,8 @@ def linearize(
         M_r ẍ + C_r ẋ + K_r x + F_0 u + F_1 u̇ = 0,     w = Z x + S u,  J Z = 0,  Zᵀ M Z = I
 
     Arguments:
-        model: the scene, or an `AbstractSystem`. Without redundant equations, and without joints that constrain
-            velocities.
+        model: the scene, or an `AbstractSystem`. Without redundant equations (`Model(redundant="remove")`), and
+            without joints that constrain velocities.
         state: q and v of a steady motion, `initial_state(model)` say; v̇ and λ are those of the motion through it. None:
             the `equilibrium` near the reference configuration.
         inputs: names of joints and forces with a signal or a prescribed number: the displacement or angle of a driver,

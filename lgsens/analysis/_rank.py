@@ -2,17 +2,10 @@
 
 import dataclasses
 
-import equinox as eqx
-import numpy as np
-
 from lgsens._validate import as_float
-from lgsens.dynamics import AbstractSystem, assemble, full_jacobian
+from lgsens.dynamics import AbstractSystem, rank_near_reference, redundant_names
 from lgsens.model import Model, scene_of
-from lgsens.simulation import as_system, left_null_space, redundant_names
-
-_DIRECTIONS = 4  # of motion, in which the neighbourhood of the reference is looked at
-_DISTANCE = 0.01  # how far, in rad or lengths of the scene
-_ITERATIONS = 20
+from lgsens.simulation import as_system
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,54 +77,7 @@ def constraint_rank(model: Model | AbstractSystem, *, t0=0.0) -> ConstraintRank:
     if scene is not None:
         system = dataclasses.replace(scene, minimum_norm=True)  # which can be assembled whatever its rank
     t = as_float(t0, (), "`t0`")
-    q, _ = _assembled(system, t)
-    _, jacobian = _evaluated(system, q, t)
-    reference_rank = rank = left_null_space(jacobian)[1]
-    for direction in np.random.default_rng(0).normal(size=(_DIRECTIONS, jacobian.shape[1])):
-        moved = _moved(system, q, t, direction)
-        if moved is not None and left_null_space(moved)[1] > rank:
-            jacobian, rank = moved, left_null_space(moved)[1]
-    m, k = jacobian.shape
-    names = tuple(redundant_names(jacobian, system.constraint_names))
-    return ConstraintRank(k - system.num_states, m, rank, reference_rank, names)
-
-
-def _moved(system: AbstractSystem, q, t, direction):
-    """J in a configuration near q along a direction, if there is one."""
-    scale = np.asarray(system.coordinate_scale())
-    _, jacobian = _evaluated(system, q, t)
-    # the part of the direction that the constraints allow, in comparable coordinates
-    rows = jacobian * scale
-    x = direction - np.linalg.lstsq(rows, rows @ direction, rcond=None)[0]
-    size = np.abs(x).max(initial=0.0)
-    if size < 1e-6:  # no freedom
-        return None
-    q = _retracted(system, q, _DISTANCE * scale * x / size)
-    tolerance = 1e3 * np.finfo(scale.dtype).eps * max(scale.max(), 1.0)
-    for _ in range(_ITERATIONS):
-        violation, jacobian = _evaluated(system, q, t)
-        if np.abs(violation).max(initial=0.0) <= tolerance:
-            return jacobian
-        # singular values that the distance does not explain belong to redundant equations
-        step = np.linalg.lstsq(jacobian[: len(violation)] * scale, violation, rcond=1e-2 * _DISTANCE)[0]
-        q = _retracted(system, q, -scale * step)
-    return None
-
-
-_assembled = eqx.filter_jit(assemble)
-
-
-def _evaluated(system, q, t) -> tuple[np.ndarray, np.ndarray]:
-    """Φ and J."""
-    violation, jacobian = _value_and_jacobian(system, q, t)
-    return np.asarray(violation), np.asarray(jacobian)
-
-
-@eqx.filter_jit
-def _value_and_jacobian(system, q, t):
-    return system.constraint(q, t), full_jacobian(system, q, t)
-
-
-@eqx.filter_jit
-def _retracted(system, q, x):
-    return system.group.retract(q, x)
+    found = rank_near_reference(system, t)
+    m, k = found.jacobian.shape
+    names = tuple(redundant_names(found.jacobian, system.constraint_names))
+    return ConstraintRank(k - system.num_states, m, found.near, found.reference, names)

@@ -44,6 +44,13 @@ from lgsens.dynamics._matrices import (
     tangents as tangents,
     times_tangent_operator as times_tangent_operator,
 )
+from lgsens.dynamics._rank import (
+    Rank as Rank,
+    jacobians_on_the_way as jacobians_on_the_way,
+    rank_near_reference as rank_near_reference,
+    redundant_names as redundant_names,
+    repeated_rows as repeated_rows,
+)
 from lgsens.dynamics._redundant import (
     AbstractRedundantSystem as AbstractRedundantSystem,
     least_norm as least_norm,

@@ -71,10 +71,10 @@ def require_independent(system: AbstractSystem, method: str) -> None:
     """Raise `ValueError` where constraints may be redundant, for a method that cannot treat that."""
     if softness(system) is not None:
         raise ValueError(
-            f"{method} needs independent constraints, and the model has redundant='minimum_norm'. Leave out what "
-            "repeats: give the bodies of a planar mechanism free='x y rz', replace joints by those with fewer "
-            "equations (`constraint_rank` names them). `equilibrium`, `kinematics`, and steps of GeneralizedAlpha with "
-            "DirectDifferentiation() or AdjointVariable() take the model as it is."
+            f"{method} needs independent constraints, and the model has redundant='minimum_norm'. "
+            "Model(…, redundant='remove') leaves out what repeats; so do free='x y rz' of the bodies of a planar "
+            "mechanism, and joints with fewer equations (`constraint_rank` names them). `equilibrium`, `kinematics`, "
+            "and steps of GeneralizedAlpha with DirectDifferentiation() or AdjointVariable() take the model as it is."
         )
 
 

@@ -37,8 +37,9 @@ _MESSAGES = {
         "The joints constrain the same motion twice, so the multipliers are not unique. Give the bodies of a planar "
         "mechanism free='x y rz', replace one of the joints named by one with fewer equations (a revolute by a "
         "spherical or a cylindrical joint, say), or remove it where the `free` coordinates of its bodies satisfy it "
-        "anyway. Or keep them and take the multipliers of least norm: Model(…, redundant='minimum_norm'), unless they "
-        "do so in this configuration only, a singular one: `constraint_rank` tells."
+        "anyway. Or let Model(…, redundant='remove') leave out what repeats, or keep it and take the multipliers of "
+        "least norm, redundant='minimum_norm'; unless they do so in this configuration only, a singular one: "
+        "`constraint_rank` tells."
     ),
     RESULTS.newton_failed: (
         "Newton's iteration did not converge. Try a smaller step (more `num_steps`), more "
@@ -55,7 +56,8 @@ _MESSAGES = {
     RESULTS.singular_configuration: (
         "The mechanism passes a singular configuration, where its joints lose independence and the motion may branch "
         "(a linkage that lies flat): which way it goes on is not determined, and derivatives by lengths are infinite. "
-        "End the simulation before, change the lengths, or let a joint give way (`Bushing`)."
+        "End the simulation before, change the lengths, or let a joint give way (`Bushing`). With redundant='remove' "
+        "it may be the equations that are left, not the mechanism: compare 'minimum_norm'."
     ),
     RESULTS.turn_not_resolved: (
         "A body turns by more than π in a step while its angular velocity changes: what loads do in between, the steps "

@@ -74,6 +74,7 @@ class TranslationDriver(AbstractJoint):
     def assembled(self):
         return self.value is None
 
+    drives = True
     coordinates = (DISPLACEMENT,)
     frames = frames_at
 
@@ -106,6 +107,7 @@ class RotationDriver(AbstractJoint):
     def assembled(self):
         return self.value is None
 
+    drives = True
     coordinates = (ANGLE,)
 
     @property

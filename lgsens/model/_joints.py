@@ -55,14 +55,16 @@ class AbstractJoint(eqx.Module):
 
     A joint of one's own has these two names, leaves for its numbers, and `constraints`. It is `assembled` if the
     reference configuration satisfies it by construction, and `rigid` if its bodies move as one. `coordinates` are those
-    that it leaves its bodies, functions of the pose of its frame on b in that on a (`lgsens.model.Coordinate`); `slips`
-    the velocities [ẋ, ω] of that pose that rub, 0 … 5, and 6 … 8 those of ω about the axes of b's frame.
+    that it leaves its bodies, or prescribes if it `drives`: functions of the pose of its frame on b in that on a
+    (`lgsens.model.Coordinate`); `slips` the velocities [ẋ, ω] of that pose that rub, 0 … 5, and 6 … 8 those of ω about
+    the axes of b's frame.
     """
 
     a: eqx.AbstractVar[str | None]
     b: eqx.AbstractVar[str | None]
     assembled: ClassVar[Any] = False
     rigid: ClassVar[bool] = False
+    drives: ClassVar[bool] = False
     coordinates: ClassVar[tuple[Coordinate, ...]] = ()
     slips: ClassVar[tuple[int, ...]] = ()
 

@@ -25,11 +25,11 @@ from lgsens.model._frames import Frame
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._merge import Group, groups
 from lgsens.model._reductions import AbstractReduction, Scene, reduced
+from lgsens.model._repeated_rows import Equations, as_redundant, repeated_equations, without
 from lgsens.model._se3_system import SE3System
 from lgsens.model._summary import Summary, summarize
 from lgsens.model._system import MultibodySystem
 
-_REDUNDANT = ("refuse", "minimum_norm")
 _FORMULATIONS = ("R3xSO3", "SE3")
 _OPTIONS = ("linear_solver", "merge_fixed", "redundant", "formulation")
 
@@ -50,7 +50,11 @@ class Model(eqx.Module):
             `Trajectory.multiplier` the multipliers of least Σ λ_i² (moments divided by the radius of gyration of the
             bodies): the forces in joints that are all equally stiff, in the limit of rigid ones. Derivatives are exact
             for changes that leave the equations redundant (both hinges of a door off their axis, and not one of
-            them). `constraint_rank` says which joints are redundant.
+            them). "remove" leaves out equations that repeat others, so that everything takes the scene (`statics`,
+            `linearize`, `RadauIIA`, `stabilized` too), and names them in `removed`: the motion is the same, joints that
+            lost an equation carry nothing in its direction, and derivatives are those of the mechanism that is left,
+            for every change. Their choice needs known numbers; where they are traced, give `removed` of a model that
+            was built before. `constraint_rank` says which joints are redundant.
         formulation: "R3xSO3", velocities of centres of mass in the inertial frame, or "SE3", in the frame of each body,
             whose steps move it along a screw: another solution of second order, with dense linear algebra. Bodies with
             some of their degrees of freedom are as before. States are in these velocities; what `Trajectory` answers
@@ -79,6 +83,7 @@ class Model(eqx.Module):
     merge_fixed: bool = eqx.field(static=True)
     redundant: str = eqx.field(static=True)
     formulation: str = eqx.field(static=True)
+    removed: Equations = eqx.field(static=True)  # of joints: the name, which basic constraint of it, and which row
 
     def __init__(
         self,
@@ -88,7 +93,7 @@ class Model(eqx.Module):
         *,
         linear_solver: AbstractLinearSolver | None = None,
         merge_fixed: bool = False,
-        redundant: str = "refuse",
+        redundant: str | Equations = "refuse",
         formulation: str = "R3xSO3",
     ):
         if not isinstance(linear_solver, AbstractLinearSolver | None):
@@ -108,9 +113,7 @@ class Model(eqx.Module):
         self.merge_fixed = merge_fixed
         if not isinstance(merge_fixed, bool):
             raise ValueError(f"Model: `merge_fixed` must be True or False, got {merge_fixed!r}.")
-        self.redundant = redundant
-        if redundant not in _REDUNDANT:
-            raise ValueError(f"Model: `redundant` must be one of {_REDUNDANT}, got {redundant!r}.")
+        self.redundant, self.removed = as_redundant(redundant, self.joints)
         self.formulation = formulation
         if formulation not in _FORMULATIONS:
             raise ValueError(f"Model: `formulation` must be one of {_FORMULATIONS}, got {formulation!r}.")
@@ -143,6 +146,8 @@ class Model(eqx.Module):
         self._check_duplicates()
         if self._groups is not None and all(group.name is None for group in self._groups):
             raise ValueError("Model: fixed joints hold all bodies on the ground; let at least one of them move.")
+        if redundant == "remove":
+            self.removed = repeated_equations(self.system, self.bodies, self.joints)
 
     def __repr__(self) -> str:
         fields = {name: roster(getattr(self, name)) for name in ("bodies", "joints", "forces")}
@@ -189,7 +194,9 @@ class Model(eqx.Module):
                 "'minimum_norm' does not have them; remove the redundant equations, or take own_forces=False."
             )
         return dataclasses.replace(
-            system, linear_solver=self.linear_solver, minimum_norm=self.redundant == "minimum_norm"
+            without(system, self.removed),
+            linear_solver=self.linear_solver,
+            minimum_norm=self.redundant == "minimum_norm",
         )
 
     def _checked(self) -> "Model":
@@ -261,6 +268,9 @@ class Model(eqx.Module):
 
     def _of(self, scene: Scene) -> "Model":
         options: dict[str, Any] = {name: getattr(self, name) for name in _OPTIONS} | {"merge_fixed": scene.merge_fixed}
+        kinds = lambda joints: {name: (type(joint), joint.a, joint.b) for name, joint in joints.items()}
+        if self.redundant == "remove" and kinds(scene.joints) == kinds(self.joints):
+            options["redundant"] = self.removed  # the numbers may be traced
         return Model(*scene[:3], **options)
 
     def toward(self, paths: Sequence[Sequence[AbstractReduction]], s, rate) -> "Model":

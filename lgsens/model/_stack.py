@@ -134,13 +134,13 @@ class Stack(eqx.Module, Generic[Element]):
         relative, coupled = self.elements.relative, self.elements.coupled
         return found._replace(relative=relative, coupled=coupled, velocity=velocity, nth=self.places)
 
-    def only(self, i: int) -> "Stack[Element]":
-        """The stack of one of its elements."""
-        own = slice(i, i + 1)
-        a, b = (None if side is None else side[own] for side in (self.a, self.b))
-        elements = jax.tree.map(lambda leaf: leaf[own], self.elements)
-        carriers = tuple(of[own] for of in self.carriers)
-        return Stack(elements, a, b, self.owners[own], self.kept[own], self.places[own], carriers, self.joints[own])
+    def only(self, *which: int) -> "Stack[Element]":
+        """The stack of some of its elements."""
+        own = lambda of: tuple(of[i] for i in which)
+        a, b = (None if side is None else own(side) for side in (self.a, self.b))
+        elements = jax.tree.map(lambda leaf: leaf[np.asarray(which)], self.elements)
+        carriers, joints = tuple(map(own, self.carriers)), own(self.joints) if self.joints else ()
+        return Stack(elements, a, b, own(self.owners), own(self.kept), own(self.places), carriers, joints)
 
     def map(self, function, ends: AtEnds, extra: Sequence[Any] = ()):
         """`function(element, frame_a, frame_b, *(side_a, side_b)…, *extra, *others)` for each; `ends`: of `at_ends`.

@@ -4,9 +4,7 @@ from lgsens.simulation._body_motion import BodyMotion as BodyMotion, PointMotion
 from lgsens.simulation._errors import (
     SimulationError as SimulationError,
     failures_by_callback as failures_by_callback,
-    left_null_space as left_null_space,
     raise_if_failed as raise_if_failed,
-    redundant_names as redundant_names,
     throw_if_failed as throw_if_failed,
 )
 from lgsens.simulation._joint_motion import JointMotion as JointMotion

@@ -8,9 +8,8 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 
-from lgsens.dynamics import RESULTS, full_jacobian, initial_state
+from lgsens.dynamics import RESULTS, full_jacobian, initial_state, redundant_names
 from lgsens.integrate import singular_steps
-from lgsens.linear import Matrix, SparseMatrix
 from lgsens.model import invalid_numbers, scene_of
 
 # Whether a failure inside `jit` calls back. JAX keys its caches on it: both are traced.
@@ -36,23 +35,6 @@ def failures_by_callback(active: bool = True):
     from what comes out. A program with a callback is not kept in JAX's persistent cache, nor can it be exported.
     """
     return _by_callback(active)
-
-
-def redundant_names(jacobian: Matrix, names: tuple[str, ...]) -> list[str]:
-    """The joints whose rows of B are linearly dependent: those with weight in the left null space of B."""
-    if isinstance(jacobian, SparseMatrix):
-        jacobian = jacobian.to_numpy()
-    null_space, _ = left_null_space(jacobian)
-    weight = np.abs(null_space).max(axis=1, initial=0.0)
-    return sorted({name for name, w in zip(names, weight) if w > np.sqrt(np.finfo(jacobian.dtype).eps)})
-
-
-def left_null_space(jacobian: np.ndarray) -> tuple[np.ndarray, int]:
-    """An orthonormal basis of the left null space of B with unit rows, and the rank of B."""
-    rows = jacobian / np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), np.finfo(jacobian.dtype).tiny)
-    left, singular, _ = np.linalg.svd(rows)
-    rank = int(np.sum(singular > np.sqrt(np.finfo(jacobian.dtype).eps)))
-    return left[:, rank:], rank
 
 
 def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> str:

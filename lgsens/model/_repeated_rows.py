@@ -1,0 +1,102 @@
+"""Which equations of joints repeat others, and are left out: `Model(redundant="remove")`.
+
+Which ones can be left out, and which of them leave equations that are far from singular wherever the mechanism goes,
+`dynamics.repeated_rows` says. Among these, weights prefer what holds directions to what holds points, as pins carry
+forces before moments; of what is alike, the joints that are last by name. What drives is never left out: where it
+repeats others, they determine already what it prescribes.
+"""
+
+import dataclasses
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from lgsens._validate import is_concrete
+from lgsens.dynamics import jacobians_on_the_way, rank_near_reference, redundant_names, repeated_rows
+from lgsens.model._body import RigidBody
+from lgsens.model._frames import ROTATION
+from lgsens.model._joints import AbstractJoint
+from lgsens.model._signals import AbstractSignal
+from lgsens.model._system import MultibodySystem
+
+# Of each equation its joint, which of the joint's basic constraints, and which row of that.
+Equations = tuple[tuple[str, int, int], ...]
+_POINT, _FIRST = 0.1, 0.9  # of a direction, and of the last joint, 1
+_REDUNDANT = ("refuse", "minimum_norm", "remove")
+
+
+def as_redundant(given: Any, joints: Collection[str]) -> tuple[str, Equations]:
+    """What `Model(redundant=…)` is: one of the three words, and the equations if they are given."""
+    if isinstance(given, str) and given in _REDUNDANT:
+        return given, ()
+    is_row = lambda row: isinstance(row, tuple) and tuple(map(type, row)) == (str, int, int)
+    if isinstance(given, str) or not isinstance(given, Iterable) or not all(map(is_row, given := tuple(given))):
+        raise ValueError(
+            f"Model: `redundant` must be one of {_REDUNDANT}, or the equations `removed` of another model, "
+            f"got {given!r}."
+        )
+    if unknown := sorted({name for name, *_ in given} - set(joints)):
+        raise ValueError(f"Model: `redundant` names {unknown}; the joints are {sorted(joints)}.")
+    return "remove", given
+
+
+def repeated_equations(
+    built: Callable[[], MultibodySystem], bodies: Mapping[str, RigidBody], joints: Mapping[str, AbstractJoint]
+) -> Equations:
+    """The equations of what is `built` of a scene that follow from the others near the reference, at t = 0.
+
+    Raises `ValueError` where what drives is among those that repeat each other, and for traced numbers.
+    """
+    if not is_concrete(bodies, joints):
+        raise ValueError(
+            "Model: redundant='remove' looks for equations that repeat others, and its numbers are traced (jit, vmap, "
+            "grad). Build the model once where they are known, and give redundant=model.removed here."
+        )
+    system = built()
+    scene, t = dataclasses.replace(system, minimum_norm=True), jnp.zeros((), system.mass.dtype)
+    found = rank_near_reference(scene, t)
+    if found.near == len(found.jacobian):
+        return ()
+    equations: dict[int, tuple[str, int, int]] = {}
+    driven = np.zeros(len(found.jacobian), bool)
+    for stack, rows in zip(system.constraints, system.topology.rows):
+        for owner, place, own in zip(stack.owners, stack.places, rows):
+            driven[own[own >= 0]] = joints[owner].drives or _follows_a_signal(joints[owner])
+            equations |= {int(row): (owner, place, i) for i, row in enumerate(own) if row >= 0}
+    repeating = redundant_names(found.jacobian, system.constraint_names)
+    if conflicts := [name for name in repeating if joints[name].drives or _follows_a_signal(joints[name])]:
+        raise ValueError(
+            f"Model: redundant='remove': {conflicts} prescribe what the other joints determine already; leave one out "
+            f"of {repeating}."
+        )
+    jacobians = np.stack(jacobians_on_the_way(scene, found, t, driven)) * np.asarray(system.coordinate_scale())
+    translations = system.index[:, : ROTATION.start]
+    directions = ~np.any(jacobians[..., translations[translations >= 0]] != 0.0, axis=(0, 2))
+    order = np.argsort(sorted(equations, key=equations.__getitem__))
+    weights = np.where(directions, 1.0, _POINT) * (_FIRST + (1.0 - _FIRST) * order / len(order))
+    return tuple(sorted(equations[row] for row in repeated_rows(jacobians, weights)))
+
+
+def _follows_a_signal(joint: AbstractJoint) -> bool:
+    prescribed = [field.name for field in dataclasses.fields(joint) if field.metadata.get("prescribed")]
+    return any(isinstance(getattr(joint, name), AbstractSignal) for name in prescribed)
+
+
+def without(system: MultibodySystem, equations: Equations) -> MultibodySystem:
+    """The equations of motion without those of joints, also of parts that are merged."""
+    if not equations:
+        return system
+    gone, constraints = frozenset(equations), []
+    for stack in system.constraints:
+        kept = tuple(
+            tuple(own and (owner, place, i) not in gone for i, own in enumerate(of))
+            for owner, place, of in zip(stack.owners, stack.places, stack.kept)
+        )
+        if which := [i for i, of in enumerate(kept) if any(of)]:
+            constraints.append(dataclasses.replace(stack, kept=kept).only(*which))
+    parts = system.parts
+    if parts is not None:
+        parts = dataclasses.replace(parts, system=without(parts.system, equations))
+    return dataclasses.replace(system, constraints=tuple(constraints), parts=parts)

@@ -1,0 +1,213 @@
+"""`Model(redundant="remove")`: what is left out, and that everything takes what is left; against mechanisms without
+redundant equations, least norm, and differences."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import says
+from test_kinematics import hinged_four_bar
+from test_redundant import DOOR, EXACT, bricard, door
+
+import lgsens as lg
+
+Z, G = (0.0, 0.0, 1.0), (0.0, -9.81, 0.0)
+
+
+def sprung(length, *, planar, redundant="remove", **options):
+    """A four-bar of four hinges with a spring and a damper, at rest or with the crank turning."""
+    model = hinged_four_bar(length, planar=planar)
+    joints = {name: joint for name, joint in model.joints.items() if name != "motor"}
+    spring = lg.SpringDamper(
+        None, "coupler", at_a=(0.9, 0.9, 0.0), at_b=(0.4, 0.4, 0.0), stiffness=400.0, damping=20.0, free_length=0.5
+    )
+    crank = dataclasses.replace(model.bodies["crank"], angular_velocity=jnp.asarray((0.0, 0.0, 2.0)))
+    return lg.Model(
+        model.bodies | {"crank": crank},
+        joints,
+        model.forces | {"spring": spring},
+        redundant="refuse" if planar else redundant,
+        **options,
+    )
+
+
+HINGED = sprung(0.0, planar=False)
+
+
+def seen(trajectory):
+    """What is unique of a motion."""
+    rocker = trajectory.body("rocker")
+    parts = rocker.position, rocker.orientation, rocker.velocity, rocker.acceleration
+    return jnp.concatenate([part.ravel() for part in parts])
+
+
+RADAU = lg.RadauIIA(tolerance=1e-12)
+STABILIZED = lg.GeneralizedAlpha(0.8, tolerance=1e-13, stabilized=True)
+
+
+def run(length, planar, integrator, **options):
+    model = sprung(length, planar=planar, redundant=HINGED.removed)
+    return lg.simulate(model, t1=0.3, num_steps=30, integrator=integrator, **options)
+
+
+def test_what_is_left_out_of_hinges():
+    """Of the twelve equations out of the plane nine are independent, and those in it stay."""
+    assert len(HINGED.removed) == 3
+    assert HINGED.summary().degrees_of_freedom == lg.constraint_rank(HINGED).degrees_of_freedom == 1
+    assert lg.constraint_rank(HINGED).redundant == 0
+    constraints = {name: place for name, place, _ in HINGED.removed}
+    assert all(place > 0 for place in constraints.values())  # directions, not points
+    # a door keeps one equation less than two pins have, and no direction
+    kept = door(DOOR, redundant="remove").system().constraint_names
+    assert sorted(kept) == ["lower"] * 3 + ["upper"] * 2
+
+
+SLOW = pytest.mark.slow  # programs of their own
+
+
+@pytest.mark.parametrize(
+    "integrator",
+    [pytest.param(EXACT, marks=SLOW), STABILIZED, pytest.param(RADAU, marks=SLOW)],
+    ids=["alpha", "stabilized", "radau"],
+)
+def test_the_motion_is_that_of_the_planar_mechanism(integrator):
+    # round-off of 30 steps in accelerations of 30 m/s², Newton's tolerance over h²
+    np.testing.assert_allclose(
+        seen(run(0.0, False, integrator)), seen(run(0.0, True, integrator)), rtol=1e-8, atol=1e-8
+    )
+
+
+@SLOW
+@pytest.mark.parametrize(
+    ("method", "integrator"),
+    [(of, by) for of in (lg.DirectDifferentiation(), lg.AdjointVariable()) for by in (STABILIZED, RADAU)],
+)
+def test_gradients_by_a_length_are_those_of_the_planar_mechanism(method, integrator):
+    def end(length, planar):
+        return run(length, planar, integrator, sensitivity=method).body("rocker").position[-1, 0]
+
+    mode = jax.jacfwd if isinstance(method, lg.DirectDifferentiation) else jax.jacrev
+    found, expected = (jax.jit(mode(lambda x, of=of: end(x, of)))(0.01) for of in (False, True))
+    np.testing.assert_allclose(found, expected, rtol=1e-9)  # Newton's tolerance, times the 1e2 of 30 steps
+
+
+def test_linearize_takes_it():
+    found, expected = (lg.linearize(sprung(0.0, planar=planar)).eigenvalues for planar in (False, True))
+    np.testing.assert_allclose(found, expected, rtol=1e-9)  # second derivatives at an equilibrium found to 1e-10
+
+
+@SLOW
+def test_statics_take_it():
+    def held(planar):
+        model = sprung(0.0, planar=planar)
+        pull = lg.AppliedForce("rocker", at=(0.8, 0.3, 0.0), force=(1.0, 0.0, 0.0))
+        model = lg.Model(model.bodies, model.joints, model.forces | {"pull": pull}, redundant=model.redundant)
+        return lg.statics(model, loads={"pull": [0.0, 20.0]}).body("rocker").position
+
+    np.testing.assert_allclose(held(False), held(True), atol=1e-9)
+
+
+@SLOW
+def test_of_a_mechanism_that_no_plane_explains():
+    """Bricard's mechanism by Radau, against multipliers of least norm; its equation is left out where the others stay
+    regular all the way: without other ones the run ends in a singular configuration at 1.245 s."""
+    model = bricard(redundant="remove")
+    assert len(model.removed) == 1
+    found = lg.simulate(model, t1=1.5, num_steps=150, integrator=EXACT).body("rod 2").position
+    np.testing.assert_allclose(
+        found, lg.simulate(bricard(), t1=1.5, num_steps=150, integrator=EXACT).body("rod 2").position, atol=1e-7
+    )  # joints of the latter give way by 1e-7 of what the scheme is off in a step
+
+
+def scissors(planar, stages=6):
+    """A lift of crossed bars, each pair pinned in the middle and at the ends to the next: loops one above the other."""
+    free = "x y rz" if planar else None
+    bodies, joints = {}, {}
+    for i in range(stages):
+        for name, sign in (("left", 1.0), ("right", -1.0)):
+            bodies[f"{name} {i}"] = lg.RigidBody(
+                1.0, (0.02, 0.05, 0.06), position=(0.0, 0.3 * i + 0.15, 0.0), free=free
+            )
+            if i:
+                below = f"{'right' if name == 'left' else 'left'} {i - 1}"
+                at = (-0.4 * sign, 0.3 * i, 0.0)
+                joints[f"{name} foot {i}"] = lg.RevoluteJoint(below, f"{name} {i}", at=at, axis=Z)
+        joints[f"middle {i}"] = lg.RevoluteJoint(f"left {i}", f"right {i}", at=(0.0, 0.3 * i + 0.15, 0.0), axis=Z)
+    joints["pin"] = lg.RevoluteJoint(None, "left 0", at=(-0.4, 0.0, 0.0), axis=Z)
+    joints["roller"] = lg.PointOnPlaneJoint(None, "right 0", at=(0.4, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+    return lg.Model(
+        bodies,
+        joints,
+        {"gravity": lg.Gravity(G)},
+        redundant="refuse" if planar else "remove",
+        linear_solver=lg.BlockSparse(),
+    )
+
+
+@SLOW
+def test_of_many_loops_by_block_elimination():
+    found, expected = (
+        lg.simulate(scissors(planar), t1=0.1, num_steps=20, integrator=EXACT).body("left 5").position
+        for planar in (False, True)
+    )
+    assert scissors(False).summary().degrees_of_freedom == 1
+    np.testing.assert_allclose(found, expected, atol=1e-9)  # as above, with 12 bodies one above the other
+
+
+@SLOW
+def test_of_parts_that_fixed_joints_merge():
+    """What a fixed joint carries is the same as with free planar bodies."""
+
+    def carried(planar):
+        model = sprung(0.0, planar=planar)
+        free = "x y rz" if planar else None
+        load = lg.RigidBody(0.5, (0.001, 0.001, 0.001), position=(0.9, 0.2, 0.0), free=free)
+        joints = model.joints | {"weld": lg.FixedJoint("rocker", "load", at=(0.8, 0.2, 0.0))}
+        options = {"redundant": "refuse" if planar else "remove", "merge_fixed": True}
+        model = lg.Model(model.bodies | {"load": load}, joints, model.forces, **options)
+        return lg.simulate(model, t1=0.1, num_steps=10, integrator=EXACT).joint("weld").force
+
+    np.testing.assert_allclose(carried(False), carried(True), rtol=1e-8, atol=1e-8)  # as of the motion
+
+
+@SLOW
+def test_on_se3():
+    found, expected = (
+        seen(lg.simulate(sprung(0.0, planar=planar, formulation=of), t1=0.1, num_steps=100, integrator=EXACT))
+        for planar, of in ((False, "SE3"), (True, "R3xSO3"))
+    )
+    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3)  # two schemes of order two, ω h = 0.01 squared
+
+
+def test_traced_numbers_take_what_was_left_out_before():
+    with pytest.raises(ValueError, match=says("its numbers are traced", "redundant=model.removed")):
+        jax.jit(lambda length: sprung(length, planar=False).bodies)(0.0)
+    model = jax.jit(lambda length: sprung(length, planar=False, redundant=HINGED.removed))(0.0)
+    assert model.redundant == "remove" and model.removed == HINGED.removed
+    assert model.reduced(lg.model.Without("spring")).removed == HINGED.removed
+    assert sprung(0.0, planar=False, redundant=HINGED.removed).system().constraint_names == (
+        HINGED.system().constraint_names
+    )
+
+
+def test_what_cannot_be_left_out_is_said():
+    model = hinged_four_bar(0.0, planar=False)
+    twice = model.joints | {"other": lg.RotationDriver(None, "rocker", axis=Z)}
+    with pytest.raises(ValueError, match=says("redundant='remove'", "'motor', 'other'", "prescribe", "leave one out")):
+        lg.Model(model.bodies, twice, model.forces, redundant="remove")
+    for wrong, words in (("some", "'some'"), ([("hinge1", 0)], "hinge1"), (3, "got 3"), ([("door", 1, 0)], "'door'")):
+        with pytest.raises(ValueError, match=says("`redundant`", words)):
+            sprung(0.0, planar=False, redundant=wrong)
+
+
+def test_kinematics_takes_it():
+    model = hinged_four_bar(0.0, planar=False)
+    model = lg.Model(model.bodies, model.joints, model.forces, redundant="remove")
+    found, expected = (
+        lg.kinematics(of, {"motor": np.linspace(0.0, 1.5, 4)}, rates={"motor": 3.0})
+        for of in (model, hinged_four_bar(0.0, planar=True))
+    )
+    for what in (lambda k: k.body("rocker").acceleration, lambda k: k.multiplier("motor")):
+        np.testing.assert_allclose(what(found), what(expected), rtol=1e-11, atol=1e-11)  # round-off
