@@ -185,7 +185,8 @@ def test_traced_numbers_take_what_was_left_out_before():
     with pytest.raises(ValueError, match=says("its numbers are traced", "redundant=model.removed")):
         jax.jit(lambda length: sprung(length, planar=False).bodies)(0.0)
     model = jax.jit(lambda length: sprung(length, planar=False, redundant=HINGED.removed))(0.0)
-    assert model.redundant == "remove" and model.removed == HINGED.removed
+    assert model.removed == HINGED.removed
+    assert dataclasses.replace(model, formulation="SE3").removed == HINGED.removed
     assert model.reduced(lg.model.Without("spring")).removed == HINGED.removed
     assert sprung(0.0, planar=False, redundant=HINGED.removed).system().constraint_names == (
         HINGED.system().constraint_names

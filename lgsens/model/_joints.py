@@ -16,13 +16,7 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import axis_field, point_field, require
 from lgsens.liegroups import cross
-from lgsens.model._constraints import (
-    AbstractRows,
-    Coincidence,
-    Distance,
-    InPlane,
-    Orthogonality,
-)
+from lgsens.model._constraints import AbstractRows, Coincidence, Distance, InPlane, Orthogonality
 from lgsens.model._frames import Frame, normals
 from lgsens.model._free import single_rotation
 from lgsens.model._relative import (
@@ -55,9 +49,8 @@ class AbstractJoint(eqx.Module):
 
     A joint of one's own has these two names, leaves for its numbers, and `constraints`. It is `assembled` if the
     reference configuration satisfies it by construction, and `rigid` if its bodies move as one. `coordinates` are those
-    that it leaves its bodies, or prescribes if it `drives`: functions of the pose of its frame on b in that on a
-    (`lgsens.model.Coordinate`); `slips` the velocities [ẋ, ω] of that pose that rub, 0 … 5, and 6 … 8 those of ω about
-    the axes of b's frame.
+    that it leaves them, or `drives`: functions of the pose of its frame on b in that on a (`lgsens.model.Coordinate`);
+    `slips` the velocities [ẋ, ω] of that pose that rub, 0 … 5, and 6 … 8 those of ω about the axes of b's frame.
     """
 
     a: eqx.AbstractVar[str | None]

@@ -81,9 +81,8 @@ class Model(eqx.Module):
     forces: dict[str, AbstractForce]
     linear_solver: AbstractLinearSolver | None = eqx.field(static=True)
     merge_fixed: bool = eqx.field(static=True)
-    redundant: str = eqx.field(static=True)
+    redundant: str | Equations = eqx.field(static=True)  # what was removed, of "remove"
     formulation: str = eqx.field(static=True)
-    removed: Equations = eqx.field(static=True)  # of joints: the name, which basic constraint of it, and which row
 
     def __init__(
         self,
@@ -113,7 +112,7 @@ class Model(eqx.Module):
         self.merge_fixed = merge_fixed
         if not isinstance(merge_fixed, bool):
             raise ValueError(f"Model: `merge_fixed` must be True or False, got {merge_fixed!r}.")
-        self.redundant, self.removed = as_redundant(redundant, self.joints)
+        self.redundant = as_redundant(redundant, self.joints)
         self.formulation = formulation
         if formulation not in _FORMULATIONS:
             raise ValueError(f"Model: `formulation` must be one of {_FORMULATIONS}, got {formulation!r}.")
@@ -147,7 +146,12 @@ class Model(eqx.Module):
         if self._groups is not None and all(group.name is None for group in self._groups):
             raise ValueError("Model: fixed joints hold all bodies on the ground; let at least one of them move.")
         if redundant == "remove":
-            self.removed = repeated_equations(self.system, self.bodies, self.joints)
+            self.redundant = repeated_equations(self.system, self.bodies, self.joints)
+
+    @property
+    def removed(self) -> Equations:
+        """The equations that are left out: of each its joint, which of the joint's basic constraints, and its row."""
+        return () if isinstance(self.redundant, str) else self.redundant
 
     def __repr__(self) -> str:
         fields = {name: roster(getattr(self, name)) for name in ("bodies", "joints", "forces")}
@@ -269,8 +273,8 @@ class Model(eqx.Module):
     def _of(self, scene: Scene) -> "Model":
         options: dict[str, Any] = {name: getattr(self, name) for name in _OPTIONS} | {"merge_fixed": scene.merge_fixed}
         kinds = lambda joints: {name: (type(joint), joint.a, joint.b) for name, joint in joints.items()}
-        if self.redundant == "remove" and kinds(scene.joints) == kinds(self.joints):
-            options["redundant"] = self.removed  # the numbers may be traced
+        if not isinstance(self.redundant, str) and kinds(scene.joints) != kinds(self.joints):
+            options["redundant"] = "remove"  # anew, of known numbers
         return Model(*scene[:3], **options)
 
     def toward(self, paths: Sequence[Sequence[AbstractReduction]], s, rate) -> "Model":

@@ -27,10 +27,10 @@ _POINT, _FIRST = 0.1, 0.9  # of a direction, and of the last joint, 1
 _REDUNDANT = ("refuse", "minimum_norm", "remove")
 
 
-def as_redundant(given: Any, joints: Collection[str]) -> tuple[str, Equations]:
-    """What `Model(redundant=…)` is: one of the three words, and the equations if they are given."""
+def as_redundant(given: Any, joints: Collection[str]) -> str | Equations:
+    """What `Model(redundant=…)` is: one of the three words, or the equations."""
     if isinstance(given, str) and given in _REDUNDANT:
-        return given, ()
+        return given
     is_row = lambda row: isinstance(row, tuple) and tuple(map(type, row)) == (str, int, int)
     if isinstance(given, str) or not isinstance(given, Iterable) or not all(map(is_row, given := tuple(given))):
         raise ValueError(
@@ -39,7 +39,7 @@ def as_redundant(given: Any, joints: Collection[str]) -> tuple[str, Equations]:
         )
     if unknown := sorted({name for name, *_ in given} - set(joints)):
         raise ValueError(f"Model: `redundant` names {unknown}; the joints are {sorted(joints)}.")
-    return "remove", given
+    return given
 
 
 def repeated_equations(
