@@ -77,7 +77,9 @@ def set_options() -> None:
 
     Warns where JAX has read XLA_FLAGS already, and sums may be wrong.
     """
-    if (os.cpu_count() or 1) <= _FEW_CORES:
+    # of a process that is held to some cores XLA counts those, where the system says which
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if cores <= _FEW_CORES:
         os.environ.setdefault("PJRT_NPROC", "1")
     flags = os.environ.get("XLA_FLAGS", "")
     missing = {
