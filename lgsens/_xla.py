@@ -32,14 +32,14 @@ them unasked. Of the quarter-car, relative to jaxlib 0.10.2 as it comes, one cor
 (the top's simulation and gradient 0.58 and 0.55, those of a chain of 64 links 0.92; batches of 32 designs on two cores
 no slower). Both are keys of `--xla_backend_extra_options`, of which XLA ignores those that it does not know.
 
-Third, on two cores jaxlib 0.10 to 0.12 can wait for ever. A LAPACK call with a batch of matrices hands them to XLA's
+Third, on two cores jaxlib before 0.12 can wait for ever. A LAPACK call with a batch of matrices hands them to XLA's
 threads and waits for them on one of these. Where the two threads of two cores are both at such a call, nobody is left:
 `vmap` of 26 quarter-cars stood still at the second call in two factorizations that do not depend on each other, the
-batched gradient of `random_road` in a QR and an LU (0.12: it stood still too, where was not looked at). With one thread
-(`PJRT_NPROC=1`, which XLA reads when it starts) a batch is done where it is asked for. So that is set on machines of
-one or two cores unless the user has set it; with more cores as many such calls would have to meet. One quarter-car or
-top is faster with it, a batch of 256 tops takes 83 instead of 66 ms. (`lgsens.sweep` takes its factorizations apart by
-itself, `sweeps._one_by_one`.)
+batched gradient of `random_road` in a QR and an LU. (With 0.12 both came to their end, 16 batches and 400 gradients;
+with 0.10 and three or four threads too, 8 and 200 each.) With one thread (`PJRT_NPROC=1`, which XLA reads when it
+starts) a batch is done where it is asked for. So that is set on machines of one or two cores unless the user has set
+it; with more cores as many such calls would have to meet. One quarter-car or top is faster with it, a batch of 256 tops
+takes 83 instead of 66 ms. (`lgsens.sweep` takes its factorizations apart by itself, `sweeps._one_by_one`.)
 """
 
 import contextlib
@@ -65,7 +65,7 @@ _OPTIONS = (
     (_SUMS, "-reduce", (0, 10, 2), (0, 13)),
     (_EXTRA, _SMALL_PROGRAMS, (0, 10), (0, 11)),
 )
-_FEW_CORES = 2
+_WAITS, _FEW_CORES = _VERSION < (0, 12), 2
 Carry = TypeVar("Carry")
 Y = TypeVar("Y")
 _COLLECTED = 100_000  # how many objects are made before Python looks for those that are no longer used
@@ -79,7 +79,7 @@ def set_options() -> None:
     """
     # of a process that is held to some cores XLA counts those, where the system says which
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if cores <= _FEW_CORES:
+    if _WAITS and cores <= _FEW_CORES:
         os.environ.setdefault("PJRT_NPROC", "1")
     flags = os.environ.get("XLA_FLAGS", "")
     missing = {
