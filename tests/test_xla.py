@@ -99,7 +99,7 @@ def test_what_is_traced_sets_the_collector_back():
 @pytest.mark.parametrize("cores, own, threads", [(2, None, "1"), (2, "2", "2"), (16, None, "None")])
 def test_few_cores_get_one_thread_unless_the_user_says_otherwise(cores, own, threads):
     """On two, batched factorizations at once wait for each other for ever, before 0.12."""
-    if own is None and jaxlib_version >= (0, 12):
+    if own is None and VERSION >= (0, 12):
         threads = "None"
     given = {name: value for name, value in os.environ.items() if name != "PJRT_NPROC"}
     given |= {} if own is None else {"PJRT_NPROC": own}
