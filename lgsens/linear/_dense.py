@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from lgsens._xla import fori_loop
+from lgsens._xla import alike, fori_loop
 from lgsens.linear import tuned
 
 
@@ -24,9 +24,9 @@ class LU(eqx.Module):
         lu, pivots, permutation = lax.linalg.lu(matrix)
         exchanged = lambda pivots, _: (_permutation(pivots), _permutation(pivots, inverse=True))
         # elsewhere a loop over rows would be as many kernels, one after the other, whatever the batch
-        found = lax.platform_dependent(
-            pivots, permutation, cpu=exchanged, default=lambda _, rows: (rows, jnp.argsort(rows).astype(rows.dtype))
-        )
+        # what argsort returns does not vary over a mesh, as XLA's branches must alike
+        by_sorting = lambda _, rows: (rows, alike(jnp.argsort(rows).astype(rows.dtype), rows))
+        found = lax.platform_dependent(pivots, permutation, cpu=exchanged, default=by_sorting)
         return cls(lu, *found)
 
     def solve(self, rhs, *, transposed: bool = False):
