@@ -1,5 +1,6 @@
 """`simulate(…, save=…)`: the same values and derivatives as of the trajectory, without the trajectory."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,6 +56,57 @@ def test_adjoint_variable_method():
     method = {"sensitivity": lg.AdjointVariable()}
     found = jax.grad(lambda alpha: total(saved(alpha, **method).values))(0.7)
     np.testing.assert_allclose(found, jax.grad(lambda alpha: total(of_trajectory(alpha)))(0.7), rtol=1e-9)
+
+
+class Weighted(eqx.Module):
+    weights: jax.Array
+
+    def __call__(self, s):
+        return self.weights @ s.body("top").position
+
+
+def weighted(save, **settings):
+    """An output that depends on a number in the model and in itself; and of the trajectory."""
+
+    def of(a):
+        run = lg.simulate(spinning_top(0.1 * a), save=save(a), **(SETTINGS | settings))
+        return run.values[-1]
+
+    def expected(a):
+        trajectory = lg.simulate(spinning_top(0.1 * a), **SETTINGS)
+        return jnp.array([a, a**2, 3.0]) @ trajectory.body("top").position[-1]
+
+    return of, expected
+
+
+def in_a_closure(a):
+    return lambda s: jnp.array([a, a**2, 3.0]) @ s.body("top").position
+
+
+def in_a_module(a):
+    return Weighted(jnp.array([a, a**2, 3.0]))
+
+
+@pytest.mark.parametrize(
+    ("save", "derivative"),
+    [
+        (in_a_closure, lambda f: jax.jit(jax.grad(f))),
+        pytest.param(in_a_closure, jax.grad, marks=pytest.mark.slow),
+        pytest.param(in_a_closure, jax.jacfwd, marks=pytest.mark.slow),
+        pytest.param(in_a_module, lambda f: jax.jit(jax.jacfwd(f)), marks=pytest.mark.slow),
+        pytest.param(in_a_module, jax.grad, marks=pytest.mark.slow),
+        pytest.param(in_a_closure, lambda f: lambda a: jax.vmap(jax.grad(f))(a[None])[0], marks=pytest.mark.slow),
+    ],
+)
+def test_traced_numbers_in_what_is_asked_have_derivatives(save, derivative):
+    of, expected = weighted(save)
+    np.testing.assert_allclose(derivative(of)(jnp.asarray(7.0)), jax.grad(expected)(7.0), rtol=1e-9)  # two programs
+
+
+def test_traced_numbers_in_what_is_asked_are_refused_with_checkpoints():
+    of, _ = weighted(in_a_closure, sensitivity=lg.DirectDifferentiation(checkpoints="sqrt"))
+    with pytest.raises(ValueError, match=says("`save` depends on numbers", "`checkpoints`", "Give them to the model")):
+        jax.grad(of)(7.0)
 
 
 def memory(num_steps):

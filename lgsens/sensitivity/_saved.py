@@ -42,46 +42,58 @@ class _Shown(eqx.Module):
     output: Output = eqx.field(static=True)
     scheme: AbstractScheme = eqx.field(static=True)
 
-    def __call__(self, system, state: State, t):
-        return self.output(system, self.scheme.physical(system, state), t)
+    def __call__(self, system, state: State, t, numbers: Any = None):
+        """`numbers`: those of the output."""
+        output = self.output if numbers is None else eqx.combine(numbers, self.output)
+        return output(system, self.scheme.physical(system, state), t)
 
 
 def saved_run(
     method: AbstractSensitivity, output: Output, scheme: AbstractScheme, state0: State, parameters: Parameters
 ) -> SavedRun:
-    """`output(system, state, t)` at all times of the grid.
+    """`output(system, state, t)` at all times of the grid; arrays that it holds are differentiated like parameters.
 
-    The default method does without the states where nothing is differentiated, those with `checkpoints` always.
+    The default method does without the states where nothing is differentiated, those with `checkpoints` always. The
+    latter raise `ValueError` for an output with arrays.
     """
-    shown = _Shown(output, scheme)
+    numbers, fixed = eqx.partition(output, eqx.is_array)
+    shown = _Shown(fixed, scheme)
     if isinstance(method, DirectDifferentiation | AdjointVariable) and method.checkpoints is not None:
+        if jax.tree.leaves(numbers):
+            raise ValueError(
+                "`save` depends on numbers that are traced besides those of the instant, which `checkpoints` do not "
+                "differentiate. Give them to the model, use them on what `save` returns, or leave `checkpoints` out."
+            )
         segments = Segments.of(parameters.grid.num_steps, method.checkpoints)
         rule = _direct_segments if isinstance(method, DirectDifferentiation) else _adjoint_segments
         run, _ = cast(tuple[SavedRun, Any], rule(shown, scheme, segments, state0, parameters))
     elif method == DirectDifferentiation():
-        run = _saved(shown, scheme, state0, parameters)
+        run = _saved(shown, scheme, numbers, state0, parameters)
     else:
-        return _from_states(method, shown, scheme, state0, parameters)
+        return _from_states(method, shown, scheme, numbers, state0, parameters)
     return run._replace(stats=decoded(run.stats))
 
 
-def _from_states(method: AbstractSensitivity, output: Output, scheme, state0, parameters: Parameters) -> SavedRun:
+def _from_states(
+    method: AbstractSensitivity, output: Output, scheme, numbers: Any, state0, parameters: Parameters
+) -> SavedRun:
     states, stats = method.trajectory(scheme, state0, parameters)
-    outputs = jax.vmap(partial(output, parameters.system))(states, parameters.grid.times())
+    at = lambda state, t: output(parameters.system, state, t, numbers)
+    outputs = jax.vmap(at)(states, parameters.grid.times())
     return SavedRun(outputs, jax.tree.map(lambda leaf: leaf[-1], states), stats)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _saved(output, scheme, state0, parameters) -> SavedRun:
+def _saved(output, scheme, numbers, state0, parameters) -> SavedRun:
     system, grid = parameters
-    outputs, final, stats = march(scheme, system, grid, state0, lambda state, t: output(system, state, t))
+    outputs, final, stats = march(scheme, system, grid, state0, lambda state, t: output(system, state, t, numbers))
     return SavedRun(outputs, final, encoded(stats, final.v.dtype))
 
 
 @_saved.defjvp
 def _rule(output, scheme, primals, tangents):
-    def whole(state0, parameters):
-        run = _from_states(DirectDifferentiation(), output, scheme, state0, parameters)
+    def whole(*given):
+        run = _from_states(DirectDifferentiation(), output, scheme, *given)
         return run._replace(stats=encoded(run.stats, run.final.v.dtype))
 
     return jax.jvp(whole, primals, tangents)
@@ -126,7 +138,7 @@ class _Kept(eqx.Module):
         x, y = unknown
 
         def whole(state0, parameters):
-            found = _saved(self.output, self.scheme, state0, parameters)
+            found = _saved(self.output, self.scheme, None, state0, parameters)
             return eqx.filter((found.outputs, found.final), eqx.is_inexact_array)
 
         return x, jax.tree.map(jnp.subtract, y, jax.jvp(whole, self.primals, x)[1])

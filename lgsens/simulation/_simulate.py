@@ -2,7 +2,6 @@
 
 import dataclasses
 import warnings
-from collections.abc import Callable
 from functools import partial
 from typing import Any, overload
 
@@ -34,12 +33,11 @@ from lgsens.sensitivity import (
 from lgsens.simulation._errors import primal_value, throw_if_failed
 from lgsens.simulation._index_reduced_ode import integrate_ode
 from lgsens.simulation._richardson import extrapolate_runs
+from lgsens.simulation._save import Output, Save
 from lgsens.simulation._settings import by_diffrax, check_integrator, check_sensitivity, interval
 from lgsens.simulation._start import Begin, as_system, begin
 from lgsens.simulation._to_accuracy import simulate_to
-from lgsens.simulation._trajectory import Instant, Saved, Trajectory
-
-Save = Callable[[Instant], Any]
+from lgsens.simulation._trajectory import Saved, Trajectory
 
 
 @overload
@@ -104,7 +102,7 @@ def simulate(
         save: what to return of each instant instead of the trajectory, a function s ↦ pytree of an `Instant`; the
             result is a `Saved`. Without derivatives no state is stored, so that a batch of
             designs takes the memory of what it asks for. Define it once: a new lambda in each call compiles anew.
-            Numbers that it depends on come through the model, or are constants.
+            With `checkpoints` numbers that it depends on come through the model, or are constants.
         accuracy: take as many steps as the motion takes to have this error, outside of `jit`, and extrapolate two runs
             where that is less work: the largest error of a configuration, relative to 1 rad or the length of the scene,
             and of a velocity, relative to the largest, as far as runs in n, 2n, 4n, … steps tell. `Trajectory.reached`
@@ -157,7 +155,8 @@ def simulate(
     with tracing():
         system, t0, t1, state0 = alike((system, t0, t1, state0))
         given = for_any_number(num_steps, integrator, sensitivity, save, (system, t0, t1 - t0, state0))
-        found, details = _simulate_jit(system, t0, t1, *given, sensitivity, state0, save)
+        output = None if save is None else Output.of(save, system, t0)
+        found, details = _simulate_jit(system, t0, t1, *given, sensitivity, state0, output)
         found = cut(found, num_steps) if isinstance(given[0], Steps) else found
     if throw:
         fields = ("states", "error", "stages") if save is None else ("values", "final")  # the others say what happened
@@ -259,7 +258,7 @@ def run(
     num_steps: int | Steps,
     integrator: AbstractIntegrator,
     sensitivity: AbstractSensitivity,
-    save: Save | None = None,
+    save: Output | None = None,
 ) -> tuple[Any, dict[str, Any]]:
     """`simulate` without its checks: the trajectory or what is saved of it, and what the message of a failure needs."""
     one = lambda num_steps: _single_run(system, begun, t0, t1, num_steps, integrator, sensitivity, save)
@@ -286,7 +285,7 @@ def _single_run(
             states, newton = sensitivity.trajectory(scheme, state0, parameters, laid.found)
         turns = jnp.diff(t) * unsteady_rate(system, states.v[1:], states.vdot[1:])
     else:
-        (values, rates), final, newton = saved_run(sensitivity, _Output(save), scheme, state0, parameters)
+        (values, rates), final, newton = saved_run(sensitivity, save, scheme, state0, parameters)
         turns = jnp.diff(t) * rates[1:]
     result, details = outcome(scheme, begun, newton, turns, t, laid)
     stats = scheme.statistics(newton) if laid.stats is None else laid.stats
@@ -299,12 +298,3 @@ def _single_run(
     else:
         found = Saved(t, values, scheme.physical(system, final), result, stats)
     return found, details | jax.lax.stop_gradient({"t1": t1})
-
-
-class _Output(eqx.Module):
-    """`save` as a function of the state, and how fast it turns; equal, for one compilation, where `save` is."""
-
-    save: Save = eqx.field(static=True)
-
-    def __call__(self, system, state: State, t):
-        return self.save(Instant(t=t, state=state, system=system)), unsteady_rate(system, state.v, state.vdot)
