@@ -237,6 +237,15 @@ def test_what_cannot_take_redundant_constraints_says_so():
         lg.simulate(door(DOOR, redundant="refuse"), t1=0.1, num_steps=4)
 
 
+@pytest.mark.slow  # equal steps of the same mechanism are in the quick run
+def test_redundant_equations_are_no_singular_configuration_for_adaptive_steps():
+    """Their margins come from a matrix of their own."""
+    adaptive = lg.AdaptiveSteps(tolerance=1e-5)
+    found = lg.simulate(bricard(), t1=0.5, num_steps=200, integrator=adaptive).body("rod 2").position[-1]
+    expected = lg.simulate(bricard(), t1=0.5, num_steps=200).body("rod 2").position[-1]
+    np.testing.assert_allclose(found, expected, atol=1e-3)  # what the tolerance leaves after tens of steps
+
+
 def linkage(angle, coupler=0.9, rocker=0.3):
     """A planar four-bar, crank of 0.3 m, pins 0.9 m apart; a parallelogram is flat, and singular, at the angle π."""
     turned = lambda x: np.array([-x[1], x[0], 0.0])

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import AbstractSystem, factorized, mass_scale
+from lgsens.dynamics import AbstractSystem, factorized, mass_scale, softness
 from lgsens.linear import Factors, Matrix
 
 _SMALL = 0.1  # margins above this fraction of the largest of a run are no sign: B may turn by radians in a step
@@ -43,7 +43,7 @@ def margin_of(factors: Factors, jacobian: Matrix, scale: Float[Array, " k"]) -> 
 
 def margin_by_mass(system: AbstractSystem, mass: Matrix, jacobian: Matrix, scale: Float[Array, " k"]):
     """m with M for A: it can be compared where steps are not equal, and costs a factorization."""
-    factors = factorized(system, mass, jacobian.T, jacobian, mass_scale(mass))
+    factors = factorized(system, mass, jacobian.T, jacobian, mass_scale(mass), softness=softness(system))
     return margin_of(factors, jacobian, scale)
 
 

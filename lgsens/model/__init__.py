@@ -57,10 +57,8 @@ from lgsens.model._friction import (
 from lgsens.model._joint_forces import joint_wrenches as joint_wrenches
 from lgsens.model._joints import (
     AbstractJoint as AbstractJoint,
-    CylindricalJoint as CylindricalJoint,
     DistanceJoint as DistanceJoint,
     FixedJoint as FixedJoint,
-    PrismaticJoint as PrismaticJoint,
     RevoluteJoint as RevoluteJoint,
     SphericalJoint as SphericalJoint,
     UniversalJoint as UniversalJoint,
@@ -116,6 +114,11 @@ from lgsens.model._signals import (
     Ramp as Ramp,
     Sampled as Sampled,
 )
+from lgsens.model._sliders import (
+    CylindricalJoint as CylindricalJoint,
+    PointOnLineJoint as PointOnLineJoint,
+    PrismaticJoint as PrismaticJoint,
+)
 from lgsens.model._stack import (
     constraint_force as constraint_force,
     constraint_jacobian as constraint_jacobian,
@@ -126,7 +129,6 @@ from lgsens.model._stack import (
 from lgsens.model._summary import Summary as Summary
 from lgsens.model._surface_joints import (
     PlanarJoint as PlanarJoint,
-    PointOnLineJoint as PointOnLineJoint,
     PointOnPlaneJoint as PointOnPlaneJoint,
 )
 from lgsens.model._system import MultibodySystem as MultibodySystem

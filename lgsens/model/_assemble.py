@@ -23,7 +23,7 @@ from lgsens.model._merged_parts import Parts
 from lgsens.model._on_merged_bodies import carried
 from lgsens.model._stack import Placed, stack
 from lgsens.model._system import MultibodySystem
-from lgsens.model._violable_rows import violable_rows
+from lgsens.model._violable_rows import in_plane, violable_rows
 
 _MANY = 4  # fewer forces that are alike compile faster one by one: the yardstick's cars 7 % slower with 1
 
@@ -86,8 +86,10 @@ def _assemble(
     number = {None: None} | {name: i for i, name in enumerate(names)}
     frame = {None: None} | {name: StackRow(frames, i) for i, name in enumerate(sorted(bodies))}
 
-    between = [(name, joint) for name, joint in sorted(joints.items()) if places[joint.a].body != places[joint.b].body]
     ends_of = lambda joint: (joint.a, joint.b, *joint.others)
+    bodies_of = lambda joint: [moving[body] for end in ends_of(joint) if (body := places[end].body) is not None]
+    joints = {name: in_plane(joint, bodies_of(joint)) for name, joint in sorted(joints.items())}
+    between = [(name, joint) for name, joint in joints.items() if places[joint.a].body != places[joint.b].body]
     members = [
         (joint, *map(frame.get, ends_of(joint)), *(places[end].offset for end in ends_of(joint)))
         for _, joint in between
@@ -99,9 +101,8 @@ def _assemble(
         if None in others or len({a, b, *others}) < 2 + len(others):
             raise ValueError(f"Joint {name!r} couples bodies that `merge_fixed` makes one, or ground; leave it out.")
         more = tuple(other for other in others if other is not None)
-        own = [moving[body] for end in ends_of(joint) if (body := places[end].body) is not None]
         single = [jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), of) for of in row.of]
-        for i, (of, kept) in enumerate(zip(row.of, violable_rows(name, joint, single, own))):
+        for i, (of, kept) in enumerate(zip(row.of, violable_rows(name, joint, single, bodies_of(joint)))):
             if any(kept):
                 constraints.append(Placed(StackRow(of, row.index), a, b, name, kept, i, more))
     loads, free = [], [body.coordinates for body in ordered]

@@ -22,7 +22,6 @@ from lgsens.model._free import single_rotation
 from lgsens.model._relative import (
     ANGLE,
     ARM_ANGLES,
-    DISPLACEMENT,
     LENGTH,
     ROTATION_VECTOR,
     Coordinate,
@@ -86,6 +85,11 @@ class AbstractJoint(eqx.Module):
         """The same where its bodies turn about one inertial axis (0, 1, 2) and the joint, `name` in messages, knows
         more than its constraints; None: it does not."""
         return None
+
+    def in_plane(self, axis: int) -> "AbstractJoint":
+        """The same joint between bodies that all move in the plane normal to an inertial axis (0, 1, 2), where its
+        constraints can say what of them these can violate."""
+        return self
 
     @abc.abstractmethod
     def constraints(self, a: Frame, b: Frame) -> tuple[AbstractRows, ...]:
@@ -199,67 +203,6 @@ class UniversalJoint(AbstractJoint):
     def constraints(self, a, b):
         arm_a, arm_b = self._arms()
         return (_coincidence(a, b, self.at), _orthogonality(a, b, arm_a, arm_b))
-
-
-class PrismaticJoint(AbstractJoint):
-    """Slider: `b` translates along an axis of `a` without rotation; 5 equations.
-
-    Arguments:
-        a, b: names of the two bodies; None is the ground.
-        at: a point of the sliding axis in the reference configuration [m], inertial frame, shape (3,).
-        axis: direction of sliding, inertial frame, shape (3,), any length > 0.
-
-    Raises `ValueError` for a wrong shape or a zero axis. Source: Haug (1989), §9.4.
-    """
-
-    a: str | None = eqx.field(static=True)
-    b: str | None = eqx.field(static=True)
-    at: Float[Array, "3"] = point_field("at")
-    axis: Float[Array, "3"] = axis_field("axis")
-
-    assembled = True
-    coordinates = (DISPLACEMENT,)
-    slips = (0,)
-    frames = frames_at
-
-    def constraints(self, a, b):
-        unit, first, second = normals(self.axis)
-        return (
-            *_same_orientation(a, b, (unit, first, second)),
-            _in_plane(a, b, self.at, first),
-            _in_plane(a, b, self.at, second),
-        )
-
-
-class CylindricalJoint(AbstractJoint):
-    """`b` slides along and turns about an axis of `a`; 4 equations.
-
-    Arguments:
-        a, b: names of the two bodies; None is the ground.
-        at: a point of the axis in the reference configuration [m], inertial frame, shape (3,).
-        axis: direction of the axis, inertial frame, shape (3,), any length > 0.
-
-    Raises `ValueError` for a wrong shape or a zero axis. Source: Haug (1989), §9.4.
-    """
-
-    a: str | None = eqx.field(static=True)
-    b: str | None = eqx.field(static=True)
-    at: Float[Array, "3"] = point_field("at")
-    axis: Float[Array, "3"] = axis_field("axis")
-
-    assembled = True
-    coordinates = (ANGLE, DISPLACEMENT)
-    slips = (0, 3)
-    frames = frames_at
-
-    def constraints(self, a, b):
-        unit, first, second = normals(self.axis)
-        return (
-            _orthogonality(a, b, first, unit),
-            _orthogonality(a, b, second, unit),
-            _in_plane(a, b, self.at, first),
-            _in_plane(a, b, self.at, second),
-        )
 
 
 class FixedJoint(AbstractJoint):

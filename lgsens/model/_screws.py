@@ -18,7 +18,7 @@ from lgsens.model._drivers import Angle
 from lgsens.model._elements import body_fixed
 from lgsens.model._frames import Frame, normals
 from lgsens.model._free import TRANSLATIONS, single_rotation
-from lgsens.model._joints import AbstractJoint, CylindricalJoint
+from lgsens.model._joints import AbstractJoint
 from lgsens.model._relative import ANGLE, DISPLACEMENT, frames_at
 from lgsens.model._signals import (
     AbstractSignal,
@@ -28,6 +28,7 @@ from lgsens.model._signals import (
     prescribed_field,
     require_ratio,
 )
+from lgsens.model._sliders import CylindricalJoint
 from lgsens.model._stack import constraint_force, constraint_jacobian, constraint_stiffness
 
 

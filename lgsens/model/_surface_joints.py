@@ -7,7 +7,7 @@ from lgsens._validate import axis_field, point_field
 from lgsens.model._frames import normals
 from lgsens.model._free import TRANSLATIONS, single_rotation
 from lgsens.model._joints import AbstractJoint, _in_plane, _orthogonality
-from lgsens.model._relative import ANGLE, DISPLACEMENT, IN_PLANE, ROTATION_VECTOR, frames_at
+from lgsens.model._relative import ANGLE, IN_PLANE, ROTATION_VECTOR, frames_at
 
 
 class PlanarJoint(AbstractJoint):
@@ -73,29 +73,3 @@ class PointOnPlaneJoint(AbstractJoint):
 
     def constraints(self, a, b):
         return (_in_plane(a, b, self.at, normals(self.axis)[0]),)
-
-
-class PointOnLineJoint(AbstractJoint):
-    """A point of `b` stays on a line of `a`, x·d = 0 and y·d = 0 with x, y orthogonal to the line; 2 equations.
-
-    Arguments:
-        a, b: names of the two bodies; None is the ground.
-        at: the point in the reference configuration [m], inertial frame, shape (3,).
-        axis: direction of the line, inertial frame, shape (3,), any length > 0.
-
-    The multipliers are the forces of `b` on `a` along x and y [N]. A line in the plane of planar bodies is a
-    `PointOnPlaneJoint` with its normal in that plane. Raises `ValueError` for a wrong shape or a zero axis. Source:
-    Haug (1989), §9.4.
-    """
-
-    a: str | None = eqx.field(static=True)
-    b: str | None = eqx.field(static=True)
-    at: Float[Array, "3"] = point_field("at")
-    axis: Float[Array, "3"] = axis_field("axis")
-
-    assembled = True
-    coordinates = (DISPLACEMENT, *ROTATION_VECTOR)
-    frames = frames_at
-
-    def constraints(self, a, b):
-        return tuple(_in_plane(a, b, self.at, across) for across in normals(self.axis)[1:])

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens._validate import suggestion
@@ -20,6 +19,7 @@ from lgsens.model._constraints import AbstractRows
 from lgsens.model._frames import BODY_DIM, ROTATION, motion_at
 from lgsens.model._loads import AbstractDynamicLoad, AbstractLoad, generalized_force
 from lgsens.model._merged_parts import Parts
+from lgsens.model._sizes import compliance, coordinate_scale
 from lgsens.model._stack import (
     Stack,
     at_ends,
@@ -128,20 +128,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
 
     @property
     def compliance(self):
-        """1/m for what is measured in metres, 1/(m l²) for angles and cosines, with m the mean mass of the bodies and l
-        the radius of gyration of all of them: a moment counts as a force at the arm l."""
-        if not self.minimum_norm:
-            return None
-        mass = jnp.mean(self.mass[: len(self.body_names)])
-        square = jnp.mean(jnp.trace(self.inertia[: len(self.body_names)], axis1=1, axis2=2)) / (3.0 * mass)
-        square = jnp.where(square > 0, square, 1.0)
-        angular, t = [], jnp.zeros((), mass.dtype)
-        for stack, ends, rows in zip(self.constraints, at_ends(self.constraints, self.pose), self.topology.rows):
-            translation = stack.map(constraint_jacobian, ends, (t,)).reshape(*rows.shape, -1, BODY_DIM)
-            without = jnp.all(translation[..., : ROTATION.start] == 0.0, axis=(2, 3))
-            angular.append((without.astype(mass.dtype), rows))
-        angular = lax.stop_gradient(added(angular, self.topology.num_constraints, mass.dtype))
-        return (1.0 + angular * (1.0 / square - 1.0)) / mass
+        return compliance(self) if self.minimum_norm else None
 
     def multiplier_rows(self, joint: str) -> np.ndarray:
         """Where the multipliers of a joint are in λ, in the order of its basic constraints."""
@@ -183,31 +170,19 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         return self.pose, self.velocity
 
     def coordinate_scale(self):
-        # The scene's length: the extent of the centres of mass, or the largest arm of an attachment.
-        extents = [jnp.ptp(self.pose.position[: len(self.body_names)], axis=0)]
-        for stack in (*self.constraints, *self.loads):
-            extents += [jnp.abs(arm).max(axis=0) for arm in stack.elements.fixed("point")]
-        length = jnp.max(jnp.stack(extents))
-        scale = jnp.ones(BODY_DIM, length.dtype).at[: ROTATION.start].set(jnp.where(length > 0, length, 1.0))
-        if not isinstance(self.group, Poses):
-            return jnp.tile(scale, len(self.body_names))
-        every = scale[np.concatenate([np.asarray(own, int) for own in self.free])]
-        for stack in self._dynamic:
-            sizes = jax.vmap(lambda load, length: load.size(length), in_axes=(0, None))(stack.elements, scale[0])
-            every = every.at[state_coordinates(stack, self.index)].set(sizes)
-        return every
+        return coordinate_scale(self)
 
     @property
     def num_states(self):
         return sum(map(len, self.free[len(self.body_names) :]))
 
     @property
-    def _dynamic(self) -> list[Stack[Any]]:
+    def dynamic(self) -> list[Stack[Any]]:
         """The stacks of loads with states."""
         return [stack for stack in self.loads if stack.carriers]
 
     def settled(self, q, v, t):
-        for stack, ends in zip(self._dynamic, at_ends(self._dynamic, self._placed(q), self.twists(v))):
+        for stack, ends in zip(self.dynamic, at_ends(self.dynamic, self._placed(q), self.twists(v))):
             begun = stack.map(lambda load, *args: load.initial(*args), ends, (t,))
             v = v.at[state_coordinates(stack, self.index)].set(begun)
         return v
@@ -216,7 +191,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         """By the name of each force element with states, and their names, where they are in v."""
         return {
             owner: dict(zip(stack.elements.states, places.tolist()))
-            for stack in self._dynamic
+            for stack in self.dynamic
             for owner, places in zip(stack.owners, state_coordinates(stack, self.index))
         }
 

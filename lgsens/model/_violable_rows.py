@@ -5,8 +5,15 @@ from collections.abc import Sequence
 from lgsens._validate import require
 from lgsens.model._body import RigidBody
 from lgsens.model._constraints import AbstractRows
-from lgsens.model._free import ROTATIONS, is_along, single_rotation
+from lgsens.model._free import ROTATIONS, TRANSLATIONS, is_along, single_rotation
 from lgsens.model._joints import AbstractJoint
+
+
+def in_plane(joint: AbstractJoint, bodies: Sequence[RigidBody]) -> AbstractJoint:
+    """The joint as it is between its bodies, one or two: where all of them move in one plane, in that plane."""
+    free = {name for body in bodies for name in body.free}
+    axis = single_rotation(free)
+    return joint if axis is None or TRANSLATIONS[axis] in free else joint.in_plane(axis)
 
 
 def violable_rows(

@@ -244,6 +244,12 @@ def test_leaves_are_strongly_typed_floats(system):
     assert strongly_typed_floats(updated)
 
 
+def turned(angle):
+    """About x."""
+    sine, cosine = np.sin(angle), np.cos(angle)
+    return np.array([[1.0, 0.0, 0.0], [0.0, cosine, -sine], [0.0, sine, cosine]])
+
+
 def test_scale_is_the_extent_of_the_scene():
     for size in (0.01, 3.0):
         bodies = {"l": lg.RigidBody(1.0, (1, 1, 1)), "r": lg.RigidBody(1.0, (1, 1, 1), position=(size, 0, 0))}
@@ -253,3 +259,10 @@ def test_scale_is_the_extent_of_the_scene():
         close(single.system().coordinate_scale(), expected[:6], 4)
     alone = lg.Model({"l": bodies["l"]}).system().coordinate_scale()  # nothing in it has an extent
     np.testing.assert_array_equal(alone, np.ones(6))
+    # a leaning disc that touches the ground at the origin: no extent, but for round-off, and its radius of gyration
+    lean, radius = 0.05, 0.3
+    at = radius * np.array([0.0, -np.sin(lean), np.cos(lean)])
+    disc = lg.RigidBody(3.0, (0.0675, 0.135, 0.0675), position=at, orientation=turned(lean))
+    contact = lg.Rolling("disc", at=at, axis=(0.0, np.cos(lean), np.sin(lean)), radius=radius)
+    scale = lg.Model({"disc": disc}, {"contact": contact}).system().coordinate_scale()
+    close(scale, np.r_[np.full(3, np.sqrt(0.27 / 3.0 / 3.0)), np.ones(3)], 4)

@@ -1,0 +1,157 @@
+"""Joints along a line: sliders, sleeves, and points on a line; from Haug's basic constraints.
+
+Of bodies that move in a plane they keep what these can violate. Which equations these are depends on the directions
+across the line; one of them is then the normal of the plane, whatever the line in it (`AbstractJoint.in_plane`).
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lgsens._validate import axis_field, point_field, require
+from lgsens.liegroups import cross
+from lgsens.model._frames import normals
+from lgsens.model._free import ROTATIONS
+from lgsens.model._joints import AbstractJoint, _in_plane, _orthogonality, _same_orientation
+from lgsens.model._relative import ANGLE, DISPLACEMENT, ROTATION_VECTOR, frames_at
+
+
+def _triad_in_plane(line, normal: int):
+    """The direction of a line in a plane, one across it in the plane, and the normal of the plane."""
+    across = jnp.asarray(np.eye(3)[normal], line.dtype)
+    along = line - across * line[normal]
+    unit = along / jnp.linalg.norm(along)
+    return unit, cross(across, unit), across
+
+
+def _check_in_plane(joint: AbstractJoint, line, normal: int) -> None:
+    require(
+        lambda line: abs(line[normal]) <= np.sqrt(np.finfo(line.dtype).eps) * np.abs(line).max(),
+        f"{type(joint).__name__} between {joint.a!r} and {joint.b!r}: `axis` {line} leaves the plane of their motion, "
+        f"that of the rotation {ROTATIONS[normal]!r}; turn it into the plane, or free more of them.",
+        line,
+    )
+
+
+class PrismaticJoint(AbstractJoint):
+    """Slider: `b` translates along an axis of `a` without rotation; 5 equations.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at: a point of the sliding axis in the reference configuration [m], inertial frame, shape (3,).
+        axis: direction of sliding, inertial frame, shape (3,), any length > 0.
+
+    Between bodies that move in a plane (`RigidBody.free`), in which `axis` lies, 2 equations are left: the multipliers
+    are a moment about the plane's normal, and the force of `b` on `a` across the axis. Raises `ValueError` for a wrong
+    shape, a zero axis, and one that leaves the plane of such bodies. Source: Haug (1989), §9.4.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at: Float[Array, "3"] = point_field("at")
+    axis: Float[Array, "3"] = axis_field("axis")
+
+    assembled = True
+    coordinates = (DISPLACEMENT,)
+    slips = (0,)
+    frames = frames_at
+
+    def in_plane(self, axis):
+        _check_in_plane(self, self.axis, axis)
+        return _PrismaticInPlane(self.a, self.b, at=self.at, axis=self.axis, normal=axis)
+
+    def _triad(self):
+        return normals(self.axis)
+
+    def constraints(self, a, b):
+        unit, first, second = self._triad()
+        return (
+            *_same_orientation(a, b, (unit, first, second)),
+            _in_plane(a, b, self.at, first),
+            _in_plane(a, b, self.at, second),
+        )
+
+
+class _PrismaticInPlane(PrismaticJoint):
+    normal: int = eqx.field(static=True, kw_only=True)
+
+    def _triad(self):
+        return _triad_in_plane(self.axis, self.normal)
+
+    def violable_about(self, name, free, axis):
+        return (True,), (False,), (False,), (True,), (False,)
+
+
+class CylindricalJoint(AbstractJoint):
+    """`b` slides along and turns about an axis of `a`; 4 equations.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at: a point of the axis in the reference configuration [m], inertial frame, shape (3,).
+        axis: direction of the axis, inertial frame, shape (3,), any length > 0.
+
+    Raises `ValueError` for a wrong shape or a zero axis. Source: Haug (1989), §9.4.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at: Float[Array, "3"] = point_field("at")
+    axis: Float[Array, "3"] = axis_field("axis")
+
+    assembled = True
+    coordinates = (ANGLE, DISPLACEMENT)
+    slips = (0, 3)
+    frames = frames_at
+
+    def constraints(self, a, b):
+        unit, first, second = normals(self.axis)
+        return (
+            _orthogonality(a, b, first, unit),
+            _orthogonality(a, b, second, unit),
+            _in_plane(a, b, self.at, first),
+            _in_plane(a, b, self.at, second),
+        )
+
+
+class PointOnLineJoint(AbstractJoint):
+    """A point of `b` stays on a line of `a`, x·d = 0 and y·d = 0 with x, y orthogonal to the line; 2 equations.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        at: the point in the reference configuration [m], inertial frame, shape (3,).
+        axis: direction of the line, inertial frame, shape (3,), any length > 0.
+
+    The multipliers are the forces of `b` on `a` along x and y [N]. Between bodies that move in a plane
+    (`RigidBody.free`), in which the line lies, 1 equation is left, across the line. Raises `ValueError` for a wrong
+    shape, a zero axis, and one that leaves the plane of such bodies. Source: Haug (1989), §9.4.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at: Float[Array, "3"] = point_field("at")
+    axis: Float[Array, "3"] = axis_field("axis")
+
+    assembled = True
+    coordinates = (DISPLACEMENT, *ROTATION_VECTOR)
+    frames = frames_at
+
+    def in_plane(self, axis):
+        _check_in_plane(self, self.axis, axis)
+        return _PointOnLineInPlane(self.a, self.b, at=self.at, axis=self.axis, normal=axis)
+
+    def _triad(self):
+        return normals(self.axis)
+
+    def constraints(self, a, b):
+        return tuple(_in_plane(a, b, self.at, across) for across in self._triad()[1:])
+
+
+class _PointOnLineInPlane(PointOnLineJoint):
+    normal: int = eqx.field(static=True, kw_only=True)
+
+    def _triad(self):
+        return _triad_in_plane(self.axis, self.normal)
+
+    def violable_about(self, name, free, axis):
+        return (True,), (False,)
