@@ -14,6 +14,13 @@ from jaxtyping import Array
 
 _NUMBERS = (jax.Array, np.ndarray, float, int)
 
+# What to do where a number is asked for and a function comes: `eqx.nn.MLP` holds its activation as a leaf.
+_OF_FUNCTIONS = (
+    " Functions are no leaves: split what holds them (an eqx.nn.MLP) by params, static = eqx.partition(net, "
+    "eqx.is_inexact_array), keep `static: Any = eqx.field(static=True)` beside the leaves `params`, and call "
+    "eqx.combine(params, static)."
+)
+
 
 def as_float(value: Any, shape: tuple[int, ...] | None, what: str) -> Array:
     """`value` as a strongly typed float array of `shape` (None: any shape).
@@ -25,12 +32,21 @@ def as_float(value: Any, shape: tuple[int, ...] | None, what: str) -> Array:
         array = value
     else:
         try:
+            if _says_something_else(value):
+                raise TypeError("text or truth values, of which JAX would make numbers")
             array = jnp.asarray(value, dtype=_float_type())
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{what} must be a number or an array of numbers, got {value!r}.") from error
+            remedy = _OF_FUNCTIONS if callable(value) else ""
+            raise ValueError(f"{what} must be a number or an array of numbers, got {value!r}.{remedy}") from error
     if shape is not None and array.shape != shape:
         raise ValueError(f"{what} must have shape {shape}, got shape {array.shape}.")
     return array
+
+
+def _says_something_else(value: Any) -> bool:
+    """Whether there are texts or truth values in it."""
+    kind = lambda leaf: getattr(getattr(leaf, "dtype", None), "kind", "")
+    return any(isinstance(leaf, str | bytes | bool) or kind(leaf) in {*"bSU"} for leaf in jax.tree.leaves(value))
 
 
 def is_float_array(value: Any) -> bool:
@@ -46,6 +62,8 @@ def _float_type() -> np.dtype:
 def as_count(value: Any, name: str, why: str = "") -> int:
     """`value` as a Python int of at least 1."""
     try:
+        if isinstance(value, bool | np.bool_):
+            raise TypeError("a truth value, which counts as 0 or 1")
         count = operator.index(value)
     except TypeError as error:
         raise ValueError(f"`{name}` must be a Python int{why}, got {value!r}.") from error
@@ -73,7 +91,10 @@ def require(condition: Callable[..., Any], message: str | Callable[[], str], *va
 def require_setting(owner: Any, name: str, valid: bool, must: str, advice: str = "") -> None:
     """Raise `ValueError` unless a static setting of `owner` is valid."""
     if not valid:
-        raise ValueError(f"{type(owner).__name__}: `{name}` must be {must}, got {getattr(owner, name)!r}{advice}.")
+        value = getattr(owner, name)
+        if isinstance(value, jax.Array):
+            advice = "; settings are static, no data: give a Python number, `float(x)`, which is never traced" + advice
+        raise ValueError(f"{type(owner).__name__}: `{name}` must be {must}, got {value!r}{advice}.")
 
 
 def optional(module: str, what: str, extra: str = "data") -> Any:

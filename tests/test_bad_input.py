@@ -1,5 +1,7 @@
 """Bad input to constructors: each with the argument, the value and the remedy in its message."""
 
+import equinox as eqx
+import jax
 import numpy as np
 import pytest
 from helpers import says
@@ -37,6 +39,9 @@ CONSTRUCTORS = {
         ("RigidBody: `mass`", "shape ()", "got shape (2,)"),
     ),
     "mass of text": (lambda: body(mass="heavy"), ("RigidBody: `mass`", "must be a number", "'heavy'")),
+    "mass a truth value": (lambda: body(mass=True), ("RigidBody: `mass`", "must be a number", "True")),
+    "position of texts": (lambda: body(position=["0", "1", "2"]), ("`position` must be a number", "['0', '1', '2']")),
+    "position of truth values": (lambda: body(position=np.zeros(3, bool)), ("`position` must be a number", "False")),
     "mass zero": (lambda: body(mass=0.0), ("RigidBody: `mass` must be positive", "0.0 kg")),
     "mass negative": (lambda: body(mass=-2.5), ("RigidBody: `mass` must be positive", "-2.5 kg")),
     "mass nan": (lambda: body(mass=NAN), ("RigidBody: `mass` must be positive", "nan kg")),
@@ -252,6 +257,62 @@ def test_constructor(mistake):
 def test_a_trajectory_for_a_state():
     with pytest.raises(ValueError, match=says("`state0` must be a State", "`trajectory.state(-1)`", "got Model")):
         lg.simulate(lg.Model(TWO), t1=1.0, num_steps=2, state0=lg.Model(TWO))
+
+
+def pendulum(**changes):
+    """A body 1 m below a ball joint."""
+    bodies = {"bob": body(position=(0.0, 0.0, -1.0), **changes)}
+    return lg.Model(bodies, {"pivot": ball(None, "bob")}, {"gravity": lg.Gravity((0.0, 0.0, -9.81))})
+
+
+def test_a_state_of_other_shapes():
+    """A batch of states, by itself, in `jit` and in `differentiate`; and one of a model with fewer joints."""
+    model = pendulum()
+    states = lg.simulate(model, t1=0.1, num_steps=4).states
+    run = lambda state0: lg.simulate(model, t1=0.1, num_steps=4, state0=state0).states.v
+    parts = ("`state0` must be one state of this model", "v has (5, 6) and must have (6,)", "jax.vmap(lambda state0:")
+    end = lg.Criterion(terminal=lambda s, p: s.body("bob").position[0])
+    by_p = lambda states: lg.differentiate(
+        end, lambda mass: pendulum(mass=mass), 1.0, t1=0.1, num_steps=4, state0=lambda mass: states
+    )
+    for given in (run, jax.jit(run), by_p):
+        with pytest.raises(ValueError, match=says(*parts)):
+            given(states)
+    free = lg.initial_state(lg.Model(model.bodies))
+    with pytest.raises(ValueError, match=says("`state0`", "lam has (0,) and must have (3,)", "`initial_state(model)`")):
+        run(free)
+    assert jax.vmap(run)(states).shape == (5, 5, 6)
+
+
+def test_a_state_off_the_joints():
+    """Known numbers alone are looked at, those of `grad` too; what is left of a rounded file passes."""
+    model = pendulum()
+    run = lambda state0: lg.simulate(model, t0=0.5, t1=0.6, num_steps=4, state0=state0).body("bob").position[-1, 0]
+    off = lambda by: eqx.tree_at(lambda state: state.q.position, start, start.q.position + by)
+    start = lg.initial_state(model, t0=0.5)
+    parts = ("`state0` does not satisfy the joints at t0 = 0.5 s: |Φ| = 0.01", "'pivot'", "`trajectory.state(-1)`")
+    for given in (run, jax.grad(run)):
+        with pytest.raises(ValueError, match=says(*parts)):
+            given(off(0.01))
+    run(off(1e-4))
+    jax.jit(run)(off(0.01))
+
+
+def test_the_index_of_a_state():
+    trajectory = lg.simulate(pendulum(), t1=0.1, num_steps=4)
+    for index in (5, -6, np.int64(5)):
+        with pytest.raises(IndexError, match=says("`index` must be from -5 to 4", "5 states", f"got {index}")):
+            trajectory.state(index)
+    np.testing.assert_array_equal(trajectory.state(-5).v, trajectory.states.v[0])
+    np.testing.assert_array_equal(jax.jit(lambda i: trajectory.state(i).v)(5), trajectory.states.v[4])
+
+
+@pytest.mark.filterwarnings("ignore:A JAX array is being set as static")  # Equinox, of the same
+def test_a_setting_is_no_array():
+    parts = ("GeneralizedAlpha: `rho_inf` must be a number", "got ", "settings are static", "give a Python number")
+    for make in (lg.GeneralizedAlpha, jax.jit(lg.GeneralizedAlpha)):
+        with pytest.raises(ValueError, match=says(*parts)):
+            make(jax.numpy.float64(0.9))
 
 
 def test_what_looks_like_a_duplicate_and_is_none():

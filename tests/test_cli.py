@@ -188,6 +188,12 @@ def test_bad_arguments_give_one_line(arguments, message, tmp_path, capsys):
     assert not out.exists()
 
 
+def test_travel_out_of_reach_names_its_option(tmp_path, capsys):
+    status, _, err = run(capsys, "curves", "quarter-car", "--travel", "0.9", "--points", "3", "--out", tmp_path / "out")
+    assert status == 2 and err.count("\n") == 1 + err.count("compiling")
+    assert "error: argument --travel 0.9: too much for this suspension, give less. No position satisfies" in err
+
+
 @pytest.mark.parametrize("arguments", [[], ["optimise"], ["optimize"], ["optimize", "half-car"], ["top", "--h", "0.5"]])
 def test_bad_commands_give_one_line(arguments, capsys):
     status, _, err = run(capsys, *arguments)

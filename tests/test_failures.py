@@ -53,6 +53,12 @@ ARGUMENTS = {
     "t1 before t0": (dict(t0=2.0, t1=1.0), ("`t1` must be later than `t0`", "t0 = 2.0 s", "t1 = 1.0 s")),
     "t1 at t0": (dict(t0=1.0, t1=1.0), ("`t1` must be later than `t0`", "t0 = 1.0 s", "t1 = 1.0 s")),
     "t1 nan": (dict(t1=NAN), ("`t1` must be later than `t0`", "nan")),
+    "t1 infinite": (dict(t1=float("inf")), ("`t0` and `t1` must be finite", "t1 = inf s")),
+    "t0 infinite": (dict(t0=-float("inf")), ("`t0` and `t1` must be finite", "t0 = -inf s")),
+    "t1 text": (dict(t1="1"), ("`t1` must be a number", "got '1'")),
+    "t1 a truth value": (dict(t1=True), ("`t1` must be a number", "got True")),
+    "num_steps a truth value": (dict(num_steps=True), ("`num_steps` must be a Python int", "got True")),
+    "num_steps NumPy's": (dict(num_steps=np.True_), ("`num_steps` must be a Python int", "True")),
     "t1 of shape (2,)": (dict(t1=[1.0, 2.0]), ("`t1` must have shape ()", "got shape (2,)")),
     "integrator": (dict(integrator="RK4"), ("`integrator` must be a GeneralizedAlpha", "'RK4'")),
     "sensitivity": (

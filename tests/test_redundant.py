@@ -205,6 +205,8 @@ def test_rank_of_bricard_and_door():
     assert "Degrees of freedom          1" in str(found) and "hinge 0, hinge 1" in str(found)
     assert lg.constraint_rank(door(DOOR, redundant="refuse")).joints == ("lower", "upper")
     assert lg.constraint_rank(door(DOOR, hinges=1)).redundant == 0
+    with pytest.raises(ValueError, match=says("`constraint_rank`", "must be known numbers, got traced ones", "`jit`")):
+        jax.jit(lambda t0: lg.constraint_rank(door(DOOR), t0=t0).rank)(0.0)
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from lgsens._validate import as_float
+from lgsens._validate import as_float, is_concrete
 from lgsens.dynamics import AbstractSystem, rank_near_reference, redundant_names
 from lgsens.model import Model, scene_of
 from lgsens.simulation import as_system
@@ -71,8 +71,15 @@ def constraint_rank(model: Model | AbstractSystem, *, t0=0.0) -> ConstraintRank:
     The rank is the largest found in the reference configuration and in four that the mechanism reaches by moving from
     it by 0.01 rad or lengths of the scene: in a singular reference configuration alone it would be too small, and
     equations would seem redundant that are not.
+
+    Raises `ValueError` for numbers that are traced.
     """
     system = as_system(model)
+    if not is_concrete(system, t0):
+        raise ValueError(
+            "`constraint_rank` counts singular values, so `model` and `t0` must be known numbers, got traced ones: "
+            "call it before `jit`, `grad` or `vmap`, with one of the models."
+        )
     scene = scene_of(system)
     if scene is not None:
         system = dataclasses.replace(scene, minimum_norm=True)  # which can be assembled whatever its rank

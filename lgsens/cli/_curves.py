@@ -8,7 +8,7 @@ import numpy as np
 
 from lgsens import plotting
 from lgsens._progress import compiling
-from lgsens.cli._report import output_folder, suspension_file, write_all, written
+from lgsens.cli._report import asking_for, output_folder, suspension_file, write_all, written
 from lgsens.examples import QuarterCar, SuspensionCurves
 
 # Heading, member of SuspensionCurves, factor to the unit shown, decimals.
@@ -33,7 +33,8 @@ def run(arguments: argparse.Namespace) -> int:
         plotting.figure()  # asks for matplotlib now
         car = QuarterCar.load(suspension_file(arguments))
         travel = np.linspace(-arguments.travel, arguments.travel, arguments.points)
-        with compiling("the positions of the wheel", not arguments.quiet):
+        quiet = arguments.quiet
+        with asking_for({"travel": arguments.travel}), compiling("the positions of the wheel", not quiet):
             curves = car.curves(travel, axle=arguments.axle)
         files = {
             "curves.csv": lambda path: write_table(curves, path),
@@ -44,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
         }
         if status := write_all("curves", files, out):
             return status
-        if not arguments.quiet:
+        if not quiet:
             print(table(curves), written(out), sep="\n")
     return 0
 

@@ -16,7 +16,7 @@ import numpy as np
 from lgsens import plotting, rigs
 from lgsens._progress import compiling
 from lgsens._validate import suggestion
-from lgsens.cli._report import output_folder, suspension_file, versions, write_all, write_json, written
+from lgsens.cli._report import asking_for, output_folder, suspension_file, versions, write_all, write_json, written
 from lgsens.examples import Axle
 
 # By unit of a sweep's number the factor and the unit shown.
@@ -44,7 +44,10 @@ def run(arguments: argparse.Namespace) -> int:
         chosen = _chosen(arguments.gradient, sweeps, axle)
         vehicle = _vehicle(arguments, axle)
         model = axle.model(links="rods", compliant=not arguments.rigid)
-        with compiling("the equilibria of the axle", not arguments.quiet):
+        # the options are those of `standard_sweeps`
+        own = {"parallel": "travel", "single": "travel", "opposite": "roll", "steering": "rack"}
+        most = {own.get(name, name.removesuffix("_opposed")): sweep.amplitude for name, sweep in sweeps.items()}
+        with asking_for(most), compiling("the equilibria of the axle", not arguments.quiet):
             test = rigs.kc(model, axle.wheel_centres, sweeps, points=arguments.points, vehicle=vehicle)
         numbers = {name: float(value) for name, value in rigs.characteristics(test).items()}
         gradients = {}

@@ -10,7 +10,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from lgsens.dynamics import RESULTS
 from lgsens.examples import DEFAULT
+from lgsens.simulation import SimulationError
 
 ANEW = "the same command with --overwrite begins anew"
 UNFINISHED = "search.npz", "tradeoff.json"  # from which --resume goes on
@@ -33,6 +35,18 @@ def output_folder(out: Path, overwrite: bool) -> Iterator[Path]:
             with contextlib.suppress(OSError):
                 out.rmdir()
         raise
+
+
+@contextlib.contextmanager
+def asking_for(amplitudes: Mapping[str, float]) -> Iterator[None]:
+    """Where a position or an equilibrium is not found, the message names the options that say how far to go."""
+    try:
+        yield
+    except (ValueError, SimulationError) as error:
+        if not str(error).startswith((RESULTS.position_failed.message, RESULTS.statics_failed.message)):
+            raise
+        options = " or ".join(f"--{name} {value:g}" for name, value in amplitudes.items())
+        raise ValueError(f"argument {options}: too much for this suspension, give less. {error}") from error
 
 
 def suspension_file(arguments: Any) -> str:

@@ -116,6 +116,9 @@ def differentiate(
     `IndexReduced` that of the motion, to their own accuracy. Compiled once for the same functions: define
     `criteria` and `build` outside the loop that calls this.
 
+    What it returns has derivatives in forward mode, `jax.jacfwd`. Reverse mode does not pass through it, but through
+    `simulate`: `jax.grad` of the criterion there.
+
     Raises `ValueError` for criteria that are not scalar, parameters that are not numbers, a criterion that the method
     cannot treat (with the alternatives), and multipliers that redundant constraints make non-unique; otherwise as
     `simulate`. Source: Sonneville & Brüls (2014), §5–7.

@@ -22,7 +22,7 @@ TICKS = 6  # along the longest axis
 
 
 def mechanism(
-    models: Mapping[str, Model | AbstractRun],
+    models: Mapping[str, Model | AbstractRun] | Model | AbstractRun,
     title: str = "",
     view: tuple[float, float] | None = None,
     axes_names: Sequence[str] = ("x", "y", "z"),
@@ -37,20 +37,28 @@ def mechanism(
     massless rods lines, elements of beams bent lines.
 
     Arguments:
-        models: scenes by name, drawn over each other: a `Model`, or what `simulate`, `kinematics` and `statics` return.
+        models: scenes by name, drawn over each other: a `Model`, or what `simulate`, `kinematics` and `statics` return;
+            or one of these alone.
         title: over the figure.
         view: elevation and azimuth [degree]; None: from the front, or across the plane in which everything lies.
         axes_names: names of the inertial axes: ("x, forward", "y, left", "z, up") of a car.
         colour_beams: "stress": elements of beams have the colour of their `SectionState.stress` [MPa], with its scale,
             where it is known and not 0 everywhere (of a `Model` at rest it is that of preloads); None: all one colour.
 
-    Raises `ValueError` for another `colour_beams`, `ImportError` without matplotlib.
+    Raises `ValueError` for `models` of another type and another `colour_beams`, `ImportError` without matplotlib.
     """
+    scenes = models if isinstance(models, Mapping) else {"": models}
+    for model in scenes.values():
+        if not isinstance(model, Model | AbstractRun):
+            raise ValueError(
+                "`models` must be a Model, or what `simulate`, `kinematics` or `statics` return, or a dict of such by "
+                f"name, got {type(model).__name__}."
+            )
     fig = figure(8.0, 7.0, title)
     axes: Any = fig.add_subplot(projection="3d")
     points, held, labels = [], [], {}
-    for name, model in models.items():
-        last = name == list(models)[-1]
+    for name, model in scenes.items():
+        last = name == list(scenes)[-1]
         system, q, v, lam, t = _last(model)
         position, orientation = (np.asarray(array[0]) for array in q)
         scene = shapes(system)
@@ -58,7 +66,7 @@ def mechanism(
         colours = stress.colours(0) if stress else [None] * len(scene.struts)
         points.append(draw(axes, scene, position, orientation, last, colours))
         held.append(corners(scene, position, orientation))
-        if len(models) > 1:
+        if len(scenes) > 1:
             labels[name] = ROLES["link"] if last else COLOURS[0]
         else:
             own = [strut for strut, colour in zip(scene.struts, colours) if colour is None]

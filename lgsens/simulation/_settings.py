@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import numpy as np
 
 from lgsens._validate import as_count, as_float, is_concrete, require
 from lgsens.integrate import AbstractIntegrator, IndexReducedODE
@@ -34,7 +35,9 @@ def by_diffrax(integrator: Any) -> bool:
 def interval(t0, t1):
     """The initial and the final time as arrays."""
     t0, t1 = as_float(t0, (), "`t0`"), as_float(t1, (), "`t1`")
-    require(lambda t0, t1: t1 > t0, f"`t1` must be later than `t0`, got t0 = {t0} s and t1 = {t1} s.", t0, t1)
+    given = lambda: f"got t0 = {t0} s and t1 = {t1} s."
+    require(lambda t0, t1: t1 > t0, lambda: f"`t1` must be later than `t0`, {given()}", t0, t1)
+    require(lambda *t: np.isfinite(t).all(), lambda: f"`t0` and `t1` must be finite, {given()}", t0, t1)
     return t0, t1
 
 

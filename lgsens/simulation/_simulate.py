@@ -35,7 +35,7 @@ from lgsens.simulation._index_reduced_ode import integrate_ode
 from lgsens.simulation._richardson import extrapolate_runs
 from lgsens.simulation._save import Output, Save
 from lgsens.simulation._settings import by_diffrax, check_integrator, check_sensitivity, interval
-from lgsens.simulation._start import Begin, as_system, begin
+from lgsens.simulation._start import Begin, as_system, begin, check_state0
 from lgsens.simulation._to_accuracy import simulate_to
 from lgsens.simulation._trajectory import Saved, Trajectory
 
@@ -98,7 +98,10 @@ def simulate(
             transformation; `AdjointVariable` is reverse mode only; `AssociativeScan` takes all steps at once, for
             accelerators.
         state0: the state at t0, used as it is: one of `equilibrium`, or `Trajectory.state` to continue. None: the
-            consistent initial state of the model.
+            consistent initial state of the model, from which the scheme begins with its own corrections. A given state
+            has none: with `initial_state(model)` accelerations and multipliers of the first steps are of first order.
+            For second order leave it out and put initial velocities into the model, or continue from
+            `trajectory.state(-1)`.
         save: what to return of each instant instead of the trajectory, a function s ↦ pytree of an `Instant`; the
             result is a `Saved`. Without derivatives no state is stored, so that a batch of
             designs takes the memory of what it asks for. Define it once: a new lambda in each call compiles anew.
@@ -144,14 +147,10 @@ def simulate(
             f"`sensitivity` = {sensitivity!r} and `save` need steps of the scheme. With `rtol` diffrax takes its own, "
             "and differentiates them in one direction only (`mode`): leave them out, or leave `rtol` out."
         )
-    if not isinstance(state0, State | None):
-        raise ValueError(
-            "`state0` must be a State: one of `equilibrium` or `initial_state`, or `trajectory.state(-1)` to continue, "
-            f"got {type(state0).__name__}."
-        )
     if save is not None and not callable(save):
         raise ValueError(f"`save` must be a function of an Instant, got {save!r}. Leave it out to have the trajectory.")
     t0, t1 = interval(t0, t1)
+    check_state0(system, state0, t0)
     with tracing():
         system, t0, t1, state0 = alike((system, t0, t1, state0))
         given = for_any_number(num_steps, integrator, sensitivity, save, (system, t0, t1 - t0, state0))

@@ -1,14 +1,15 @@
 """How a simulation starts: the system of a model, its consistent initial state or equilibrium, and a scheme's start."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from lgsens._validate import as_float
+from lgsens._validate import as_float, is_concrete
 from lgsens._xla import alike
 from lgsens.dynamics import (
     RESULTS,
@@ -24,7 +25,7 @@ from lgsens.dynamics import (
 from lgsens.integrate import AbstractScheme, Start
 from lgsens.linear import Matrix
 from lgsens.model import Model
-from lgsens.simulation._errors import throw_if_failed
+from lgsens.simulation._errors import primal_value, throw_if_failed
 
 
 def as_system(model: Model | AbstractSystem) -> AbstractSystem:
@@ -92,6 +93,60 @@ def _found_state(find: Callable[..., Initial], model: Model | AbstractSystem, t0
     return throw_if_failed(initial.state, initial.result, details, system.constraint_names)
 
 
+def check_state0(system: AbstractSystem, state0: State | None, t0) -> None:
+    """Raise `ValueError` for what is no state of the system, and for one that is known to be off its joints at t0."""
+    if state0 is None:
+        return
+    known = jax.tree.map(primal_value, (system, state0, t0))
+    if not is_concrete(known):
+        return _require_state(system, state0)
+    violation, least = map(np.asarray, _violation_jit(*known))
+    if violation.size and np.max(np.abs(violation)) > least:
+        i = np.argmax(np.abs(violation))
+        raise ValueError(
+            f"`state0` does not satisfy the joints at t0 = {float(known[2]):.6g} s: |Φ| = {abs(violation[i]):.3g}, "
+            f"largest in joint {system.constraint_names[i]!r}. Give a state of this model at this time: "
+            "`initial_state(model, t0=t0)`, `equilibrium(model, t0=t0)`, or `trajectory.state(-1)` with t0 = "
+            "trajectory.t[-1]."
+        )
+
+
+@eqx.filter_jit
+def _violation_jit(system: AbstractSystem, state0: State, t0):
+    """Φ, and a violation that no step leaves. Rows are lengths or sines of angles, so that is a thousandth of the
+    scene, or of 1 in a larger one: loose tolerances and drift leave less, and so does a state written with four digits.
+    """
+    _require_state(system, state0)
+    scale = system.coordinate_scale()
+    of_bodies = scale[: scale.shape[0] - system.num_states]
+    return system.constraint(state0.q, t0), 1e-3 * jnp.min(of_bodies, initial=1.0)
+
+
+def _require_state(system: AbstractSystem, state0: Any) -> None:
+    """Raise `ValueError` for what is no state, or one in other shapes than those of the system."""
+    if not isinstance(state0, State):
+        raise ValueError(
+            "`state0` must be a State: one of `equilibrium` or `initial_state`, or `trajectory.state(-1)` to continue, "
+            f"got {type(state0).__name__}."
+        )
+    q, v = system.reference()
+    lam = jax.ShapeDtypeStruct((len(system.constraint_names),), v.dtype)
+    shapes = lambda *parts: [[jnp.shape(leaf) for leaf in jax.tree.leaves(part)] for part in parts]
+    given = shapes(state0.q, state0.v, state0.vdot, state0.lam, state0.a)
+    needed = shapes(q, v, v, lam, v)
+    wrong = [
+        f"{name} has {', '.join(map(str, found))} and must have {', '.join(map(str, right))}"
+        for name, found, right in zip(("q", "v", "vdot", "lam", "a"), given, needed)
+        if found != right
+    ]
+    if wrong:
+        raise ValueError(
+            f"`state0` must be one state of this model; its shapes are others: {'; '.join(wrong)}. Take it from "
+            "`initial_state(model)` or `trajectory.state(i)` of the same model; for a batch of states jax.vmap(lambda "
+            "state0: simulate(model, state0=state0, …))(states)."
+        )
+
+
 class Begin(NamedTuple):
     """The initial state as the scheme starts from it, and how its computation ended."""
 
@@ -107,6 +162,7 @@ def begin(
 ) -> Begin:
     """The state at t0: `state0` as it is, or the consistent one of the reference configuration, `initial` if known."""
     if state0 is not None:
+        _require_state(system, state0)
         jacobian, start = constraint_jacobian(system, state0.q, t0), Start(scheme.resumed(system, state0, t0))
         valid = system.is_valid() & finite(state0)
         result = jnp.where(valid, RESULTS.successful, RESULTS.invalid_numbers).astype(jnp.int32)

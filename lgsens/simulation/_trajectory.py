@@ -267,7 +267,13 @@ class Trajectory(AbstractRun):
         return self.states, self.t
 
     def state(self, index: int) -> State:
-        """The state at step `index` (negative: from the end), from which a simulation can be continued."""
+        """The state at step `index` (negative: from the end), from which a simulation can be continued.
+
+        Raises `IndexError` for an int that is out of range; a traced one is taken to the nearest state.
+        """
+        count = self.t.shape[0]
+        if isinstance(index, int | np.integer) and not -count <= index < count:
+            raise IndexError(f"`index` must be from {-count} to {count - 1}, as there are {count} states; got {index}.")
         return jax.tree.map(lambda leaf: leaf[index], self.states)
 
 

@@ -1,11 +1,13 @@
 """A joint and a spring of one's own that say what the library asks of them: drawn, reduced, preloaded, carried over."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import close, random_body, random_point
+from helpers import close, random_body, random_point, says
 
 import lgsens as lg
 from lgsens.model import (
@@ -317,3 +319,37 @@ def test_loads_of_a_spring_of_ones_own():
     )
     falls = [lg.initial_state(of(kind)).vdot[2] for kind in (lg.SpringDamper, Doubled)]
     np.testing.assert_allclose(falls, [-25.0, -50.0], rtol=1e-14)
+
+
+class NetLoad(AbstractLoad):
+    """A network of position and velocity of b, as notebooks/own_elements.md has it where `static` is given."""
+
+    params: Any
+    static: Any = eqx.field(static=True, default=None)
+
+    def force(self, a, b, va, vb, t):
+        push = eqx.combine(self.params, self.static)(jnp.concatenate([b.position, vb]))
+        return jnp.zeros(12).at[6:9].set(push)
+
+
+class NetForce(AbstractForce):
+    load: NetLoad
+    bodies = property(lambda self: ("a",))
+
+    def loads(self, bodies):
+        return (Attached(self.load, None, "a"),)
+
+
+def test_a_network_as_a_force():
+    """Its arrays are leaves and the rest is static; the message says so where it is given as it is."""
+    net = eqx.nn.MLP(9, 3, 4, 1, activation=jnp.tanh, key=jax.random.key(0))
+    scene = lambda load: lg.Model({"a": random_body(np.random.default_rng(0))}, {}, {"net": NetForce(load)})
+    end = lambda load: lg.simulate(scene(load), t1=0.1, num_steps=4).body("a").position[-1, 0]
+    parts = ("Force 'net': `load.params.activation` must be a number", "eqx.partition(net, eqx.is_inexact_array)")
+    with pytest.raises(ValueError, match=says(*parts, "eqx.field(static=True)", "eqx.combine(params, static)")):
+        end(NetLoad(net))
+    params, static = eqx.partition(net, eqx.is_inexact_array)
+    along = jax.tree.map(jnp.ones_like, params)
+    slope = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(jax.grad(lambda p: end(NetLoad(p, static)))(params)))
+    at = lambda h: end(NetLoad(jax.tree.map(lambda leaf, one: leaf + h * one, params, along), static))
+    np.testing.assert_allclose(slope, (at(1e-4) - at(-1e-4)) / 2e-4, rtol=1e-6)

@@ -201,6 +201,13 @@ def test_a_motion_is_drawn_as_it_ends(swinging):
         plotting.mechanism({"end": swinging}, colour_beams="heat")
 
 
+def test_one_scene_needs_no_name(swinging):
+    fig = plotting.mechanism(swinging)
+    assert words(fig.legends[0]) == words(plotting.mechanism({"end": swinging}).legends[0])
+    with pytest.raises(ValueError, match=says("`models` must be a Model", "or a dict of such by name, got State")):
+        plotting.mechanism(swinging.states)  # pyright: ignore[reportArgumentType]
+
+
 def test_the_scale_of_stress_is_a_map_whose_steps_look_alike():
     plasma, own = matplotlib.colormaps["plasma"], plotting._stress._map()
     shares = np.linspace(0.0, 1.0, 33)
