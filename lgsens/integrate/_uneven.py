@@ -145,8 +145,8 @@ class AdaptiveSteps(AbstractIntegrator):
     differences agree with it on the same grid (`GivenSteps.of`). **Sensitivities**: their errors are not controlled,
     but the scheme is stable at any step size for the motion and so for its linearization: across a bump gradients by
     hardpoints converge as Ψ does (`benchmarks/variable_steps.py`). The criterion's trapezoidal rule sees the grid too.
-    **Multipliers** of generalized-α in index 3, and with them forces in joints and drivers, are off by O(r² − 1) h where
-    steps change by a factor r: they do not converge with the tolerance. Take `stabilized=True` or `RadauIIA` for these.
+    **Multipliers** of generalized-α in index 3, and with them forces in joints and drivers, are off by O(r² − 1) h
+    where steps change by a factor r: they do not converge with the tolerance. Take `stabilized=True` or `RadauIIA`.
 
     All static and hashable. Raises `ValueError` for settings out of range.
     """
