@@ -53,7 +53,7 @@ def newton_euler(body, motion, gravity=G):
 def test_force_and_moment_are_what_the_motion_needs():
     """m ẍ = m g + F, J Ω̇ + Ω × J Ω = Rᵀ(M + (p − x) × F) for each type of joint."""
     model = each_joint()
-    trajectory = lg.simulate(model, t1=0.1, num_steps=20)
+    trajectory = lg.simulate(model, t1=0.1, num_steps=20, integrator=lg.GeneralizedAlpha(0.5))
     for name, joint in model.joints.items():
         found = trajectory.joint(name)
         force, moment, x = newton_euler(model.bodies[name], trajectory.body(name))

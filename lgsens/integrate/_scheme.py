@@ -123,7 +123,6 @@ class AbstractIntegrator(eqx.Module):
 
     def check(self, num_steps: int) -> None:
         """Raise `ValueError` for a number of steps that these are not."""
-        return
 
     def lay(self, system: AbstractSystem, start: Start, t0, t1, num_steps) -> Laid:
         """The grid of a run from t0 to t1: here equal steps. `num_steps`: an int, or `Steps` where steps are equal."""
@@ -215,7 +214,9 @@ class AbstractScheme(AbstractIntegrator):
 
     def stages(self, system: AbstractSystem, grid: AbstractGrid, states: State) -> Stages | None:
         """Those of all steps, if criteria are integrated over them."""
-        return None
+
+    def caution(self, system: AbstractSystem) -> str | None:
+        """What may go wrong with a system, and what to take instead, if anything is known."""
 
     def resized(self, vdot, a, ratio) -> Float[Array, " k"]:
         """a of a state as a step begins with it that is `ratio` times as long as the one that led there."""

@@ -128,10 +128,10 @@ class Rolling(AbstractJoint):
     Its coordinates (`Trajectory.joint`): how far the lowest point is, forward (axis × normal) and along the projected
     axle, from the point of the plane; heading about the normal, lean of the axle towards it, spin about the axle.
     The multipliers are the force of the wheel on the ground along the normal, forward (axis × normal) and sideways
-    [N]; the first is negative where it presses. Equations are solved by dense matrices. Where wheels roll on a body
-    that is articulated (a bicycle), take `GeneralizedAlpha(stabilized=True)`, ρ∞ ≤ 0.8 or `RadauIIA`: with positions in
-    index 3 and ρ∞ = 0.9 what Rolling couples to them can grow from step to step. Raises `ValueError` for a wrong shape,
-    a zero direction, a radius ≤ 0, or a wheel that lies flat.
+    [N]; the first is negative where it presses. Equations are solved by dense matrices. In a mechanism of several
+    bodies (a bicycle) take `GeneralizedAlpha(stabilized=True)`, ρ∞ ≤ 0.5 or `RadauIIA`: with positions in index 3 and
+    larger ρ∞ what rolling couples to them can grow from step to step. Raises `ValueError` for a wrong shape, a zero
+    direction, a radius ≤ 0, or a wheel that lies flat.
     """
 
     a: str | None = eqx.field(static=True)

@@ -149,6 +149,8 @@ def simulate(
         )
     if save is not None and not callable(save):
         raise ValueError(f"`save` must be a function of an Instant, got {save!r}. Leave it out to have the trajectory.")
+    if caution := integrator.scheme.caution(system):
+        warnings.warn(caution, stacklevel=2)
     t0, t1 = interval(t0, t1)
     check_state0(system, state0, t0)
     with tracing():
