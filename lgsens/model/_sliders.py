@@ -4,6 +4,8 @@ Of bodies that move in a plane they keep what these can violate. Which equations
 across the line; one of them is then the normal of the plane, whatever the line in it (`AbstractJoint.in_plane`).
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -25,16 +27,35 @@ def _triad_in_plane(line, normal: int):
     return unit, cross(across, unit), across
 
 
-def _check_in_plane(joint: AbstractJoint, line, normal: int) -> None:
-    require(
-        lambda line: abs(line[normal]) <= np.sqrt(np.finfo(line.dtype).eps) * np.abs(line).max(),
-        f"{type(joint).__name__} between {joint.a!r} and {joint.b!r}: `axis` {line} leaves the plane of their motion, "
-        f"that of the rotation {ROTATIONS[normal]!r}; turn it into the plane, or free more of them.",
-        line,
-    )
+class AbstractAlongLine(AbstractJoint):
+    """A joint at a point of a line."""
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    at: Float[Array, "3"] = point_field("at")
+    axis: Float[Array, "3"] = axis_field("axis")
+
+    assembled = True
+    frames = frames_at
+
+    def in_plane(self, axis):
+        found = _IN_PLANE.get(type(self))
+        if found is None:
+            return self
+        require(
+            lambda line: abs(line[axis]) <= np.sqrt(np.finfo(line.dtype).eps) * np.abs(line).max(),
+            f"{type(self).__name__} between {self.a!r} and {self.b!r}: `axis` {self.axis} leaves the plane of their "
+            f"motion, that of the rotation {ROTATIONS[axis]!r}; turn it into the plane, or free more of them.",
+            self.axis,
+        )
+        return found(self.a, self.b, at=self.at, axis=self.axis, normal=axis)
+
+    def _triad(self):
+        """The direction of the line, and two across it."""
+        return normals(self.axis)
 
 
-class PrismaticJoint(AbstractJoint):
+class PrismaticJoint(AbstractAlongLine):
     """Slider: `b` translates along an axis of `a` without rotation; 5 equations.
 
     Arguments:
@@ -47,22 +68,8 @@ class PrismaticJoint(AbstractJoint):
     shape, a zero axis, and one that leaves the plane of such bodies. Source: Haug (1989), §9.4.
     """
 
-    a: str | None = eqx.field(static=True)
-    b: str | None = eqx.field(static=True)
-    at: Float[Array, "3"] = point_field("at")
-    axis: Float[Array, "3"] = axis_field("axis")
-
-    assembled = True
     coordinates = (DISPLACEMENT,)
     slips = (0,)
-    frames = frames_at
-
-    def in_plane(self, axis):
-        _check_in_plane(self, self.axis, axis)
-        return _PrismaticInPlane(self.a, self.b, at=self.at, axis=self.axis, normal=axis)
-
-    def _triad(self):
-        return normals(self.axis)
 
     def constraints(self, a, b):
         unit, first, second = self._triad()
@@ -83,7 +90,7 @@ class _PrismaticInPlane(PrismaticJoint):
         return (True,), (False,), (False,), (True,), (False,)
 
 
-class CylindricalJoint(AbstractJoint):
+class CylindricalJoint(AbstractAlongLine):
     """`b` slides along and turns about an axis of `a`; 4 equations.
 
     Arguments:
@@ -94,15 +101,8 @@ class CylindricalJoint(AbstractJoint):
     Raises `ValueError` for a wrong shape or a zero axis. Source: Haug (1989), §9.4.
     """
 
-    a: str | None = eqx.field(static=True)
-    b: str | None = eqx.field(static=True)
-    at: Float[Array, "3"] = point_field("at")
-    axis: Float[Array, "3"] = axis_field("axis")
-
-    assembled = True
     coordinates = (ANGLE, DISPLACEMENT)
     slips = (0, 3)
-    frames = frames_at
 
     def constraints(self, a, b):
         unit, first, second = normals(self.axis)
@@ -114,7 +114,7 @@ class CylindricalJoint(AbstractJoint):
         )
 
 
-class PointOnLineJoint(AbstractJoint):
+class PointOnLineJoint(AbstractAlongLine):
     """A point of `b` stays on a line of `a`, x·d = 0 and y·d = 0 with x, y orthogonal to the line; 2 equations.
 
     Arguments:
@@ -127,21 +127,7 @@ class PointOnLineJoint(AbstractJoint):
     shape, a zero axis, and one that leaves the plane of such bodies. Source: Haug (1989), §9.4.
     """
 
-    a: str | None = eqx.field(static=True)
-    b: str | None = eqx.field(static=True)
-    at: Float[Array, "3"] = point_field("at")
-    axis: Float[Array, "3"] = axis_field("axis")
-
-    assembled = True
     coordinates = (DISPLACEMENT, *ROTATION_VECTOR)
-    frames = frames_at
-
-    def in_plane(self, axis):
-        _check_in_plane(self, self.axis, axis)
-        return _PointOnLineInPlane(self.a, self.b, at=self.at, axis=self.axis, normal=axis)
-
-    def _triad(self):
-        return normals(self.axis)
 
     def constraints(self, a, b):
         return tuple(_in_plane(a, b, self.at, across) for across in self._triad()[1:])
@@ -155,3 +141,6 @@ class _PointOnLineInPlane(PointOnLineJoint):
 
     def violable_about(self, name, free, axis):
         return (True,), (False,)
+
+
+_IN_PLANE: dict[type, Any] = {PrismaticJoint: _PrismaticInPlane, PointOnLineJoint: _PointOnLineInPlane}
