@@ -316,12 +316,17 @@ def run_hinged(length, *, planar):
 
 def test_redundant_hinges():
     """The motion and what is unique of the forces are those of the same mechanism without the equations too many."""
-    found, step = run_hinged(0.0, planar=False), 1e-5
+    found = run_hinged(0.0, planar=False)
     # round-off in bars of 0.3 to 1 m, times ω² of up to 15² 1/s² in accelerations
     np.testing.assert_allclose(looked_at(found), looked_at(run_hinged(0.0, planar=True)), rtol=1e-11, atol=1e-11)
     # what hinges share they need not bear: no moments, and no forces out of the plane
     forces = jnp.stack([found.multiplier(f"hinge{i}") for i in range(4)])
     np.testing.assert_allclose(forces[..., 2:], 0.0, atol=1e-11 * float(jnp.max(jnp.abs(forces))))
+
+
+@pytest.mark.slow  # two more programs; gradients by lengths are in the quick run, those of redundant joints of the door
+def test_gradients_of_redundant_hinges_are_those_of_differences():
+    step = 1e-5
     gradient = jax.jacrev(lambda length: looked_at(run_hinged(length, planar=False)))(0.0)
     after, before = (looked_at(run_hinged(sign * step, planar=True)) for sign in (1.0, -1.0))
     # h² times third derivatives over the 0.1 m of the shortest distance, cubed, and round-off over h

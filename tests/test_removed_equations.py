@@ -203,6 +203,7 @@ def test_what_cannot_be_left_out_is_said():
             sprung(0.0, planar=False, redundant=wrong)
 
 
+@SLOW
 def test_kinematics_takes_it():
     model = hinged_four_bar(0.0, planar=False)
     model = lg.Model(model.bodies, model.joints, model.forces, redundant="remove")

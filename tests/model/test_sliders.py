@@ -82,6 +82,7 @@ def block(slope, free=None):
     return lg.Model(bodies, joints, {"gravity": lg.Gravity((0.0, -9.81, 0.0)), "friction": friction})
 
 
+@pytest.mark.slow  # joints that rub have quick tests; that they read these rows is the same code
 def test_friction_reads_what_is_left():
     """v̇ = g (sin α − μ cos α), and its derivative by α."""
     slope = 0.6
