@@ -2,6 +2,7 @@
 redundant equations, least norm, and differences."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +34,9 @@ def sprung(length, *, planar, redundant="remove", **options):
     )
 
 
-HINGED = sprung(0.0, planar=False)
+@functools.cache  # not when the tests are collected
+def hinged():
+    return sprung(0.0, planar=False)
 
 
 def seen(trajectory):
@@ -48,16 +51,16 @@ STABILIZED = lg.GeneralizedAlpha(0.8, tolerance=1e-13, stabilized=True)
 
 
 def run(length, planar, integrator, **options):
-    model = sprung(length, planar=planar, redundant=HINGED.removed)
+    model = sprung(length, planar=planar, redundant=hinged().removed)
     return lg.simulate(model, t1=0.3, num_steps=30, integrator=integrator, **options)
 
 
 def test_what_is_left_out_of_hinges():
     """Of the twelve equations out of the plane nine are independent, and those in it stay."""
-    assert len(HINGED.removed) == 3
-    assert HINGED.summary().degrees_of_freedom == lg.constraint_rank(HINGED).degrees_of_freedom == 1
-    assert lg.constraint_rank(HINGED).redundant == 0
-    constraints = {name: place for name, place, _ in HINGED.removed}
+    assert len(hinged().removed) == 3
+    assert hinged().summary().degrees_of_freedom == lg.constraint_rank(hinged()).degrees_of_freedom == 1
+    assert lg.constraint_rank(hinged()).redundant == 0
+    constraints = {name: place for name, place, _ in hinged().removed}
     assert all(place > 0 for place in constraints.values())  # directions, not points
     # a door keeps one equation less than two pins have, and no direction
     kept = door(DOOR, redundant="remove").system().constraint_names
@@ -182,14 +185,17 @@ def test_on_se3():
 
 
 def test_traced_numbers_take_what_was_left_out_before():
+    model = hinged()
     with pytest.raises(ValueError, match=says("its numbers are traced", "redundant=model.removed")):
         jax.jit(lambda length: sprung(length, planar=False).bodies)(0.0)
-    model = jax.jit(lambda length: sprung(length, planar=False, redundant=HINGED.removed))(0.0)
-    assert model.removed == HINGED.removed
-    assert dataclasses.replace(model, formulation="SE3").removed == HINGED.removed
-    assert model.reduced(lg.model.Without("spring")).removed == HINGED.removed
-    assert sprung(0.0, planar=False, redundant=HINGED.removed).system().constraint_names == (
-        HINGED.system().constraint_names
+    with pytest.raises(ValueError, match="its numbers are traced"):  # those of a force too
+        jax.jit(lambda gravity: lg.Model(model.bodies, model.joints, gravity, redundant="remove").bodies)(model.forces)
+    model = jax.jit(lambda length: sprung(length, planar=False, redundant=hinged().removed))(0.0)
+    assert model.removed == hinged().removed
+    assert dataclasses.replace(model, formulation="SE3").removed == hinged().removed
+    assert model.reduced(lg.model.Without("spring")).removed == hinged().removed
+    assert sprung(0.0, planar=False, redundant=hinged().removed).system().constraint_names == (
+        hinged().system().constraint_names
     )
 
 

@@ -29,15 +29,14 @@ class Rank(NamedTuple):
 def rank_near_reference(system: AbstractSystem, t: Float[Array, ""]) -> Rank:
     """The rank in the reference configuration and in others that the mechanism reaches by moving from it a little: in a
     singular reference alone it would be too small. Numbers are known, and constraints may be redundant."""
-    at, _ = _assembled(system, t)
-    best = _jacobian(system, at, t)
-    reference = rank = left_null_space(best)[1]
-    q = at
-    for direction in np.random.default_rng(0).normal(size=(_DIRECTIONS, best.shape[1])):
+    q, _ = _assembled(system, t)
+    at = best = _Place(q, _evaluated(system, q, t)[1])
+    reference = rank = left_null_space(at.jacobian)[1]
+    for direction in np.random.default_rng(0).normal(size=(_DIRECTIONS, at.jacobian.shape[1])):
         there, _ = _moved(system, at, t, direction, _DISTANCE)
-        if there is not None and (own := left_null_space(jacobian := _jacobian(system, there, t))[1]) > rank:
-            q, best, rank = there, jacobian, own
-    return Rank(reference, rank, q, best)
+        if there is not None and (own := left_null_space(there.jacobian)[1]) > rank:
+            best, rank = there, own
+    return Rank(reference, rank, *best)
 
 
 def jacobians_on_the_way(
@@ -48,13 +47,13 @@ def jacobians_on_the_way(
     every, k = [found.jacobian], found.jacobian.shape[1]
     for way in np.random.default_rng(1).normal(size=(_WAYS, k)):
         for direction in (way, -way):
-            q = found.q
+            place: _Place | None = _Place(found.q, found.jacobian)
             for _ in range(_STRIDES):
-                q, direction = _moved(system, q, t, direction, _STRIDE, driven)
-                if q is None:
+                place, direction = _moved(system, place, t, direction, _STRIDE, driven)
+                if place is None:
                     break
-                if left_null_space(jacobian := _jacobian(system, q, t))[1] == found.near:
-                    every.append(jacobian)
+                if left_null_space(place.jacobian)[1] == found.near:
+                    every.append(place.jacobian)
     return every
 
 
@@ -94,10 +93,17 @@ def left_null_space(jacobian: np.ndarray) -> tuple[np.ndarray, int]:
     return left[:, rank:], rank
 
 
-def _moved(system: AbstractSystem, q, t, direction, distance: float, driven=None):
-    """A configuration at a distance from q along a direction, None if there is none; and the direction there. `driven`:
-    equations that need not hold."""
-    scale, jacobian = np.asarray(system.coordinate_scale()), _jacobian(system, q, t)
+class _Place(NamedTuple):
+    """A configuration, and J there."""
+
+    q: Any
+    jacobian: Float[np.ndarray, "m k"]
+
+
+def _moved(system: AbstractSystem, place: _Place, t, direction, distance: float, driven=None):
+    """The place at a distance from another one along a direction, None if there is none; and the direction there.
+    `driven`: equations that need not hold."""
+    (q, jacobian), scale = place, np.asarray(system.coordinate_scale())
     held = np.ones(len(jacobian), bool) if driven is None else ~driven
     # the part of the direction that the constraints allow, in comparable coordinates
     rows = jacobian[held] * scale
@@ -109,12 +115,11 @@ def _moved(system: AbstractSystem, q, t, direction, distance: float, driven=None
     tolerance = 1e3 * np.finfo(scale.dtype).eps * max(scale.max(), 1.0)
     for _ in range(_ITERATIONS):
         violation, jacobian = _evaluated(system, q, t)
-        own = held[: len(violation)]
-        violation, jacobian = violation[own], jacobian[: len(own)][own]
-        if np.abs(violation).max(initial=0.0) <= tolerance:
-            return q, x
+        own = np.flatnonzero(held[: len(violation)])
+        if np.abs(violation[own]).max(initial=0.0) <= tolerance:
+            return _Place(q, jacobian), x
         # singular values that the distance does not explain belong to redundant equations
-        step = np.linalg.lstsq(jacobian * scale, violation, rcond=1e-2 * distance)[0]
+        step = np.linalg.lstsq(jacobian[own] * scale, violation[own], rcond=1e-2 * distance)[0]
         q = _retracted(system, q, -scale * step)
     return None, x
 
@@ -126,10 +131,6 @@ def _evaluated(system, q, t) -> tuple[np.ndarray, np.ndarray]:
     """Φ and J."""
     violation, jacobian = _value_and_jacobian(system, q, t)
     return np.asarray(violation), np.asarray(jacobian)
-
-
-def _jacobian(system, q, t) -> np.ndarray:
-    return _evaluated(system, q, t)[1]
 
 
 @eqx.filter_jit

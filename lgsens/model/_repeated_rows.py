@@ -7,7 +7,7 @@ repeats others, they determine already what it prescribes.
 """
 
 import dataclasses
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,7 +15,6 @@ import numpy as np
 
 from lgsens._validate import is_concrete
 from lgsens.dynamics import jacobians_on_the_way, rank_near_reference, redundant_names, repeated_rows
-from lgsens.model._body import RigidBody
 from lgsens.model._frames import ROTATION
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._signals import AbstractSignal
@@ -42,19 +41,16 @@ def as_redundant(given: Any, joints: Collection[str]) -> str | Equations:
     return given
 
 
-def repeated_equations(
-    built: Callable[[], MultibodySystem], bodies: Mapping[str, RigidBody], joints: Mapping[str, AbstractJoint]
-) -> Equations:
-    """The equations of what is `built` of a scene that follow from the others near the reference, at t = 0.
+def repeated_equations(system: MultibodySystem, joints: Mapping[str, AbstractJoint]) -> Equations:
+    """The equations of a scene that follow from the others near the reference, at t = 0.
 
     Raises `ValueError` where what drives is among those that repeat each other, and for traced numbers.
     """
-    if not is_concrete(bodies, joints):
+    if not is_concrete(system):
         raise ValueError(
             "Model: redundant='remove' looks for equations that repeat others, and its numbers are traced (jit, vmap, "
             "grad). Build the model once where they are known, and give redundant=model.removed here."
         )
-    system = built()
     scene, t = dataclasses.replace(system, minimum_norm=True), jnp.zeros((), system.mass.dtype)
     found = rank_near_reference(scene, t)
     if found.near == len(found.jacobian):
@@ -63,10 +59,10 @@ def repeated_equations(
     driven = np.zeros(len(found.jacobian), bool)
     for stack, rows in zip(system.constraints, system.topology.rows):
         for owner, place, own in zip(stack.owners, stack.places, rows):
-            driven[own[own >= 0]] = joints[owner].drives or _follows_a_signal(joints[owner])
+            driven[own[own >= 0]] = _prescribes(joints[owner])
             equations |= {int(row): (owner, place, i) for i, row in enumerate(own) if row >= 0}
     repeating = redundant_names(found.jacobian, system.constraint_names)
-    if conflicts := [name for name in repeating if joints[name].drives or _follows_a_signal(joints[name])]:
+    if conflicts := [name for name in repeating if _prescribes(joints[name])]:
         raise ValueError(
             f"Model: redundant='remove': {conflicts} prescribe what the other joints determine already; leave one out "
             f"of {repeating}."
@@ -79,9 +75,10 @@ def repeated_equations(
     return tuple(sorted(equations[row] for row in repeated_rows(jacobians, weights)))
 
 
-def _follows_a_signal(joint: AbstractJoint) -> bool:
+def _prescribes(joint: AbstractJoint) -> bool:
+    """Whether it is a driver, or has a signal of time."""
     prescribed = [field.name for field in dataclasses.fields(joint) if field.metadata.get("prescribed")]
-    return any(isinstance(getattr(joint, name), AbstractSignal) for name in prescribed)
+    return joint.drives or any(isinstance(getattr(joint, name), AbstractSignal) for name in prescribed)
 
 
 def without(system: MultibodySystem, equations: Equations) -> MultibodySystem:
