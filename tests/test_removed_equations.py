@@ -34,9 +34,15 @@ def sprung(length, *, planar, redundant="remove", **options):
     )
 
 
-@functools.cache  # not when the tests are collected
+@functools.cache
 def hinged():
     return sprung(0.0, planar=False)
+
+
+@pytest.fixture(autouse=True)
+def built():
+    """Not when the tests are collected, nor first inside of a trace."""
+    hinged()
 
 
 def seen(trajectory):
