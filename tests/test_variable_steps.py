@@ -71,6 +71,24 @@ def test_order():
     assert np.all(np.abs(orders[-1] - 2.0) < 0.1), orders  # the next term of the error is a step of 3e-3 smaller
 
 
+def test_multipliers_where_sizes_jump():
+    """By 2 and 1/2 from step to step, then by 3 once: the largest error of all steps is of second order in index 3 too.
+
+    With velocities that keep what belongs to the size before it is 10 times as large, of order 0.5.
+    """
+    p = jnp.array(P)
+    exact = lg.simulate(make(p), t1=1.0, num_steps=2000, integrator=lg.IndexReducedODE())
+    errors = []
+    for n in (80, 160):
+        sizes = np.append(np.tile([1.0, 2.0], n // 4), np.full(n // 2, 3.0))
+        run = lg.simulate(make(p), t1=1.0, num_steps=n, integrator=lg.GivenSteps(sizes, SCHEME))
+        of = lambda row: np.interp(run.t, exact.t, row)  # its error is 1/8 (5e-4)² of a second derivative: 1e-3 of those
+        parts = ((run.states.lam, exact.states.lam), (run.states.vdot, exact.states.vdot))
+        errors.append([np.abs(one - np.apply_along_axis(of, 0, other)).max() for one, other in parts])
+    orders = np.log2(np.array(errors[0]) / np.array(errors[1]))
+    assert np.all(np.abs(orders - 2.0) < 0.2), (orders, errors)  # as `test_order`, with steps of 1/80 instead of 1/320
+
+
 @pytest.mark.slow  # on the grid that error control has found: below
 def test_derivatives_on_a_given_grid():
     """By parameters, times and sizes, with empty steps in the middle and at the end: both modes, differences."""
@@ -137,6 +155,17 @@ def test_error_control():
     assert run.stats.rejected.shape == (250,) and np.all(run.stats.rejected[steps:] == 0)
     for leaf in map(np.asarray, jax.tree.leaves(run.states)):
         assert np.all(np.isfinite(leaf)) and np.all(leaf[steps:] == leaf[steps])
+
+
+@pytest.mark.slow
+def test_forces_fall_with_the_tolerance():
+    """The largest error of all steps, as that of the motion: tolerance^(2/3), 21."""
+    p, errors = jnp.array(P), []
+    exact = lg.simulate(make(p), t0=0.2, t1=1.2, num_steps=4000, integrator=SCHEME)
+    for tolerance, n in ((1e-5, 250), (1e-7, 1000)):
+        run = adaptive(tolerance, n)(p)
+        errors.append(np.abs(run.states.lam[:, 0] - np.interp(run.t, exact.t, exact.states.lam[:, 0])).max())
+    assert 10 < errors[0] / errors[1] < 40, errors
 
 
 @pytest.mark.slow

@@ -205,7 +205,7 @@ def _left_by_newton(scheme: AbstractScheme, states: State, parameters: Parameter
     system, grid = parameters
 
     def left(place, before, state):
-        return rows(scheme, system, grid.node(place), grid.begun(scheme, place, before), state)
+        return rows(scheme, system, grid.node(place), grid.begun(scheme, system, place, before), state)
 
     residual = jax.vmap(left)(grid.places(), earlier(states), later(states))
     b = with_first(jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]), residual), jax.tree.map(jnp.negative, residual))

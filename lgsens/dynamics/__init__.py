@@ -33,6 +33,7 @@ from lgsens.dynamics._kinematics import (
     positions as positions,
 )
 from lgsens.dynamics._matrices import (
+    ConstrainedMass as ConstrainedMass,
     constraint_jacobian as constraint_jacobian,
     factor_size as factor_size,
     factorized as factorized,

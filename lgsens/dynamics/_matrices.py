@@ -142,6 +142,14 @@ class ConstrainedMass(eqx.Module):
         factors = factorized(system, fixed, border.T, border, mass_scale(mass), softness=soft, once=True)
         return cls(mass, jacobian, factors, soft is not None)
 
+    @classmethod
+    def in_steps(cls, system: AbstractSystem, q, t) -> "ConstrainedMass":
+        """With factors for every step of a run, which know no derivative and need none."""
+        mass, jacobian = mass_matrix(system), constraint_jacobian(system, q, t)
+        soft, (fixed, border) = softness(system), lax.stop_gradient((mass, jacobian))
+        factors = factorized(system, fixed, border.T, border, mass_scale(mass), softness=soft)
+        return cls(mass, jacobian, factors, soft is not None)
+
     def solve(self, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:
         """x and μ of M x + Jᵀμ = force, J x = rate; differentiable through M and J, by one more solve."""
         if self.factors is None:

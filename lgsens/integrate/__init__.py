@@ -7,7 +7,7 @@ from lgsens.integrate._generalized_alpha import GeneralizedAlpha as GeneralizedA
 from lgsens.integrate._grid import (
     AbstractGrid as AbstractGrid,
     EqualGrid as EqualGrid,
-    StepLink as StepLink,
+    Start as Start,
     Steps as Steps,
     UnevenGrid as UnevenGrid,
     earlier as earlier,
@@ -36,7 +36,6 @@ from lgsens.integrate._scheme import (
     AbstractScheme as AbstractScheme,
     Laid as Laid,
     Stages as Stages,
-    Start as Start,
     Stats as Stats,
     rows as rows,
     scheme_of as scheme_of,

@@ -157,7 +157,7 @@ class IndexReducedODE(AbstractScheme):
     def convergence_order(self):
         return self._solver.order(None)
 
-    def mismatch(self, before, after):
+    def mismatch(self, before, after, ratio):
         return after[1] - after[0]
 
     @property

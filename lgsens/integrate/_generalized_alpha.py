@@ -25,14 +25,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from lgsens._validate import require_setting
-from lgsens.dynamics import given_way, normal_jerk, softness
+from lgsens.dynamics import ConstrainedMass, consistent_velocity, given_way, normal_jerk, softness
 from lgsens.integrate._alpha import AbstractAlpha, AbstractEquations, Matrix, Wear
 from lgsens.integrate._alpha_defects import alpha_defects
+from lgsens.integrate._grid import Start
 from lgsens.integrate._guess import Guess
 from lgsens.integrate._index3 import Index3
 from lgsens.integrate._levels import Levels
 from lgsens.integrate._newton import take_step
-from lgsens.integrate._scheme import Memory, Start
+from lgsens.integrate._scheme import Memory
 from lgsens.integrate._singular import Watch
 from lgsens.linear import LU, Inverse
 
@@ -95,15 +96,40 @@ class AbstractGeneralizedAlpha(AbstractAlpha):
             return states
         return dataclasses.replace(states, lam=states.lam[..., : len(system.constraint_names)])
 
-    def resized(self, vdot, a, ratio):
-        """Along the line through v̇_n at t_n and a_n at t_n + Δ h_n, (eq. 29 is of second order for that alone)
+    def resized(self, system, state, t, factors=None):
+        """Along the line through v̇_n at t_n and a_n at t_n + Δ h_n (eq. 29 is of second order for that alone),
 
-            a_n* = v̇_n + r (a_n − v̇_n).
+            a_n* = v̇_n + r (a_n − v̇_n),
+
+        and with the velocity off the constraints by as much as steps of the new size keep it. Under way index 3 has
+        c(q_n, v_n) = −h² B c, c of `missed_increment` (see `start`), and with η = N v, the least change of v_n, in the
+        metric of M, that takes it to c(q_n, v) = 0,
+
+            v_n* = v_n + (r² − 1) η,     c(q_n, v_n*) = r² c(q_n, v_n).
+
+        Without it the step must take B c (h_n² − h_{n−1}²) h_n out through the acceleration, as at a start with
+        B v_0 = 0: λ is then off by O(r² − 1) h, and for as long as (−ρ∞)ⁿ n takes to fade. Taken along N it moves
+        nothing that is stiff.
 
         Sources: Brüls & Arnold, Journal of Computational and Nonlinear Dynamics 3 (2008), doi:10.1115/1.2960475; Jay &
-        Negrut, the same journal 2 (2007), doi:10.1115/1.2389231.
+        Negrut, the same journal 2 (2007), doi:10.1115/1.2389231; for the offset of v Arnold, Brüls & Cardona,
+        Numerische Mathematik 129 (2015), doi:10.1007/s00211-014-0633-1.
         """
-        return vdot + ratio * (a - vdot)
+        line = Start(dataclasses.replace(state, a=state.vdot), a_1=state.a - state.vdot)
+        if not self._off_velocities(system):
+            return line
+        if factors is None:
+            factors = self.resizing_factors(system, state, t)
+        v = consistent_velocity(system, state.q, state.v, t, factors)
+        return line._replace(state=dataclasses.replace(line.state, v=v), v_2=state.v - v)
+
+    def resizing_factors(self, system, state, t):
+        return ConstrainedMass.in_steps(system, state.q, t).factors if self._off_velocities(system) else None
+
+    def _off_velocities(self, system) -> bool:
+        """Whether B v is to be kept at what belongs to the size: in index 3."""
+        off = not self.stabilized and len(system.constraint_names) > system.num_velocity_rows
+        return self.second_order_start and off
 
     def missed_increment(self, system, v, vdot, jerk):
         """c: with exact values and a_n = v̇(t_n + Δ h), Δ = α_m − α_f, the increment (27) misses the true one by h³ c.
@@ -123,9 +149,10 @@ class AbstractGeneralizedAlpha(AbstractAlpha):
             return None
         return alpha_defects(self, system, grid, states)
 
-    def mismatch(self, before, after):
+    def mismatch(self, before, after, ratio):
         """Of eq. (29)."""
         (vdot, a), (next_vdot, next_a) = before, after
+        a = vdot + ratio * (a - vdot)
         left = (1.0 - self.alpha_m) * next_a + self.alpha_m * a
         return left - (1.0 - self.alpha_f) * next_vdot - self.alpha_f * vdot
 
@@ -207,8 +234,10 @@ class GeneralizedAlpha(AbstractGeneralizedAlpha):
         second_order_start: start with what the constraints ask of v̈ in a₀, because a_n stands for the acceleration at
             t_n + (α_m − α_f) h, and with v₀ moved by O(h²) along the constraint directions, where the scheme keeps
             it anyway: positions, velocities and multipliers are then second order from the first step.
+            Where steps change their size the velocity is moved likewise, which takes a factorization per step.
             False: a₀ = v̇₀ and v₀ as it is; multipliers are first order in the first steps (Arnold,
-            Brüls & Cardona, Numerische Mathematik 129, 2015, doi:10.1007/s00211-014-0633-1).
+            Brüls & Cardona, Numerische Mathematik 129, 2015, doi:10.1007/s00211-014-0633-1), and after each change of
+            the size.
         stabilized: satisfy B v = 0 in every step besides Φ = 0 (stabilized index 2, after Gear, Gupta & Leimkuhler),
             at the price of m more unknowns in a step; see `_level_step.py`. Dense. False: index 3, where B v is O(h²).
 

@@ -7,10 +7,10 @@ through both functions.
 Steps of different sizes. What a state carries of the step that it ends may belong to the size of that step: the
 algorithmic acceleration of generalized-α stands for the acceleration at t_n + Δ h. Each step begins with
 
-    a_n* = `scheme.resized`(v̇_n, a_n, r_n),     r_n = h_n/h_{n−1},
+    y_n* = `scheme.resized`(y_n) at r_n = h_n/h_{n−1}
 
-linear in v̇_n and a_n, in place of a_n. A step of size 0 leaves everything as it is: a grid that needs fewer steps than
-its arrays have places ends with such. For its equations it has the size before it, which can be divided by.
+in place of y_n. A step of size 0 leaves everything as it is: a grid that needs fewer steps than its arrays have places
+ends with such. For its equations it has the size before it, which can be divided by.
 """
 
 import abc
@@ -24,46 +24,34 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from lgsens.dynamics import State
-from lgsens.integrate._linearized import Node, Variation
+from lgsens.dynamics import AbstractSystem, State
+from lgsens.integrate._linearized import Node
+
+
+class Start(NamedTuple):
+    """A state as a step of any size h begins with it: q exp(h² q̃_2), v + h² v_2, a + h a_1; None: nothing."""
+
+    state: State
+    q_2: Float[Array, " k"] | None = None
+    v_2: Float[Array, " k"] | None = None
+    a_1: Float[Array, " k"] | None = None
+
+    def at(self, system: AbstractSystem, h) -> State:
+        state = self.state
+        return dataclasses.replace(
+            state,
+            q=state.q if self.q_2 is None else system.group.retract(state.q, h**2 * self.q_2),
+            v=state.v if self.v_2 is None else state.v + h**2 * self.v_2,
+            a=state.a if self.a_1 is None else state.a + h * self.a_1,
+        )
 
 
 class Resizes(Protocol):
     """What a grid knows of a scheme."""
 
-    def resized(self, vdot, a, ratio) -> Float[Array, " k"]: ...
+    def resized(self, system: AbstractSystem, state: State, t, factors: Any = None) -> Start: ...
 
-
-class StepLink(eqx.Module):
-    """How a step follows the one before, linearized; stacked, all of them. Between equal steps nothing changes."""
-
-    scheme: Any = eqx.field(static=True, default=None)  # None, like the others: steps are equal
-    ratio: Any = None  # of the sizes, shape ()
-    by_ratio: Any = None  # ∂a*/∂r, shape (k,)
-    empty: Any = None  # whether the step is, shape ()
-
-    def begun(self, previous: Variation, d_place: Any) -> Variation:
-        """The variation of what the step begins with."""
-        if self.ratio is None:
-            return previous
-        a = self.scheme.resized(previous.vdot, previous.a, self.ratio)
-        return previous._replace(a=a + d_place.ratio * self.by_ratio)
-
-    def begun_transposed(self, begun: Variation) -> tuple[Variation, Float[Array, ""] | None]:
-        """The cotangents of δ_n and of the ratio, from that of what the step begins with."""
-        if self.ratio is None:
-            return begun, None
-        zero = jnp.zeros_like(begun.a)
-        transposed = jax.linear_transpose(lambda vdot, a: self.scheme.resized(vdot, a, self.ratio), zero, zero)
-        vdot, a = transposed(begun.a)
-        ratio = jnp.where(self.empty, 0.0, jnp.dot(begun.a, self.by_ratio))
-        return begun._replace(vdot=begun.vdot + vdot, a=a), ratio
-
-    def unless_empty(self, rows: Any, otherwise: Any) -> Any:
-        """`rows`, or, of an empty step, `otherwise`."""
-        if self.empty is None:
-            return rows
-        return jax.tree.map(lambda row, other: jnp.where(self.empty, other, row), rows, otherwise)
+    def resizing_factors(self, system: AbstractSystem, state: State, t) -> Any: ...
 
 
 class AbstractGrid(eqx.Module):
@@ -86,22 +74,35 @@ class AbstractGrid(eqx.Module):
     def node(self, place: Any) -> Node:
         """The step at a place."""
 
-    def link(self, scheme: Resizes, place: Any, previous: State) -> StepLink:
-        """How the step at a place follows the state before it."""
-        return StepLink()
+    resizes: ClassVar[bool] = False  # whether a step may begin with another state than the last one ended with
 
-    def begun(self, scheme: Resizes, place: Any, state: State) -> State:
-        """What the step at a place begins with."""
+    def begun(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State, factors: Any = None) -> State:
+        """What the step at a place begins with; `factors`: those below, if they are known."""
         return state
+
+    def factors(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State) -> Any:
+        """What `begun` is found with; they have no derivative of their own."""
+        return None
+
+    def ratio(self, place: Any) -> Any:
+        """The size of the step at a place, over that of the one before."""
+        return 1.0
 
     def empty(self, place: Any) -> Bool[Array, ""] | None:
         """Whether the step is none; None: no step of this grid is empty."""
         return None
 
+    def unless_empty(self, place: Any, rows: Any, otherwise: Any) -> Any:
+        """`rows`, or, of an empty step, `otherwise`."""
+        empty = self.empty(place)
+        if empty is None:
+            return rows
+        return jax.tree.map(lambda row, other: jnp.where(empty, other, row), rows, otherwise)
+
     @property
     @abc.abstractmethod
     def first_size(self) -> Float[Array, ""]:
-        """The size of the step to which the a at t0 belongs."""
+        """The size of the step to which the state at t0 belongs."""
 
     @abc.abstractmethod
     def segments(self, count: int, length: int) -> "AbstractGrid":
@@ -180,13 +181,14 @@ class UnevenGrid(AbstractGrid):
 
     t0: Float[Array, ""]
     h: Float[Array, " n"]
-    before: Float[Array, ""]  # the size of the step that led to t0, to which the a there belongs
+    before: Float[Array, ""]  # the size of the step that led to t0, to which the state there belongs
+    resizes: ClassVar[bool] = True
     num_steps: ClassVar[Any] = property(lambda self: self.h.shape[-1])  # no argument, where the base has a field
     count: ClassVar[None] = None
 
     @classmethod
     def first(cls, t0, h) -> "UnevenGrid":
-        """From a state at t0 whose a belongs to the first step."""
+        """From a state at t0 that belongs to the first step."""
         return cls(t0, h, h[0])
 
     @property
@@ -206,12 +208,14 @@ class UnevenGrid(AbstractGrid):
     def node(self, place):
         return Node(place.begin, place.begin + place.size, place.h)
 
-    def link(self, scheme, place, previous):
-        by_ratio = jax.jacfwd(lambda ratio: scheme.resized(previous.vdot, previous.a, ratio))(place.ratio)
-        return StepLink(scheme, place.ratio, by_ratio, self.empty(place))
+    def begun(self, scheme, system, place, state, factors=None):
+        return scheme.resized(system, state, place.begin, factors).at(system, place.ratio)
 
-    def begun(self, scheme, place, state):
-        return dataclasses.replace(state, a=scheme.resized(state.vdot, state.a, place.ratio))
+    def factors(self, scheme, system, place, state):
+        return scheme.resizing_factors(system, state, place.begin)
+
+    def ratio(self, place):
+        return place.ratio
 
     def empty(self, place):
         return place.size == 0.0

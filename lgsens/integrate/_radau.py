@@ -123,7 +123,7 @@ class RadauIIA(AbstractScheme):
     def convergence_order(self):
         return 5
 
-    def mismatch(self, before, after):
+    def mismatch(self, before, after, ratio):
         return after[1] - after[0]
 
     # How a motion begins, and what is seen of it.

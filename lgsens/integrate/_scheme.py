@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._xla import while_loop
 from lgsens.dynamics import RESULTS, AbstractSystem, Initial, State, finite
-from lgsens.integrate._grid import AbstractGrid, EqualGrid
+from lgsens.integrate._grid import AbstractGrid, EqualGrid, Start
 from lgsens.integrate._linearized import AbstractLinearizedStep, DenseLinearizedStep, Node, Variation
 
 
@@ -46,24 +46,6 @@ class Stats(NamedTuple):
         """Of no step, with floats like one given."""
         zero = jnp.zeros_like(like)
         return cls(jnp.zeros((), jnp.int32), zero, zero, jnp.ones((), bool), jnp.full_like(like, jnp.inf))
-
-
-class Start(NamedTuple):
-    """The initial state for a first step of any size h: q exp(h² q̃_2), v + h² v_2, a + h a_1; None: nothing."""
-
-    state: State
-    q_2: Float[Array, " k"] | None = None
-    v_2: Float[Array, " k"] | None = None
-    a_1: Float[Array, " k"] | None = None
-
-    def at(self, system: AbstractSystem, h) -> State:
-        state = self.state
-        return dataclasses.replace(
-            state,
-            q=state.q if self.q_2 is None else system.group.retract(state.q, h**2 * self.q_2),
-            v=state.v if self.v_2 is None else state.v + h**2 * self.v_2,
-            a=state.a if self.a_1 is None else state.a + h * self.a_1,
-        )
 
 
 class Memory(NamedTuple):
@@ -218,9 +200,13 @@ class AbstractScheme(AbstractIntegrator):
     def caution(self, system: AbstractSystem) -> str | None:
         """What may go wrong with a system, and what to take instead, if anything is known."""
 
-    def resized(self, vdot, a, ratio) -> Float[Array, " k"]:
-        """a of a state as a step begins with it that is `ratio` times as long as the one that led there."""
-        return a
+    def resized(self, system: AbstractSystem, state: State, t, factors: Any = None) -> Start:
+        """A state at t as steps begin with it that are r times as long as the one that led there; 1: as it is."""
+        return Start(state)
+
+    def resizing_factors(self, system: AbstractSystem, state: State, t) -> Any:
+        """What `resized` factorizes, if anything, without derivative."""
+        return None
 
     def step_error(self, system: AbstractSystem, begun: State, state: State, memory: Memory, node: Node) -> Array:
         """c, shape (k,), of a step from `begun` to `state` that left that memory: the error of its configuration is
@@ -244,10 +230,10 @@ class AbstractScheme(AbstractIntegrator):
         """
         return None
 
-    def mismatch(self, before: tuple[Any, Any], after: tuple[Any, Any]) -> Any:
-        """What is zero of (v̇, a) as a step begins and ends with them, in NumPy or JAX: whether a run is of this scheme.
+    def mismatch(self, before: tuple[Any, Any], after: tuple[Any, Any], ratio: Any) -> Any:
+        """What is zero of (v̇, a) at both ends of a step, in NumPy or JAX: whether a run is of this scheme.
 
-        None: v̇ and a do not tell.
+        `ratio`: of its size to the one before, of shape (…, 1). None: v̇ and a do not tell.
         """
         return None
 

@@ -14,9 +14,6 @@ follows from the errors of the last two, E = |e|/tolerance, by the filter
     ρ = (θ/E_n)^{1/(4p)} (θ/E_{n−1})^{1/(4p)} (h_n/h_{n−1})^{−1/4},      h_{n+1} = h_n (1 + κ arctan((ρ − 1)/κ)).
 
 It does not answer to what alternates from step to step, as accelerations do after a change, with (−ρ∞)ⁿ.
-Sizes so chosen change smoothly, which matters to index 3: in the constraint directions its velocity carries an error of
-O(h²) that belongs to the step size (see `_start.py`), and where this changes by a factor r multipliers are off by
-O(r² − 1) h.
 
 From π in a step on the samples of an unsteady body, and with them the estimate of the error, say nothing of its motion
 (`dynamics._turning`): no step turns one by more than half of it, whatever its error.
@@ -67,8 +64,7 @@ class GivenSteps(AbstractIntegrator):
 
     `GivenSteps.of(trajectory)` has those of a trajectory: the grid that error control found for one design serves
     those nearby, and what is computed on it is as smooth in the parameters as on equal steps. The trajectory is of
-    second order where sizes change smoothly; where they jump by a factor r, multipliers are off by O(r² − 1) h for some
-    steps. Derivatives are exact, those by `fractions`, t0 and t1 too.
+    second order, multipliers too, where sizes jump as well. Derivatives are exact, those by `fractions`, t0 and t1 too.
 
     Raises `ValueError` for fractions of another shape or sign.
     """
@@ -145,8 +141,7 @@ class AdaptiveSteps(AbstractIntegrator):
     differences agree with it on the same grid (`GivenSteps.of`). **Sensitivities**: their errors are not controlled,
     but the scheme is stable at any step size for the motion and so for its linearization: across a bump gradients by
     hardpoints converge as Ψ does (`benchmarks/variable_steps.py`). The criterion's trapezoidal rule sees the grid too.
-    **Multipliers** of generalized-α in index 3, and with them forces in joints and drivers, are off by O(r² − 1) h
-    where steps change by a factor r: they do not converge with the tolerance. Take `stabilized=True` or `RadauIIA`.
+    **Multipliers**, and with them forces in joints and drivers, converge as the motion does.
 
     All static and hashable. Raises `ValueError` for settings out of range.
     """
@@ -239,6 +234,7 @@ def _controlled_steps(
         active = progress.running & (elapsed < total)
         remaining = jnp.where(active, total - elapsed, h)
         wanted = fitted(proposed, remaining)
+        resized = scheme.resized(system, progress.state, t0 + elapsed)
 
         def begins(trial: _Trial) -> tuple[Progress, Float[Array, ""]]:
             """A first step begins with the state that belongs to its size, another with what earlier trials leave."""
@@ -249,7 +245,7 @@ def _controlled_steps(
         def attempt(trial: _Trial) -> _Trial:
             start, size = begins(trial)
             state, h = start.state, trial.h
-            begun = eqx.tree_at(lambda s: s.a, state, scheme.resized(state.vdot, state.a, h / size))
+            begun = selected(n == 0, state, resized.at(system, h / size))
             node = Node(t0 + elapsed, t0 + (elapsed + h), h)
             done, stats = walk.take(start, begun, node, trial.trying)
             error = relative(scheme.step_error(system, begun, done.state, done.memory, node), h)

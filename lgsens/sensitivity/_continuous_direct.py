@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 from lgsens._xla import scan
 from lgsens.dynamics import State, consistent_velocity, full_jacobian, kkt_solve
-from lgsens.integrate import GeneralizedAlpha, Variation, earlier, later, with_first
+from lgsens.integrate import GeneralizedAlpha, Variation, later, with_first
 from lgsens.sensitivity._linear_alpha import LinearMotion, LinearNode, advance, started
 from lgsens.sensitivity._linearization import Parameters, node_tangent
 
@@ -52,16 +52,13 @@ def continuous_direct_sweep(
     motion = _begin(scheme, system, jax.tree.map(lambda leaf: leaf[0], states), first, d, grid.t0, grid.first_size)
 
     def sweep(previous: LinearMotion, inputs):
-        state, place, d_place, link = inputs
-        h = grid.node(place).h
-        current = advance(
-            scheme, mass, previous, node(state, place, d_place), h, 1.0 if link.ratio is None else link.ratio
-        )
-        current = link.unless_empty(current, previous)
+        state, place, d_place = inputs
+        h, ratio = grid.node(place).h, grid.ratio(place)
+        current = advance(scheme, mass, previous, node(state, place, d_place), h, ratio)
+        current = grid.unless_empty(place, current, previous)
         return current, current
 
-    links = jax.vmap(lambda place, state: grid.link(scheme, place, state))(places, earlier(states))
-    _, rest = scan(sweep, motion, (later(states), places, d_places, links))
+    _, rest = scan(sweep, motion, (later(states), places, d_places))
     motion = jax.tree.map(lambda leaf: leaf[..., 0], with_first(motion, rest))
     return jax.vmap(partial(_variation, group))(states, motion)
 

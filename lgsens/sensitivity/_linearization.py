@@ -6,11 +6,12 @@ system and of the grid. Row 0 of L is δ_0 = b_0, those of a step are its equati
 
     E_{y⁺} δ_{n+1} + E_y δ_n* + E_p p' = b_{n+1},
 
-and the last row is p' = b.p. A step of size 0 has the equations δ_{n+1} − δ_n = b. L is block lower bidiagonal with a
-border for p. A derivative has b_0 and b.p only (all other rows zero); derivatives of derivatives fill the other rows.
+and the last row is p' = b.p. Where sizes change, y_n* depends on p as well. A step of size 0 has the equations
+δ_{n+1} − δ_n = b. L is block lower bidiagonal with a border for p. A derivative has b_0 and b.p only (all other rows
+zero); derivatives of derivatives fill the other rows.
 
-Forward substitution with L is the direct differentiation method , back substitution with Lᵀ the
-discrete adjoint variable method (`_sweeps.py`). Both solve with the exact iteration matrix of eq. (30).
+Forward substitution with L is the direct differentiation method, back substitution with Lᵀ the discrete adjoint
+variable method (`_sweeps.py`). Both solve with the exact iteration matrix of eq. (30).
 """
 
 from typing import Any, NamedTuple
@@ -23,7 +24,6 @@ from lgsens.integrate import (
     AbstractGrid,
     AbstractScheme,
     Node,
-    StepLink,
     Variation,
     earlier,
     later,
@@ -40,22 +40,16 @@ class Parameters(NamedTuple):
 
 
 class Step(NamedTuple):
-    """One converged step: where it is, how it follows the one before, what it begins with, and its end."""
+    """One converged step: where it is, and the states at both ends."""
 
     place: Any
-    link: StepLink
-    begun: State
+    before: State
     state: State
 
 
-def steps(scheme: AbstractScheme, states: State, grid: AbstractGrid) -> Step:
+def steps(states: State, grid: AbstractGrid) -> Step:
     """All steps of a trajectory, stacked."""
-
-    def linked(place, previous):
-        return grid.link(scheme, place, previous), grid.begun(scheme, place, previous)
-
-    places = grid.places()
-    return Step(places, *jax.vmap(linked)(places, earlier(states)), later(states))
+    return Step(grid.places(), earlier(states), later(states))
 
 
 def place_tangents(grid: AbstractGrid, d: AbstractGrid) -> Any:
@@ -81,12 +75,11 @@ def matvec(scheme: AbstractScheme, states: State, parameters: Parameters, delta:
 
     def row(place, d_place, before: State, state: State, previous: Variation, current: Variation) -> Variation:
         def equations(system, grid, place, before, state):
-            return rows(scheme, system, grid.node(place), grid.begun(scheme, place, before), state)
+            return rows(scheme, system, grid.node(place), grid.begun(scheme, system, place, before), state)
 
         d_states = to_ambient(group, before, previous), to_ambient(group, state, current)
         _, found = jax.jvp(equations, (system, grid, place, before, state), (d.system, d.grid, d_place, *d_states))
-        link = grid.link(scheme, place, before)
-        return link.unless_empty(found, jax.tree.map(jnp.subtract, current, previous))
+        return grid.unless_empty(place, found, jax.tree.map(jnp.subtract, current, previous))
 
     def taken(rows: Variation) -> Variation:
         """The rows of steps; those beyond the last one say δ = b."""

@@ -1,8 +1,10 @@
 """The steps of a known trajectory, linearized, in both directions: what is gone through in turn, or all at once.
 
-A step follows the one before (`StepLink`: δ_n* from δ_n) and solves its linearized equations (`AbstractLinearizedStep`)
-for δ_{n+1}, with the loads E_p p' of the parameters; an empty one is δ_{n+1} = δ_n + b. Backwards it takes the
-cotangent c of δ_{n+1} to the multipliers μ of its rows, and to what it adds to the cotangents of δ_n and of p.
+A step begins with what its grid makes of the state before (δ_n* from δ_n and p') and solves its linearized equations
+(`AbstractLinearizedStep`) for δ_{n+1}, with the loads E_p p' of the parameters; an empty one is δ_{n+1} = δ_n + b.
+Backwards it takes the cotangent c of δ_{n+1} to the multipliers μ of its rows, and to what it adds to the cotangents of
+δ_n and of p. Between equal steps δ_n* = δ_n; else y_n* is a function that JAX differentiates, with factors that are
+made once.
 """
 
 from collections.abc import Callable
@@ -11,8 +13,25 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from lgsens.dynamics import State
 from lgsens.integrate import AbstractLinearizedStep, AbstractScheme, Variation
-from lgsens.sensitivity._linearization import Parameters, Step, node_tangent
+from lgsens.sensitivity._linearization import Parameters, Step, node_tangent, to_algebra, to_ambient
+
+
+class LinearStep(NamedTuple):
+    """A step, linearized."""
+
+    step: Step
+    begun: State
+    factors: Any  # what `begun` is found with
+    equations: AbstractLinearizedStep
+
+
+class Loads(NamedTuple):
+    """What parameters add: to the equations of a step, and to the variation that it begins with."""
+
+    equations: Any
+    begun: Variation | None  # None: nothing
 
 
 class Backward(NamedTuple):
@@ -20,8 +39,7 @@ class Backward(NamedTuple):
 
     previous: Variation  # what it adds to the cotangent of δ_n
     mu: Variation
-    of_loads: Any
-    of_ratio: Any  # None: steps are equal
+    loads: Loads
 
 
 class LinearizedSteps(NamedTuple):
@@ -35,54 +53,76 @@ class LinearizedSteps(NamedTuple):
     def of(cls, scheme: AbstractScheme, parameters: Parameters) -> "LinearizedSteps":
         return cls(scheme, parameters, scheme.shared(parameters.system))
 
-    def linearized(self, step: Step) -> AbstractLinearizedStep:
+    def linearized(self, step: Step) -> LinearStep:
         """Its matrices, with what solves them."""
         system, grid = self.parameters
-        return self.scheme.linearized(system, self.shared, grid.node(step.place), step.begun, step.state)
+        factors = grid.factors(self.scheme, system, step.place, step.before)
+        begun = grid.begun(self.scheme, system, step.place, step.before, factors)
+        node = grid.node(step.place)
+        equations = self.scheme.linearized(system, self.shared, node, begun, step.state)
+        return LinearStep(step, begun, factors, equations)
 
-    def loads(self, step: Step, d: Parameters, d_place: Any) -> Any:
-        """E_p p'."""
+    def loads(self, linear: LinearStep, d: Parameters, d_place: Any) -> Loads:
+        """E_p p', and what p' makes of y_n*."""
         system, grid = self.parameters
+        step, begun = linear.step, None
         node, d_node = grid.node(step.place), node_tangent(grid, d.grid, step.place, d_place)
-        loads = self.scheme.loads(self.shared, step.begun, step.state)
-        return jax.jvp(loads, (system, node), (d.system, d_node))[1]
+        loads = self.scheme.loads(self.shared, linear.begun, step.state)
+        if grid.resizes:
+            at = lambda system, place: grid.begun(self.scheme, system, place, step.before, linear.factors)
+            _, d_begun = jax.jvp(at, (system, step.place), (d.system, d_place))
+            begun = to_algebra(system.group, linear.begun, d_begun)
+        return Loads(jax.jvp(loads, (system, node), (d.system, d_node))[1], begun)
 
-    def forward(
-        self,
-        linearized: AbstractLinearizedStep,
-        step: Step,
-        previous: Variation,
-        loads: Any,
-        row: Variation,
-        d_place: Any,
-    ) -> Variation:
+    def _begun(self, linear: LinearStep, previous: Variation) -> Variation:
+        """δ_n* at given parameters."""
+        (system, grid), step = self.parameters, linear.step
+        if not grid.resizes:
+            return previous
+        at = lambda state: grid.begun(self.scheme, system, step.place, state, linear.factors)
+        d_begun = jax.jvp(at, (step.before,), (to_ambient(system.group, step.before, previous),))[1]
+        return to_algebra(system.group, linear.begun, d_begun)
+
+    def forward(self, linear: LinearStep, previous: Variation, loads: Loads, row: Variation) -> Variation:
         """δ_{n+1}."""
-        begun = step.link.begun(previous, d_place)
-        current = linearized.forward(self.shared, self.parameters.grid.node(step.place), begun, loads, row)
-        return step.link.unless_empty(current, jax.tree.map(jnp.add, previous, row))
+        grid, place = self.parameters.grid, linear.step.place
+        begun = self._begun(linear, previous)
+        if loads.begun is not None:
+            begun = jax.tree.map(jnp.add, begun, loads.begun)
+        current = linear.equations.forward(self.shared, grid.node(place), begun, loads.equations, row)
+        return grid.unless_empty(place, current, jax.tree.map(jnp.add, previous, row))
 
-    def backward(self, linearized: AbstractLinearizedStep, step: Step, c: Variation, loads: Any) -> Backward:
+    def backward(self, linear: LinearStep, c: Variation, loads: Loads) -> Backward:
         """The transpose of `forward`; `loads`: in shape."""
-        node = self.parameters.grid.node(step.place)
-        begun, of_loads, mu = linearized.backward(self.shared, node, c, loads)
-        previous, of_ratio = step.link.begun_transposed(begun)
-        previous = step.link.unless_empty(previous, c)
-        of_loads = step.link.unless_empty(of_loads, jax.tree.map(jnp.zeros_like, of_loads))
-        return Backward(previous, step.link.unless_empty(mu, c), of_loads, of_ratio)
+        grid, place = self.parameters.grid, linear.step.place
+        begun, of_equations, mu = linear.equations.backward(self.shared, grid.node(place), c, loads.equations)
+        previous, own = begun, None
+        if grid.resizes:
+            (previous,) = jax.vjp(lambda delta: self._begun(linear, delta), Variation.none(linear.begun))[1](begun)
+            own = begun
+        found = Loads(of_equations, own)
+        found = grid.unless_empty(place, found, jax.tree.map(jnp.zeros_like, found))
+        return Backward(grid.unless_empty(place, previous, c), grid.unless_empty(place, mu, c), found)
 
-    def pull_back(self, steps: Step) -> tuple[Any, Callable[[Backward], tuple[Parameters, Any]]]:
+    def pull_back(self, linear: LinearStep) -> tuple[Loads, Callable[[Backward], tuple[Parameters, Any]]]:
         """The loads of a step, in shape; and for stacked steps what they add to p̄, and the cotangents of places."""
+        resizes, group = self.parameters.grid.resizes, self.parameters.system.group
 
         def all_loads(system, grid, places):
-            at = lambda step, place: self.scheme.loads(self.shared, step.begun, step.state)(system, grid.node(place))
-            return jax.vmap(at)(steps, places)
+            def of_one(linear: LinearStep, place):
+                step = linear.step
+                loads = self.scheme.loads(self.shared, linear.begun, step.state)(system, grid.node(place))
+                if not resizes:
+                    return Loads(loads, None)
+                begun = grid.begun(self.scheme, system, place, step.before, linear.factors)
+                return Loads(loads, Variation.of(group.from_ambient(linear.begun.q, begun.q), begun))
 
-        loads, transposed = jax.vjp(all_loads, *self.parameters, steps.place)
+            return jax.vmap(of_one)(linear, places)
+
+        loads, transposed = jax.vjp(all_loads, *self.parameters, linear.step.place)
 
         def pulled(found: Backward):
-            of_system, of_grid, of_places = transposed(found.of_loads)
-            if found.of_ratio is not None:
-                of_places = of_places._replace(ratio=of_places.ratio + found.of_ratio)
+            of_system, of_grid, of_places = transposed(found.loads)
             return Parameters(of_system, of_grid), of_places
 
         return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), loads), pulled

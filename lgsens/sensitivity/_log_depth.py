@@ -44,18 +44,17 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import State
-from lgsens.integrate import AbstractLinearizedStep, AbstractScheme, Variation, earlier, later, with_first, with_last
+from lgsens.integrate import AbstractScheme, Variation, earlier, later, with_first, with_last
 from lgsens.sensitivity._carried import Carried
-from lgsens.sensitivity._linearization import Parameters, Step, place_tangents, steps, with_places
-from lgsens.sensitivity._linearized_steps import Backward, LinearizedSteps
+from lgsens.sensitivity._linearization import Parameters, place_tangents, steps, with_places
+from lgsens.sensitivity._linearized_steps import Backward, LinearizedSteps, LinearStep, Loads
 
 
 class _Composed(NamedTuple):
     """All steps of a run, stacked: equations, coordinates before and after each, and Ã."""
 
     equations: LinearizedSteps
-    linearized: AbstractLinearizedStep
-    steps: Step
+    steps: LinearStep
     before: Carried
     after: Carried
     transitions: Float[Array, "n s s"]
@@ -63,33 +62,32 @@ class _Composed(NamedTuple):
     @classmethod
     def of(cls, scheme: AbstractScheme, states: State, parameters: Parameters) -> "_Composed":
         system, grid = parameters
-        equations, every = LinearizedSteps.of(scheme, parameters), steps(scheme, states, grid)
-        linearized = jax.vmap(equations.linearized)(every)
-        reduced = every.link.empty is None
+        equations, every = LinearizedSteps.of(scheme, parameters), steps(states, grid)
+        linear = jax.vmap(equations.linearized)(every)
+        reduced = grid.empty(every.place) is None
         carried = jax.vmap(partial(Carried.of, scheme, system, reduced=reduced))(states, grid.times())
         before, after = earlier(carried), later(carried)
         d, d_places = jax.tree.map(jnp.zeros_like, (parameters, every.place))
 
-        def transition(linearized, step, place, before, after):
-            none = Variation.none(step.begun)
-            loads = jax.tree.map(jnp.zeros_like, jax.eval_shape(equations.loads, step, d, place))
+        def transition(linear, place, before, after):
+            none = Variation.none(linear.begun)
+            loads = jax.tree.map(jnp.zeros_like, jax.eval_shape(equations.loads, linear, d, place))
 
             def column(y):
-                return after.back(equations.forward(linearized, step, before.into(y, none), loads, none, place))
+                return after.back(equations.forward(linear, before.into(y, none), loads, none))
 
             return jax.vmap(column, out_axes=1)(jnp.eye(before.back(none).shape[0], dtype=none.v.dtype))
 
-        found = jax.vmap(transition)(linearized, every, d_places, before, after)
-        return cls(equations, linearized, every, before, after, found)
+        found = jax.vmap(transition)(linear, d_places, before, after)
+        return cls(equations, linear, before, after, found)
 
-    def forward(self, previous: Variation, loads: Any, rows: Variation, d_places: Any) -> Variation:
+    def forward(self, previous: Variation, loads: Loads, rows: Variation) -> Variation:
         """A_n δ_n + f_n."""
-        return jax.vmap(self.equations.forward)(self.linearized, self.steps, previous, loads, rows, d_places)
+        return jax.vmap(self.equations.forward)(self.steps, previous, loads, rows)
 
-    def backward(self, c: Variation, loads: Any) -> Backward:
+    def backward(self, c: Variation, loads: Loads) -> Backward:
         """Of all c_{n+1}; `loads`: of one, in shape."""
-        backward = lambda linearized, step, c: self.equations.backward(linearized, step, c, loads)
-        return jax.vmap(backward)(self.linearized, self.steps, c)
+        return jax.vmap(lambda linear, c: self.equations.backward(linear, c, loads))(self.steps, c)
 
 
 def _after(first, second):
@@ -103,7 +101,7 @@ def direct_at_once(scheme: AbstractScheme, states: State, parameters: Parameters
     grid = parameters.grid
     every, d_places = _Composed.of(scheme, states, parameters), place_tangents(grid, d.grid)
     loads = jax.vmap(lambda step, d_place: every.equations.loads(step, d, d_place))(every.steps, d_places)
-    given = loads, later(b), d_places
+    given = loads, later(b)
     nothing = jax.tree.map(jnp.zeros_like, given)
 
     def solved(f: Variation) -> Variation:

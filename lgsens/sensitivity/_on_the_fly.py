@@ -20,11 +20,12 @@ from lgsens.integrate import AbstractScheme, Stats, Variation, Walk, over_steps
 from lgsens.sensitivity._criterion_terms import Functional
 from lgsens.sensitivity._linearization import (
     Parameters,
-    node_tangent,
+    Step,
     place_tangents,
     to_algebra,
     to_ambient,
 )
+from lgsens.sensitivity._linearized_steps import LinearizedSteps
 
 
 class OnTheFly(NamedTuple):
@@ -50,6 +51,7 @@ def direct_on_the_fly(
     )(directions)
     system, grid = parameters
     group, walk = system.group, Walk.of(scheme, system)
+    equations = LinearizedSteps(scheme, parameters, walk.shared)
     none = Variation.none(state0)
 
     def with_derivative(function, state: State, t, delta: Variation):
@@ -65,23 +67,18 @@ def direct_on_the_fly(
     def step(carry, inputs):
         progress, delta, before, total = carry
         place, d_places = inputs
-        node = grid.node(place)
-        link, begun = grid.link(scheme, place, progress.state), grid.begun(scheme, place, progress.state)
+        node, origin = grid.node(place), progress.state
         progress, stats = walk.on(grid, progress, place)
-        linearized = scheme.linearized(system, walk.shared, node, begun, progress.state)
-        memory, stats = scheme.remembered(walk.shared, progress.memory, linearized, node, stats)
+        linear = equations.linearized(Step(place, origin, progress.state))
+        memory, stats = scheme.remembered(walk.shared, progress.memory, linear.equations, node, stats)
         progress = progress._replace(memory=memory)
 
         def along(delta, d: Parameters, d_place):
-            d_node = node_tangent(grid, d.grid, place, d_place)
-            loads = scheme.loads(walk.shared, begun, progress.state)
-            _, of_parameters = jax.jvp(loads, (system, node), (d.system, d_node))
-            current = linearized.forward(walk.shared, node, link.begun(delta, d_place), of_parameters, none)
-            return link.unless_empty(current, delta)
+            return equations.forward(linear, delta, equations.loads(linear, d, d_place), none)
 
         delta = jax.vmap(along)(delta, d, d_places)
         rate = with_derivative(functional.rate, progress.state, node.t, delta)
-        weight = link.unless_empty(node.h / 2, jnp.zeros_like(node.h))
+        weight = grid.unless_empty(place, node.h / 2, jnp.zeros_like(node.h))
         total = jax.tree.map(lambda total, f, g: total + weight * (f + g), total, before, rate)
         turning = unsteady_rate(system, progress.state.v, progress.state.vdot)
         return (progress, delta, rate, total), (stats, turning)

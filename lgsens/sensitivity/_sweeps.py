@@ -101,20 +101,20 @@ def direct_sweep(scheme: AbstractScheme, states: State, parameters: Parameters, 
     blocks = StepBlocks.of(grid.num_steps, scheme.numbers(system), grid.count)
 
     def prepare(step: Step, d_place):
-        loads = equations.loads(step, d, d_place)
-        return equations.linearized(step), loads
+        linear = equations.linearized(step)
+        return linear, equations.loads(linear, d, d_place)
 
     def one(previous: Variation, inputs):
-        (linearized, loads), step, row, d_place = inputs
-        current = equations.forward(linearized, step, previous, loads, row, d_place)
+        (linear, loads), row = inputs
+        current = equations.forward(linear, previous, loads, row)
         return current, current
 
     def block(previous: Variation, inputs):
         step, rows, d_place = inputs
-        return scan(one, previous, (jax.vmap(prepare)(step, d_place), step, rows, d_place))
+        return scan(one, previous, (jax.vmap(prepare)(step, d_place), rows))
 
     first = jax.tree.map(lambda leaf: leaf[0], b)
-    inputs = (steps(scheme, states, grid), later(b), place_tangents(grid, d.grid))
+    inputs = (steps(states, grid), later(b), place_tangents(grid, d.grid))
     _, rest = blocks.scan(block, first, blocks.padded(inputs, repeat=True))
     return with_first(first, rest), d
 
@@ -126,21 +126,21 @@ def adjoint_sweep(scheme: AbstractScheme, states: State, parameters: Parameters,
     blocks = StepBlocks.of(grid.num_steps, scheme.numbers(system), grid.count)
 
     def one(loads, c: Variation, inputs):
-        linearized, step, own = inputs
-        found = equations.backward(linearized, step, c, loads)
+        linear, own = inputs
+        found = equations.backward(linear, c, loads)
         return jax.tree.map(jnp.add, own, found.previous), found._replace(previous=None)
 
     def block(carry, inputs):
         c, bar = carry
         step, own = inputs
-        loads, pull_back = equations.pull_back(step)
-        inputs = (jax.vmap(equations.linearized)(step), step, own)
-        c, found = scan(partial(one, loads), c, inputs, reverse=True)
+        linear = jax.vmap(equations.linearized)(step)
+        loads, pull_back = equations.pull_back(linear)
+        c, found = scan(partial(one, loads), c, (linear, own), reverse=True)
         of_parameters, of_places = pull_back(found)
         return (c, jax.tree.map(jnp.add, bar, of_parameters)), (found.mu, of_places)
 
     # The steps that fill the last block come first, with zero cotangents, and leave them zero.
     c = blocks.padded(c, repeat=False)
-    inputs = (blocks.padded(steps(scheme, states, grid), repeat=True), earlier(c))
+    inputs = (blocks.padded(steps(states, grid), repeat=True), earlier(c))
     (first, bar), (rest, of_places) = blocks.scan(block, (blocks.last(c), c_p), inputs, reverse=True)
     return with_first(first, rest), with_places(grid, bar, of_places)

@@ -154,8 +154,8 @@ def test_a_step_hands_on_what_its_coordinates_hold(scheme, size):
     @jax.jit
     def found(states, parameters, delta):
         every, previous = _Composed.of(scheme, states, parameters), jax.tree.map(lambda leaf: leaf[1:], delta)
-        load = lambda step: every.equations.loads(step, parameters, step.place)
-        nothing = jax.tree.map(jnp.zeros_like, (jax.vmap(load)(every.steps), previous, every.steps.place))
+        load = lambda linear: every.equations.loads(linear, parameters, linear.step.place)
+        nothing = jax.tree.map(jnp.zeros_like, (jax.vmap(load)(every.steps), previous))
         unread = {name: 7.0 + getattr(previous, name) for name in ("vdot", "lam", "a") if name not in scheme.carries}
         back, into = jax.vmap(Carried.back), jax.vmap(Carried.into)
         end = every.forward(previous, *nothing)
