@@ -4,7 +4,7 @@ On sizes h_n = ε θ(n ε), θ smooth, what a scheme of order p computes has the
 
     true ≈ ψ + (ψ' − ψ) 2^p/(2^p − 1),     in a Lie group: q exp(w̃),  w = log(q⁻¹ q') 2^p/(2^p − 1)
 
-from the runs ψ with ε and ψ' with ε/2, which halve each step: what belongs to the size of a step follows it (`resized`),
+from the runs ψ with ε and ψ' with ε/2, which halves each step: what belongs to its size follows it (`resized`),
 at the start as well.
 
 Source: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I (2008), §II.4 and §II.8.
@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from lgsens.integrate import AbstractScheme, UnevenGrid
 from lgsens.sensitivity import DirectDifferentiation, Parameters
 from lgsens.simulation import StateError, Trajectory
+
 
 @eqx.filter_jit
 def refined_error(scheme: AbstractScheme, trajectory: Trajectory) -> StateError:

@@ -36,7 +36,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._validate import as_float, is_concrete, require, require_setting
-from lgsens._xla import scan, while_loop
+from lgsens._xla import alike, scan, while_loop
 from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk, unsteady_rate
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
 from lgsens.integrate._grid import UnevenGrid, with_first
@@ -234,7 +234,11 @@ def _controlled_steps(
         active = progress.running & (elapsed < total)
         remaining = jnp.where(active, total - elapsed, h)
         wanted = fitted(proposed, remaining)
-        resized = scheme.resized(system, progress.state, t0 + elapsed)
+        # Not in the loop below: XLA takes out of a loop what does not change in it, and then no turn costs one.
+        resize = lambda: scheme.resized(system, progress.state, t0 + elapsed)
+        found = jax.eval_shape(resize)
+        nothing = lambda: alike(jax.tree.map(jnp.zeros_like, found), found)
+        resized = lax.cond(active, lambda: alike(resize(), found), nothing)
 
         def begins(trial: _Trial) -> tuple[Progress, Float[Array, ""]]:
             """A first step begins with the state that belongs to its size, another with what earlier trials leave."""
