@@ -196,7 +196,7 @@ def test_derivative_is_that_on_the_frozen_grid():
     grid = lg.GivenSteps.of(run, SCHEME)
     assert grid.num_steps == int(run.stats.steps)
     again = jax.jit(lambda p: observed(lg.simulate(make(p), t0=0.2, t1=1.2, num_steps=grid.num_steps, integrator=grid)))
-    # sizes are fractions again, and differ by round-off: 0.01 λ by 0.01 · 1e-16/(βh²), 1e-12 for the shortest, 1e-3
+    # Sizes are fractions again, and differ by round-off: 0.01 λ by 0.01 · 1e-16/(βh²)/(1 − ρ∞)² = 5e-12 at h = 4e-3.
     np.testing.assert_allclose(again(p), found, rtol=4e-12)
     expected = [central(lambda s, e=e: again(p + s * e * p), 1e-3) for e in jnp.eye(4)]
     # As on equal steps, test_own_system.py. The round-off of Ψ, 1e-12 of it in differences over 1e-3, is in all alike.
