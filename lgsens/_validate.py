@@ -33,7 +33,7 @@ def as_float(value: Any, shape: tuple[int, ...] | None, what: str) -> Array:
     else:
         try:
             if _says_something_else(value):
-                raise TypeError("text or truth values, of which JAX would make numbers")
+                raise TypeError("text, truth values or complex numbers, of which JAX would make others")
             array = jnp.asarray(value, dtype=_float_type())
         except (TypeError, ValueError) as error:
             remedy = _OF_FUNCTIONS if callable(value) else ""
@@ -44,9 +44,9 @@ def as_float(value: Any, shape: tuple[int, ...] | None, what: str) -> Array:
 
 
 def _says_something_else(value: Any) -> bool:
-    """Whether there are texts or truth values in it."""
+    """Whether there are texts, truth values or complex numbers in it."""
     kind = lambda leaf: getattr(getattr(leaf, "dtype", None), "kind", "")
-    return any(isinstance(leaf, str | bytes | bool) or kind(leaf) in {*"bSU"} for leaf in jax.tree.leaves(value))
+    return any(isinstance(leaf, str | bytes | bool) or kind(leaf) in {*"bcSU"} for leaf in jax.tree.leaves(value))
 
 
 def is_float_array(value: Any) -> bool:
@@ -115,9 +115,14 @@ def leaf_name(path: tuple[Any, ...], root: str) -> str:
     return jax.tree_util.keystr(path, simple=True, separator=".") or root
 
 
+def of_shape(*shape: int, **kwargs: Any) -> Any:
+    """A field whose array, unless it is None, has that shape: what comes in after construction is held to it."""
+    return eqx.field(metadata={"shape": shape}, **kwargs)
+
+
 def number_field(name: str, **kwargs: Any) -> Any:
     """A keyword-only scalar leaf of an element; with `default=None` it may be left out."""
-    return eqx.field(
+    return of_shape(
         converter=lambda value: None if value is None else as_float(value, (), f"`{name}`"),
         kw_only=True,
         **kwargs,
@@ -126,7 +131,8 @@ def number_field(name: str, **kwargs: Any) -> Any:
 
 def point_field(name: str, **kwargs: Any) -> Any:
     """A keyword-only leaf of shape (3,): a point, a vector or a direction."""
-    return eqx.field(
+    return of_shape(
+        3,
         converter=lambda value: None if value is None else as_float(value, (3,), f"`{name}`"),
         kw_only=True,
         **kwargs,
@@ -146,7 +152,7 @@ def axis_field(name: str) -> Any:
         )
         return axis
 
-    return eqx.field(converter=convert, kw_only=True)
+    return of_shape(3, converter=convert, kw_only=True)
 
 
 def require_positive(owner: Any, *names: str) -> None:

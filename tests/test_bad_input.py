@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import says
@@ -285,7 +286,8 @@ def test_a_state_of_other_shapes():
 
 
 def test_a_state_off_the_joints():
-    """Known numbers alone are looked at, those of `grad` too; what is left of a rounded file passes."""
+    """Of known numbers, those of `grad` too, before anything runs; inside `jit` the result says so, and the data are
+    NaN. What is left of a rounded file passes."""
     model = pendulum()
     run = lambda state0: lg.simulate(model, t0=0.5, t1=0.6, num_steps=4, state0=state0).body("bob").position[-1, 0]
     off = lambda by: eqx.tree_at(lambda state: state.q.position, start, start.q.position + by)
@@ -295,7 +297,48 @@ def test_a_state_off_the_joints():
         with pytest.raises(ValueError, match=says(*parts)):
             given(off(0.01))
     run(off(1e-4))
-    jax.jit(run)(off(0.01))
+    whole = lambda state0: lg.simulate(model, t0=0.5, t1=0.6, num_steps=4, state0=state0, throw=False)
+    states = jax.tree.map(lambda one, other: jnp.stack([one, other]), off(1e-4), off(0.01))
+    batch = jax.jit(jax.vmap(whole))(states)
+    assert batch.result.tolist() == [lg.RESULTS.successful, lg.RESULTS.off_joints]
+    assert np.all(np.isfinite(batch.states.v[0])) and np.all(np.isnan(batch.states.v[1]))
+    with pytest.raises(ValueError, match=says("`state0` does not satisfy the joints at t0", "`equilibrium(model")):
+        lg.raise_if_failed(batch)
+
+
+def test_a_state_in_single_precision():
+    """It is taken in that of the model."""
+    model = pendulum(velocity=(0.5, 0.0, 0.0))
+    start = lg.initial_state(model)
+    run = lambda state0: lg.simulate(model, t1=0.1, num_steps=4, state0=state0).states.v[-1]
+    found = run(jax.tree.map(lambda leaf: leaf.astype(jnp.float32), start))
+    assert found.dtype == jnp.float64
+    np.testing.assert_allclose(found, run(start), rtol=0, atol=1e-5)  # 6e-8 of 10 m/s², of 0.5 m/s, in steps of 25 ms
+
+
+def test_complex_numbers():
+    """An imaginary part is not dropped: differences of complex steps would be zero."""
+    with pytest.raises(ValueError, match=says("`t1` must be a number", "e-20j")):
+        lg.simulate(pendulum(), t1=jnp.asarray(1.0 + 1e-20j), num_steps=2)
+    with pytest.raises(ValueError, match=says("`mass` must be a number", "j")):
+        pendulum(mass=np.asarray(1.0 + 0.0j))
+
+
+def test_leaves_of_other_shapes():
+    """A batch of models, and leaves that `tree_at` put in."""
+    models = jax.vmap(lambda mass: pendulum(mass=mass))(jnp.array([1.0, 2.0]))
+    with pytest.raises(ValueError, match=says("Body 'bob': `mass` must have shape (), got shape (2,)", "jax.vmap")):
+        lg.simulate(models, t1=0.1, num_steps=2)
+    leaf = lambda model: model.joints["pivot"].at
+    for given in (lambda model: model.system(), jax.jit(lambda model: model.system())):
+        with pytest.raises(ValueError, match=says("Joint 'pivot': `at` must have shape (3,), got shape (1,)")):
+            given(eqx.tree_at(leaf, pendulum(), jnp.ones(1)))
+
+
+def test_a_search_inside_of_a_transformation():
+    search = lambda x: lg.optimize.minimize(lambda x: jnp.sum(x**2), x, num_steps=5, progress=False).x
+    with pytest.raises(ValueError, match=says("`x0`", "traced", "`multi_start`", "`least_squares`")):
+        jax.vmap(search)(jnp.ones((2, 2)))
 
 
 def test_the_index_of_a_state():

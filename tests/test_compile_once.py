@@ -39,6 +39,10 @@ def build(p):
     return spinning_top(p[0], length=p[1])
 
 
+def psi_of_model(model):
+    return lg.simulate(model, t1=0.1, num_steps=4).body("top").position[-1, 0]
+
+
 def psi(p, criterion=HIGH, times=FIRST, numbers=None, **settings):
     run = lg.simulate(build(p), **(FIRST | times), integrator=lg.GeneralizedAlpha(**(numbers or {})), **settings)
     return criterion(run, p)
@@ -60,6 +64,14 @@ def test_eager_gradients_share_their_programs(compiled):
     run = lg.simulate(build(P), t1=0.1, num_steps=30)
     assert run.t.shape == (31,) and run.states.v.shape[0] == 31 and run.stats.converged.shape == (30,)
     np.testing.assert_allclose(run.t, np.linspace(0.0, 0.1, 31), rtol=0, atol=1e-16)
+
+
+def test_a_gradient_by_the_whole_model_compiles_once(compiled):
+    """As in README, outside of `jit`: the projection of orientations on rotations is no loop to be transposed anew."""
+    gradient = eqx.filter_grad(psi_of_model)
+    gradient(spinning_top(0.7))
+    names, _ = compiled(gradient, spinning_top(0.8))
+    assert not names
 
 
 @pytest.mark.slow  # as the gradients above

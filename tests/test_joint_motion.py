@@ -352,8 +352,43 @@ def test_messages():
         trajectory.point("arm", (0.0, 1.0))
     with pytest.raises(ValueError, match=says("do not know their joints", "give `simulate` the Model", "`multiplier`")):
         dataclasses.replace(trajectory, joints=None).joint("hinge")  # of `simulate(model.system(), …)`
-    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), trajectory)
-    with pytest.raises(ValueError, match=says("batch of motions, of shape (2,)", "jax.vmap")):
-        batch.joint("hinge")
-    angles = jax.vmap(lambda trajectory: trajectory.joint("hinge").angle)(batch)
-    np.testing.assert_allclose(angles[1], trajectory.joint("hinge").angle, rtol=0, atol=1e-15)
+
+
+def test_a_batch_is_asked_one_by_one():
+    """Whatever is asked: a body, a point mass, a point, a joint, a force, multipliers, a state."""
+
+    def run(length):
+        bodies = {
+            "arm": lg.RigidBody(mass=1.0, inertia=(0.1, 0.1, 0.1), position=(length, 0.0, 0.0)),
+            "bob": lg.RigidBody(2.0, None, position=(2.0 * length, 0.0, 0.0)),
+        }
+        joints = {
+            "hinge": lg.RevoluteJoint(None, "arm", at=ORIGIN, axis=(0.0, 1.0, 0.0)),
+            "ball": lg.SphericalJoint("arm", "bob", at=(2.0 * length, 0.0, 0.0)),
+        }
+        spring = lg.SpringDamper(None, "bob", at_a=(0.0, 0.0, 1.0), at_b=(2.0 * length, 0.0, 0.0), stiffness=50.0)
+        model = lg.Model(bodies, joints, {"gravity": lg.Gravity((0.0, 0.0, -9.81)), "spring": spring})
+        return lg.simulate(model, t1=0.1, num_steps=4)
+
+    questions = {
+        "body": lambda run: run.body("arm"),
+        "mass": lambda run: run.body("bob"),
+        "point": lambda run: run.point("bob", (0.1, 0.2, 0.3)),
+        "joint": lambda run: run.joint("hinge"),
+        "force": lambda run: run.force("spring"),
+        "multiplier": lambda run: run.multiplier("ball"),
+        "state": lambda run: run.state(-1),
+    }
+    batch = jax.jit(jax.vmap(jax.vmap(run)))(jnp.array([[0.4, 0.5, 0.6], [0.7, 0.8, 0.9]]))
+    one = jax.tree.map(lambda leaf: leaf[1, 2], batch)
+    asked = jax.jit(lambda run: {name: ask(run) for name, ask in questions.items()})
+    of_all, of_one = asked(batch), asked(one)
+    for name in questions:
+        for found, expected in zip(jax.tree.leaves(of_all[name]), jax.tree.leaves(of_one[name]), strict=True):
+            assert found.shape == (2, 3, *expected.shape), name
+            # round-off of a product in another order
+            np.testing.assert_allclose(found[1, 2], expected, rtol=0, atol=1e-12, err_msg=name)
+    with pytest.raises(IndexError, match=says("from -5 to 4, as there are 5 states")):
+        batch.state(5)
+    with pytest.raises(ValueError, match=says("batch of trajectories, of shape (2, 3)", "jax.vmap(GivenSteps.of)")):
+        lg.GivenSteps.of(batch)

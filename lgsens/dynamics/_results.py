@@ -20,6 +20,7 @@ class RESULTS(IntEnum):
     not_steady = 11
     statics_failed = 12
     not_held = 13
+    off_joints = 14
 
     @property
     def message(self) -> str:
@@ -85,6 +86,10 @@ _MESSAGES = {
     RESULTS.not_held: (
         "The equilibrium is not determined: something can move without any force against it. Lock it (a wheel on its "
         "hinge: `FixedJoint`), hold it (`RigidBody.free`), or give it a spring, however weak; or drive it."
+    ),
+    RESULTS.off_joints: (
+        "`state0` does not satisfy the joints at t0. Give a state of this model at this time: `initial_state(model, "
+        "t0=t0)`, `equilibrium(model, t0=t0)`, or the last one of a run of a model with the same hardpoints."
     ),
     RESULTS.steps_exhausted: (
         "Error control needs more steps than `num_steps` allows. Try more `num_steps` or a looser `tolerance`."

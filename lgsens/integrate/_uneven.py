@@ -85,7 +85,15 @@ class GivenSteps(AbstractIntegrator):
 
     @classmethod
     def of(cls, trajectory: Any, integrator: AbstractScheme = GeneralizedAlpha()) -> "GivenSteps":
-        """The steps of a trajectory; those of size 0 are left out, unless it is traced."""
+        """The steps of a trajectory; those of size 0 are left out, unless it is traced.
+
+        Raises `ValueError` for a batch of trajectories, each of which has its own: `jax.vmap` this.
+        """
+        if jnp.ndim(trajectory.t) != 1:
+            raise ValueError(
+                f"GivenSteps.of: this is a batch of trajectories, of shape {jnp.shape(trajectory.t)[:-1]}; each has "
+                "steps of its own: jax.vmap(GivenSteps.of)(trajectories), for simulations under `vmap`."
+            )
         sizes = lax.stop_gradient(jnp.diff(trajectory.t))
         if is_concrete(sizes):
             sizes = np.asarray(sizes)[np.asarray(sizes) > 0.0]

@@ -39,9 +39,9 @@ def _nearer(R):
     return 0.5 * R @ (3.0 * eye - R.swapaxes(-1, -2) @ R)
 
 
-@partial(jax.jit, inline=True)  # else each scene that is made outside of `jit` compiles the loop again
+@partial(jax.jit, inline=True)  # not a loop, whose transpose JAX 0.10 compiles again wherever it is outside of `jit`
 def _nearest(R):
-    return lax.scan(lambda R, _: (_nearer(R), None), R, length=4)[0]
+    return reduce(lambda R, _: _nearer(R), range(4), R)
 
 
 def _components(x):

@@ -8,6 +8,7 @@ semidefinite: that is the triangle inequality of its principal moments, and J ha
 seven principal minors are not negative.
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -54,7 +55,14 @@ def checked(what: str, element: Any) -> Any:
 
 
 def _check_again(module: eqx.Module) -> None:
-    """The checks of the constructors of a module and of those in it."""
+    """The checks of the constructors of a module and of those in it: shapes first."""
+    for field in dataclasses.fields(module):
+        shape, value = field.metadata.get("shape"), getattr(module, field.name)
+        if shape is not None and value is not None and value.shape != shape:
+            raise ValueError(
+                f"`{field.name}` must have shape {shape}, got shape {value.shape}; for many models at once jax.vmap "
+                "what is done with one."
+            )
     for kind in type(module).__mro__:
         if "__check_init__" in vars(kind):
             vars(kind)["__check_init__"](module)

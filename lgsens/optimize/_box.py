@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -78,6 +79,11 @@ def checked_box(x0, lower, upper, log_scale) -> tuple[Array, Callable[[Array], P
         return ravel_pytree(jax.tree_util.tree_map_with_path(leaf, x0, tree))[0]
 
     x, unravel = ravel_pytree(x0)
+    if isinstance(x, Tracer):
+        raise ValueError(
+            "`x0` must be numbers that are known, and is traced: a search is no function for jit, vmap or grad. Call "
+            "it outside; `multi_start` takes many starts at once, and `least_squares` is differentiable."
+        )
     low, high, log = (
         vector(*bound)
         for bound in ((lower, "lower", -np.inf), (upper, "upper", np.inf), (log_scale, "log_scale", False))

@@ -51,7 +51,7 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
         i = int(np.argmax(np.where(np.isfinite(violation), violation, np.inf)))
         worst = f"Left over: |Φ| = {violation[i]:.3g}, largest in joint {names[i]!r}."
     match code:
-        case RESULTS.assembly_failed:
+        case RESULTS.assembly_failed | RESULTS.off_joints:
             more = worst
         case RESULTS.invalid_numbers if "numbers" in details:
             more = f"Found: {'; '.join(details['numbers'])}."
@@ -93,6 +93,7 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
 def _exception(result: int, details: dict[str, Any], names: tuple[str, ...], note: str) -> Exception:
     bad_input = (
         RESULTS.assembly_failed,
+        RESULTS.off_joints,
         RESULTS.redundant_constraints,
         RESULTS.position_failed,
         RESULTS.invalid_numbers,

@@ -95,8 +95,8 @@ def simulate(
             of n and 2n steps, to nearly fourth order. `IndexReducedODE`: an explicit Runge–Kutta scheme of high order.
             `AdaptiveSteps`: generalized-α under error control; `GivenSteps`: with steps of given sizes.
         sensitivity: how the trajectory is differentiated. `DirectDifferentiation` supports every JAX
-            transformation; `AdjointVariable` is reverse mode only; `AssociativeScan` takes all steps at once, for
-            accelerators.
+            transformation; `AdjointVariable` is reverse mode, and forward over it (`jax.hessian`); `AssociativeScan`
+            takes all steps at once, for accelerators.
         state0: the state at t0, used as it is: one of `equilibrium`, or `Trajectory.state` to continue. None: the
             consistent initial state of the model, from which the scheme begins with its own corrections. A given state
             has none: with `initial_state(model)` accelerations and multipliers of the first steps are of first order.

@@ -99,7 +99,8 @@ def check_state0(system: AbstractSystem, state0: State | None, t0) -> None:
         return
     known = jax.tree.map(primal_value, (system, state0, t0))
     if not is_concrete(known):
-        return _require_state(system, state0)
+        _as_state(system, state0)
+        return
     violation, least = map(np.asarray, _violation_jit(*known))
     if violation.size and np.max(np.abs(violation)) > least:
         i = np.argmax(np.abs(violation))
@@ -113,17 +114,20 @@ def check_state0(system: AbstractSystem, state0: State | None, t0) -> None:
 
 @eqx.filter_jit
 def _violation_jit(system: AbstractSystem, state0: State, t0):
+    return _violation(system, _as_state(system, state0), t0)
+
+
+def _violation(system: AbstractSystem, state0: State, t0):
     """Φ, and a violation that no step leaves. Rows are lengths or sines of angles, so that is a thousandth of the
     scene, or of 1 in a larger one: loose tolerances and drift leave less, and so does a state written with four digits.
     """
-    _require_state(system, state0)
     scale = system.coordinate_scale()
     of_bodies = scale[: scale.shape[0] - system.num_states]
     return system.constraint(state0.q, t0), 1e-3 * jnp.min(of_bodies, initial=1.0)
 
 
-def _require_state(system: AbstractSystem, state0: Any) -> None:
-    """Raise `ValueError` for what is no state, or one in other shapes than those of the system."""
+def _as_state(system: AbstractSystem, state0: Any) -> State:
+    """A state in the precision of the system; `ValueError` for what is none, or has other shapes than the system's."""
     if not isinstance(state0, State):
         raise ValueError(
             "`state0` must be a State: one of `equilibrium` or `initial_state`, or `trajectory.state(-1)` to continue, "
@@ -145,6 +149,7 @@ def _require_state(system: AbstractSystem, state0: Any) -> None:
             "`initial_state(model)` or `trajectory.state(i)` of the same model; for a batch of states jax.vmap(lambda "
             "state0: simulate(model, state0=state0, …))(states)."
         )
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, v.dtype), state0)
 
 
 class Begin(NamedTuple):
@@ -162,11 +167,15 @@ def begin(
 ) -> Begin:
     """The state at t0: `state0` as it is, or the consistent one of the reference configuration, `initial` if known."""
     if state0 is not None:
-        _require_state(system, state0)
-        jacobian, start = constraint_jacobian(system, state0.q, t0), Start(scheme.resumed(system, state0, t0))
+        state0 = _as_state(system, state0)
+        jacobian, start = constraint_jacobian(system, state0.q, t0), scheme.resumed(system, state0, t0)
+        violation, most = _violation(system, state0, t0)
+        on_joints = ~jnp.any(jnp.abs(violation) > most)
+        start = Start(jax.tree.map(lambda leaf: jnp.where(on_joints, leaf, jnp.nan), start))
         valid = system.is_valid() & finite(state0)
-        result = jnp.where(valid, RESULTS.successful, RESULTS.invalid_numbers).astype(jnp.int32)
-        return Begin(start, state0.v, result, system.constraint(state0.q, t0), jacobian)
+        result = jnp.where(on_joints, RESULTS.successful, RESULTS.off_joints)
+        result = jnp.where(valid, result, RESULTS.invalid_numbers).astype(jnp.int32)
+        return Begin(start, state0.v, result, violation, jacobian)
     initial = _initial(system, t0) if initial is None else initial
     usable = initial.result == RESULTS.successful
     start = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), scheme.start(system, initial, t0))

@@ -2,9 +2,9 @@
 
 import abc
 import os
-from collections.abc import Iterable
-from functools import partial
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable
+from functools import partial, wraps
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -50,10 +50,27 @@ def _ending(result: Any) -> str:
     return ", ".join(RESULTS(code).name + ("" if one else f" {count}") for code, count in zip(codes, counts))
 
 
+def _of_each(question: Callable) -> Callable:
+    """A question that a batch of motions, as it comes out of `vmap`, is asked one by one: answers have its axes first.
+
+    All leaves of what `vmap` returns have the axes of the batch, those of the system too.
+    """
+
+    @wraps(question)
+    def asked(motion: "AbstractMotion", *about, **more):
+        if jnp.ndim(motion._kinematics()[1]) > motion._axes_of_time:
+            return jax.vmap(lambda one: asked(one, *about, **more))(motion)
+        return question(motion, *about, **more)
+
+    return asked
+
+
 class AbstractMotion(eqx.Module):
-    """What `Trajectory` and `Instant` answer alike; arrays of a trajectory have a leading axis n + 1."""
+    """What `Trajectory` and `Instant` answer alike; arrays of a trajectory have a leading axis n + 1, and those of a
+    batch of motions its axes before."""
 
     system: eqx.AbstractVar[AbstractSystem]
+    _axes_of_time: ClassVar[int] = 0
 
     @abc.abstractmethod
     def _kinematics(self) -> tuple[State, Any]:
@@ -95,6 +112,7 @@ class AbstractMotion(eqx.Module):
             )
         return scene, system.state_of_bodies(states) if isinstance(system, SE3System) else states, t
 
+    @_of_each
     def body(self, name: str) -> BodyMotion:
         """The motion of the body `name`. Raises `ValueError` for an unknown name."""
         system, states, _ = self.of_bodies()
@@ -103,6 +121,7 @@ class AbstractMotion(eqx.Module):
             raise ValueError(f"`body`: {suggestion(name, system.body_names)}.")
         return BodyMotion(*system.motion(system.body_names.index(name), *motion))
 
+    @_of_each
     def point(self, body: str, at) -> PointMotion:
         """The motion of a point of a body (a marker).
 
@@ -127,6 +146,7 @@ class AbstractMotion(eqx.Module):
         still = jnp.zeros_like(system.velocity)
         return Frame(*system.motion(system.body_names.index(body), system.pose, still, still)[:2])
 
+    @_of_each
     def multiplier(self, joint: str) -> Float[Array, "*n rows"]:
         """The Lagrange multipliers of a joint, shape (n+1, its equations); the joint says what they mean.
 
@@ -136,6 +156,7 @@ class AbstractMotion(eqx.Module):
         system, states, t = self.of_bodies()
         return system.multiplier(joint, states.q, states.v, states.vdot, states.lam, t)
 
+    @_of_each
     def states_of(self, force: str) -> dict[str, Float[Array, "*n"]]:
         """The states of a force element (`Actuator`, `PIDController`, `MaxwellElement`) by their names, shape (n+1,).
 
@@ -147,6 +168,7 @@ class AbstractMotion(eqx.Module):
             raise ValueError(f"`states_of`: {suggestion(force, places)}, the force elements with states.")
         return {name: states.v[..., place] for name, place in places[force].items()}
 
+    @_of_each
     def force(self, name: str) -> Any:
         """What a force element measures, every array with a leading axis n + 1 if this is a trajectory.
 
@@ -170,7 +192,9 @@ class AbstractRun(AbstractMotion):
     t: eqx.AbstractVar[Float[Array, " n+1"]]
     result: eqx.AbstractVar[Int[Array, ""]]
     joints: eqx.AbstractVar[dict[str, AbstractJoint] | None]
+    _axes_of_time: ClassVar[int] = 1
 
+    @_of_each
     def joint(self, name: str) -> JointMotion:
         """The motion of the joint `name`: angle, displacement, their rates, force and moment on its body b.
 
@@ -178,8 +202,8 @@ class AbstractRun(AbstractMotion):
         bodies cannot violate (`RigidBody.free`) transmit nothing here: what holds such bodies in the coordinates that
         they do not have is no joint.
 
-        Raises `ValueError` for an unknown name, for a motion of equations that do not know their joints, and for a
-        batch of motions. Source: Haug (1989), §11.4 (reaction forces).
+        Raises `ValueError` for an unknown name, and for a motion of equations that do not know their joints. Source:
+        Haug (1989), §11.4 (reaction forces).
         """
         return self._joint_motions((name,))[name]
 
@@ -190,11 +214,6 @@ class AbstractRun(AbstractMotion):
             raise ValueError(
                 "`joint`: this is the motion of equations, which do not know their joints; give `simulate` the Model "
                 "itself and not its `system()`, or use `multiplier`."
-            )
-        if jnp.ndim(t) != 1:
-            raise ValueError(
-                f"`joint`: this is a batch of motions, of shape {jnp.shape(t)[:-1]}; ask each of them: "
-                "jax.vmap(lambda trajectory: trajectory.joint(name))(trajectories)."
             )
         for name in names:
             if name not in joints:
@@ -266,6 +285,7 @@ class Trajectory(AbstractRun):
     def _kinematics(self):
         return self.states, self.t
 
+    @_of_each
     def state(self, index: int) -> State:
         """The state at step `index` (negative: from the end), from which a simulation can be continued.
 
