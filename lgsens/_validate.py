@@ -163,6 +163,14 @@ def require_positive(owner: Any, *names: str) -> None:
             require(lambda value: np.all(value > 0), message, value)
 
 
+def require_not_negative(owner: Any, *names: str) -> None:
+    """Raise `ValueError` for numbers of an element that are given and negative."""
+    for name in names:
+        if (value := getattr(owner, name)) is not None:
+            message = lambda name=name, value=value: f"{type(owner).__name__}: `{name}` must be ≥ 0, got {value}."
+            require(lambda value: np.all(value >= 0), message, value)
+
+
 def require_nonzero(what: str, name: str, value, advice: str) -> None:
     """Raise `ValueError` for a number of `what` that is zero; `advice` follows it: its unit, or what to do."""
     require(lambda value: value != 0, f"{what}: `{name}` must not be zero, got {value}{advice}.", value)

@@ -14,6 +14,7 @@ BODY = lg.RigidBody(1.0, (1.0, 1.0, 1.0))
 TWO = {"chassis": BODY, "wheel": lg.RigidBody(1.0, (1.0, 1.0, 1.0), position=(1.0, 0.0, 0.0))}
 ORIGIN, X, Z = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 NAN, INF = float("nan"), float("inf")
+LINES = lg.Sampled((0.0, 1.0), (0.0, 1.0))
 
 
 def body(**changes):
@@ -38,6 +39,27 @@ CONSTRUCTORS = {
     "mass of shape (2,)": (
         lambda: body(mass=[1.0, 2.0]),
         ("RigidBody: `mass`", "shape ()", "got shape (2,)"),
+    ),
+    "driver along straight lines": (
+        lambda: lg.TranslationDriver(None, "wheel", at=ORIGIN, axis=Z, value=LINES),
+        ("`value`", "velocity would jump", 'kind="cubic"'),
+    ),
+    "rod along straight lines": (
+        lambda: lg.DistanceJoint(None, "wheel", at_a=ORIGIN, at_b=X, length=LINES),
+        ("`length`", "velocity would jump"),
+    ),
+    "friction that drives": (
+        lambda: lg.JointFriction("pivot", coefficient=-0.3, slip_speed=0.1),
+        ("JointFriction: `coefficient` must be ≥ 0", "-0.3"),
+    ),
+    "drag that drives": (lambda: lg.Drag("wheel", drag_area=-1.0), ("Drag: `drag_area` must be ≥ 0", "-1.0")),
+    "stop that pulls": (
+        lambda: lg.BumpStop(None, "wheel", at_a=ORIGIN, at_b=X, gap=0.1, stiffness=-1.0, rounding=0.01),
+        ("BumpStop: `stiffness` must be ≥ 0", "-1.0"),
+    ),
+    "spring wound up by turns": (
+        lambda: lg.TorsionSpringDamper(None, "wheel", axis=Z, stiffness=1.0, free_angle=12.0),
+        ("`free_angle` must be within half a turn", "12.0", "`preload`"),
     ),
     "mass of text": (lambda: body(mass="heavy"), ("RigidBody: `mass`", "must be a number", "'heavy'")),
     "mass a truth value": (lambda: body(mass=True), ("RigidBody: `mass`", "must be a number", "True")),

@@ -288,8 +288,9 @@ class GeneralizedAlpha(AbstractGeneralizedAlpha):
         if not system.num_velocity_rows or one_body or self.stabilized or self.rho_inf <= 0.5:
             return None
         return (
-            f"Constraints of velocities (`Rolling`) between several bodies may be unstable with {self!r}, with "
-            "positions in index 3: take GeneralizedAlpha(stabilized=True), rho_inf = 0.5 or less, or RadauIIA()."
+            "Constraints of velocities (`Rolling`, gears without teeth) between several bodies may be unstable with "
+            f"{self!r}, with positions in index 3: take GeneralizedAlpha(stabilized=True), rho_inf = 0.5 or less, or "
+            "RadauIIA()."
         )
 
     def as_data(self, dtype):

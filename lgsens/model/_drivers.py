@@ -68,7 +68,7 @@ class TranslationDriver(AbstractJoint):
     b: str | None = eqx.field(static=True)
     at: Float[Array, "3"] = point_field("at")
     axis: Float[Array, "3"] = axis_field("axis")
-    value: Prescribed | None = prescribed_field("value")
+    value: Prescribed | None = prescribed_field("value", driven=True)
 
     @property
     def assembled(self):
@@ -101,7 +101,7 @@ class RotationDriver(AbstractJoint):
     a: str | None = eqx.field(static=True)
     b: str | None = eqx.field(static=True)
     axis: Float[Array, "3"] = axis_field("axis")
-    value: Prescribed | None = prescribed_field("value")
+    value: Prescribed | None = prescribed_field("value", driven=True)
 
     @property
     def assembled(self):

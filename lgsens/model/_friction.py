@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import number_field, require_positive, suggestion
+from lgsens._validate import number_field, require_not_negative, require_positive, suggestion
 from lgsens.liegroups import cross
 from lgsens.model._constraints import AbstractRows, total
 from lgsens.model._forces import AbstractForce, Attached, _frame
@@ -291,6 +291,7 @@ class JointFriction(_AbstractJointFriction):
 
     def __check_init__(self):
         require_positive(self, "slip_speed", "radius", "arm", "load_rounding")
+        require_not_negative(self, "coefficient", "viscous")
 
     def _load(self, surface):
         return CoulombLoad(surface, self.coefficient, self.viscous, self.slip_speed)

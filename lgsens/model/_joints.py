@@ -251,7 +251,7 @@ class DistanceJoint(AbstractJoint):
     b: str | None = eqx.field(static=True)
     at_a: Float[Array, "3"] = point_field("at_a")
     at_b: Float[Array, "3"] = point_field("at_b")
-    length: Prescribed | None = prescribed_field("length")
+    length: Prescribed | None = prescribed_field("length", driven=True)
 
     def __check_init__(self):
         require(

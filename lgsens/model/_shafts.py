@@ -1,15 +1,16 @@
 """Joints between shafts: gears, and the constant-velocity joint."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_count, axis_field, point_field, require
-from lgsens.liegroups import cross
-from lgsens.model._constraints import AbstractConstraint, ConstraintSum, Orthogonality
+from lgsens.liegroups import cross, skew
+from lgsens.model._constraints import AbstractConstraint, AbstractVelocityConstraint, ConstraintSum, Orthogonality
 from lgsens.model._elements import body_fixed
-from lgsens.model._frames import normals
+from lgsens.model._frames import ROTATION, Frame, normals
 from lgsens.model._joints import AbstractJoint, _coincidence
 from lgsens.model._relative import ROTATION_VECTOR, frames_at
 from lgsens.model._signals import Prescribed, at_time, prepared, prescribed_field, require_ratio
@@ -43,13 +44,40 @@ class Gearing(AbstractConstraint):
     def relative(self):
         return self.line is None
 
-    def value(self, a, b, t):
+    def angles(self, a, b):
+        """φ_a and φ_b [rad], but for whole turns."""
         d = b.point(self.point_b) - a.point(self.point_a) if self.line is None else self.line
         turned = lambda frame, x, y: -jnp.arctan2(jnp.sum(frame.axis(y) * d), jnp.sum(frame.axis(x) * d))
-        ratio = at_time(self.ratio, t)
-        angle = turned(b, self.first_b, self.second_b) - ratio * turned(a, self.first_a, self.second_a)
-        turn = 2.0 * jnp.pi / self.teeth
+        return turned(a, self.first_a, self.second_a), turned(b, self.first_b, self.second_b)
+
+    def value(self, a, b, t):
+        of_a, of_b = self.angles(a, b)
+        angle, turn = of_b - at_time(self.ratio, t) * of_a, 2.0 * jnp.pi / self.teeth
         return (angle - turn * jnp.round(angle / turn))[None]
+
+
+class FrictionGearing(AbstractVelocityConstraint):
+    """Two wheels turn at rates in the ratio ρ, φ̇_b − ρ φ̇_a = 0, as seen from the line between them: of any ratio, over
+    any number of turns; λ is a moment on b [N m]."""
+
+    gears: Gearing
+    drawn = None
+
+    @property
+    def num_rows(self):
+        return 1
+
+    @property
+    def relative(self):
+        return self.gears.relative
+
+    def fixed(self, kind, bodies="ab"):
+        return self.gears.fixed(kind, bodies)
+
+    def rate(self, a, b, va, vb, t):
+        moves = lambda frame, v: Frame(v[: ROTATION.start], frame.orientation @ skew(v[ROTATION]))
+        of_a, of_b = jax.jvp(self.gears.angles, (a, b), (moves(a, va), moves(b, vb)))[1]
+        return (of_b - at_time(self.gears.ratio, t) * of_a)[None]
 
 
 class GearJoint(AbstractJoint):
@@ -67,7 +95,10 @@ class GearJoint(AbstractJoint):
             parallel axes −n_a/n_b for n_a and n_b teeth. Or a signal of time: the angles, not their rates, have its
             ratio at every instant, as a drive of variable ratio has it that is shifted with `a` near the reference.
         teeth: n_b or another count for which ratio · teeth is an integer: gears then turn any number of times. With
-            another ratio, and for the derivative by the ratio, `a` is within half a turn of the reference.
+            another ratio, and **for the derivative by the ratio**, `a` is within half a turn of the reference: poses do
+            not tell turns, by which that derivative grows. None: no teeth but friction, a belt, a variable drive. Not
+            angles but rates are then in the ratio, φ̇_b = ρ φ̇_a, at every instant, over any number of turns, and the
+            derivative by it is right. (An equation of velocities, solved by dense matrices, as `Rolling`.)
         line: a direction, fixed in the inertial frame, shape (3,), from which the angles are seen instead: of gears on
             one axis, or any that a third part connects, in a housing that does not turn; None: that of the centres.
 
@@ -82,12 +113,13 @@ class GearJoint(AbstractJoint):
     axis_a: Float[Array, "3"] = axis_field("axis_a")
     axis_b: Float[Array, "3"] = axis_field("axis_b")
     ratio: Prescribed | None = prescribed_field("ratio")
-    teeth: int = eqx.field(static=True, default=1, kw_only=True)
+    teeth: int | None = eqx.field(static=True, default=1, kw_only=True)
     line: Float[Array, "3"] | None = point_field("line", default=None)
 
     def __check_init__(self):
         require_ratio("GearJoint", "ratio", self.ratio, "; a gear that does not turn is fixed by another joint")
-        as_count(self.teeth, "teeth")
+        if self.teeth is not None:
+            as_count(self.teeth, "teeth", ", or None for wheels without teeth")
         for name, axis in (("axis_a", self.axis_a), ("axis_b", self.axis_b)):
             require(
                 lambda d, e: np.linalg.norm(np.cross(d, e)) > 1e-6 * np.linalg.norm(d) * np.linalg.norm(e),
@@ -112,7 +144,8 @@ class GearJoint(AbstractJoint):
             first = cross(second, axis)
             marks += [frame.local_axis(mark / jnp.linalg.norm(mark)) for mark in (first, second)]
         centres = a.local_point(self.at_a), b.local_point(self.at_b)
-        return (Gearing(*centres, *marks, line=self.line, ratio=prepared(self.ratio), teeth=self.teeth),)
+        gears = Gearing(*centres, *marks, line=self.line, ratio=prepared(self.ratio), teeth=self.teeth or 1)
+        return (gears,) if self.teeth else (FrictionGearing(gears),)
 
 
 class ConstantVelocityJoint(AbstractJoint):

@@ -33,7 +33,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float, number_field, require, require_nonzero
+from lgsens._validate import as_float, number_field, of_shape, require, require_nonzero
 
 _KINDS = ("linear", "cubic", "monotone")
 
@@ -67,7 +67,7 @@ class Constant(AbstractSignal):
         value: in the unit of what it prescribes, shape ().
     """
 
-    value: Float[Array, ""] = number_field("value")
+    value: Float[Array, ""] = of_shape(converter=lambda value: as_float(value, (), "`value`"))
 
     def __call__(self, t):
         return self.value
@@ -150,9 +150,9 @@ class Sampled(AbstractSignal):
     Arguments:
         times: sample times [s], shape (n,), n ≥ 2, increasing.
         values: values at these times, in the unit of what they prescribe, shape (n,).
-        kind: "linear", constant outside of the samples; its rate jumps at them, so it cannot drive a mechanism
-            smoothly. "cubic", twice continuously differentiable, straight outside of them. "monotone", once
-            continuously differentiable, without overshoot, straight on outside of them with the slope at the end.
+        kind: "linear", constant outside of the samples; its rate jumps at them, so no driver takes it. "cubic", twice
+            continuously differentiable, straight outside of them. "monotone", once continuously differentiable,
+            without overshoot, straight on outside of them with the slope at the end.
 
     Raises `ValueError` for shapes that differ, times that do not increase and another kind.
     """
@@ -310,10 +310,16 @@ def signal_field(name: str, **default: Any) -> Any:
     return eqx.field(converter=convert, kw_only=True, **default)
 
 
-def prescribed_field(name: str, *, positional: bool = False) -> Any:
-    """A scalar leaf or signal of an element, None by default, keyword-only unless `positional`."""
+def prescribed_field(name: str, *, positional: bool = False, driven: bool = False) -> Any:
+    """A scalar leaf or signal of an element, None by default, keyword-only unless `positional`; `driven`: of which
+    positions follow, and so velocities and accelerations its derivatives."""
 
     def convert(value: Any) -> Prescribed | None:
+        if driven and isinstance(value, Sampled) and value.kind == "linear":
+            raise ValueError(
+                f"`{name}` follows straight lines between samples: at each the velocity would jump, and no force is "
+                'large enough for that. Give Sampled(…, kind="cubic"), or "monotone".'
+            )
         if callable(value) and not isinstance(value, AbstractSignal):
             raise _no_signal(name, "a number or a signal", value)
         return value if value is None or isinstance(value, AbstractSignal) else as_float(value, (), f"`{name}`")

@@ -60,7 +60,10 @@ def summarize(
     lines += _columns([(name, _mass(body), _free(body, part_of.get(name))) for name, body in bodies.items()])
     lines += [f"Joints ({len(joints)}): type, bodies, equations"]
     lines += _columns(
-        [(name, type(joint).__name__, _ends((joint.a, joint.b)), equations[name]) for name, joint in joints.items()]
+        [
+            (name, type(joint).__name__, _ends((joint.a, joint.b, *joint.others)), equations[name])
+            for name, joint in joints.items()
+        ]
     )
     lines += [f"Force elements ({len(forces)}): type, bodies"]
     lines += _columns([(name, type(force).__name__, _ends(force.on(joints).bodies)) for name, force in forces.items()])

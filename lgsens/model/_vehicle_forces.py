@@ -4,9 +4,10 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import axis_field, number_field, point_field, require, require_positive
+from lgsens._validate import axis_field, number_field, point_field, require, require_not_negative, require_positive
 from lgsens.model._contacts import PlaneContactLoad
 from lgsens.model._curves import CurveLoad
 from lgsens.model._forces import AbstractConnection, AbstractForce, Attached, _distance
@@ -33,7 +34,7 @@ class TorsionSpringDamper(AbstractConnection):
         axis: direction of the axis in the reference configuration, inertial frame, shape (3,), any length > 0.
         stiffness: k [N m/rad], shape ().
         damping: c [N m s/rad], shape ().
-        free_angle: θ₀, at which the spring is free [rad], shape ().
+        free_angle: θ₀, at which the spring is free [rad], within half a turn, shape ().
         preload: the moment M₀ that turns b back in the reference configuration [N m], shape (). θ₀ is then 0.
         motor: the moment M(t) on b [N m], a number, shape (), or a signal; None: no motor.
 
@@ -56,6 +57,13 @@ class TorsionSpringDamper(AbstractConnection):
             raise ValueError(
                 "TorsionSpringDamper: give `free_angle` or `preload`, not both: each determines the other "
                 "(preload = −stiffness · free_angle)."
+            )
+        if self.free_angle is not None:
+            require(
+                lambda angle: abs(angle) <= np.pi,
+                f"TorsionSpringDamper: `free_angle` must be within half a turn, as its angle is, got {self.free_angle} "
+                "rad; a spring that is wound up further has its moment in the reference configuration as `preload`.",
+                self.free_angle,
             )
 
     preload_shape = ()
@@ -166,6 +174,7 @@ class BumpStop(AbstractConnection):
 
     def __check_init__(self):
         require_positive(self, "rounding", "progression")
+        require_not_negative(self, "stiffness")
         require(
             lambda a, b: (a != b).any(),
             f"BumpStop: `at_a` and `at_b` coincide at {self.at_a}, so the stop has no direction; move one end.",
@@ -215,6 +224,7 @@ class PlaneContact(AbstractConnection):
 
     def __check_init__(self):
         require_positive(self, "rounding", "slip_speed")
+        require_not_negative(self, "stiffness", "damping", "coefficient")
         if (self.coefficient is None) != (self.slip_speed is None):
             raise ValueError("PlaneContact: give both `coefficient` and `slip_speed`, or neither.")
 
@@ -244,6 +254,9 @@ class Drag(AbstractForce):
     drag_area: Float[Array, ""] = number_field("drag_area")
     density: Float[Array, ""] = number_field("density", default=1.225)
     wind: Float[Array, "3"] = point_field("wind", default=(0.0, 0.0, 0.0))
+
+    def __check_init__(self):
+        require_not_negative(self, "drag_area", "density")
 
     @property
     def bodies(self):

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import lineax
 import optimistix
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
@@ -58,7 +59,8 @@ class LineSearchGaussNewton(optimistix.AbstractGaussNewton):
     rtol: float = 1e-5
     atol: float = 1e-5
     norm: Callable = optimistix.max_norm
-    descent: optimistix.NewtonDescent = optimistix.NewtonDescent()
+    # the shortest step where J has less rank than columns, which by QR has none
+    descent: optimistix.NewtonDescent = optimistix.NewtonDescent(linear_solver=lineax.SVD())
     search: optimistix.BacktrackingArmijo = optimistix.BacktrackingArmijo()
     verbose: Callable = lambda **_: None
 
@@ -121,9 +123,14 @@ def least_squares(
 
 
 def covariance(jacobian: Float[Array, "m n"]) -> Float[Array, "n n"]:
-    """(JᵀJ)⁻¹, from J = Q R: R⁻¹ R⁻ᵀ with half the digits lost that JᵀJ would lose; columns scaled to 1 before."""
+    """(JᵀJ)⁻¹, from J = Q R: R⁻¹ R⁻ᵀ with half the digits lost that JᵀJ would lose; columns scaled to 1 before.
+
+    Infinite where J has less rank than columns, up to the round-off of its numbers.
+    """
     size = jnp.linalg.norm(jacobian, axis=0)
     size = jnp.where(size > 0, size, 1.0)
     triangle = jnp.linalg.qr(jacobian / size[None], mode="r")
     inverse = jax.scipy.linalg.solve_triangular(triangle, jnp.eye(size.size, dtype=size.dtype)) / size[:, None]
-    return inverse @ inverse.T
+    singular = jnp.linalg.svd(triangle, compute_uv=False)
+    determined = singular[-1] > max(jacobian.shape) * jnp.finfo(size.dtype).eps * singular[0]
+    return jnp.where(determined, inverse @ inverse.T, jnp.inf)

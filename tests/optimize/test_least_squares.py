@@ -92,6 +92,16 @@ def test_estimates_scatter_as_the_bound_says():
     )
 
 
+def test_parameters_that_data_do_not_tell_apart():
+    """Two of three by their product alone: it is found, and that their covariance is not finite."""
+    residual = lambda x: jnp.stack([x[0] * x[1] - 2.0, 2.0 * x[0] * x[1] - 4.0, x[0] * x[1] * x[2] - 6.0])
+    found = least_squares(residual, jnp.ones(3))
+    assert found.converged
+    # quadratic convergence: an increment of 1e-6 is followed by one of round-off
+    np.testing.assert_allclose([found.x[0] * found.x[1], found.x[2]], [2.0, 3.0], rtol=1e-8)
+    assert np.all(np.isinf(found.covariance)) and np.all(np.isinf(found.deviation))
+
+
 def test_the_covariance_is_the_inverse():
     jacobian = np.random.default_rng(0).normal(size=(20, 4)) * np.array([1.0, 1e-3, 1e4, 1.0])
     expected = np.linalg.inv(jacobian.T @ jacobian)
