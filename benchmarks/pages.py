@@ -87,10 +87,11 @@ def choice(found: dict) -> str:
 def variable_steps(found: dict) -> str:
     keys = ("label", "steps", "rejected", "iterations")
     rows = (
-        (*(row.get(key, 0) for key in keys), *errors(row, "psi", "rates", "hardpoints"), round(row["ms"]))
+        (*(row.get(key, 0) for key in keys), *errors(row, "psi", "rates", "hardpoints", "forces"), round(row["ms"]))
         for row in found["rows"]
     )
-    head = "steps | number | rejected | iterations | error of Ψ₀ | of its gradient by rates | by hardpoints | ms"
+    left = "error of Ψ₀ | of its gradient by rates | by hardpoints | of forces"
+    head = f"steps | number | rejected | iterations | {left} | ms"
     return grid(head, rows)
 
 

@@ -115,26 +115,27 @@ def leaf_name(path: tuple[Any, ...], root: str) -> str:
     return jax.tree_util.keystr(path, simple=True, separator=".") or root
 
 
-def of_shape(*shape: int, **kwargs: Any) -> Any:
-    """A field whose array, unless it is None, has that shape: what comes in after construction is held to it."""
-    return eqx.field(metadata={"shape": shape}, **kwargs)
+def shaped(*shape: int) -> dict[str, tuple[int, ...]]:
+    """The metadata of a field whose array, unless it is None, has that shape: what comes in after construction too."""
+    return {"shape": shape}
 
 
 def number_field(name: str, **kwargs: Any) -> Any:
     """A keyword-only scalar leaf of an element; with `default=None` it may be left out."""
-    return of_shape(
+    return eqx.field(
         converter=lambda value: None if value is None else as_float(value, (), f"`{name}`"),
         kw_only=True,
+        metadata=shaped(),
         **kwargs,
     )
 
 
 def point_field(name: str, **kwargs: Any) -> Any:
     """A keyword-only leaf of shape (3,): a point, a vector or a direction."""
-    return of_shape(
-        3,
+    return eqx.field(
         converter=lambda value: None if value is None else as_float(value, (3,), f"`{name}`"),
         kw_only=True,
+        metadata=shaped(3),
         **kwargs,
     )
 
@@ -152,7 +153,7 @@ def axis_field(name: str) -> Any:
         )
         return axis
 
-    return of_shape(3, converter=convert, kw_only=True)
+    return eqx.field(converter=convert, kw_only=True, metadata=shaped(3))
 
 
 def require_positive(owner: Any, *names: str) -> None:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float, of_shape, require
+from lgsens._validate import as_float, require, shaped
 from lgsens.model._frames import Frame
 from lgsens.model._free import ALL_FREE, ROTATIONS, TRANSLATIONS, Free, as_free, is_along, places, single_rotation
 
@@ -54,13 +54,13 @@ class RigidBody(eqx.Module):
     velocity that is not free. Source: Sonneville & Brüls (2014), §3.2.
     """
 
-    mass: Float[Array, ""] = of_shape()
+    mass: Float[Array, ""] = eqx.field(metadata=shaped())
     inertia: Float[Array, "3"] | Float[Array, "3 3"] | None
-    position: Float[Array, "3"] = of_shape(3)
-    orientation: Float[Array, "3 3"] = of_shape(3, 3)
-    velocity: Float[Array, "3"] = of_shape(3)
-    angular_velocity: Float[Array, "3"] = of_shape(3)
-    pivot: Float[Array, "3"] | None = of_shape(3)
+    position: Float[Array, "3"] = eqx.field(metadata=shaped(3))
+    orientation: Float[Array, "3 3"] = eqx.field(metadata=shaped(3, 3))
+    velocity: Float[Array, "3"] = eqx.field(metadata=shaped(3))
+    angular_velocity: Float[Array, "3"] = eqx.field(metadata=shaped(3))
+    pivot: Float[Array, "3"] | None = eqx.field(metadata=shaped(3))
     free: Free = eqx.field(static=True)
 
     def __init__(

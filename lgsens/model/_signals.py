@@ -33,7 +33,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float, number_field, of_shape, require, require_nonzero
+from lgsens._validate import as_float, number_field, require, require_nonzero, shaped
 
 _KINDS = ("linear", "cubic", "monotone")
 
@@ -67,7 +67,7 @@ class Constant(AbstractSignal):
         value: in the unit of what it prescribes, shape ().
     """
 
-    value: Float[Array, ""] = of_shape(converter=lambda value: as_float(value, (), "`value`"))
+    value: Float[Array, ""] = eqx.field(converter=lambda value: as_float(value, (), "`value`"), metadata=shaped())
 
     def __call__(self, t):
         return self.value
