@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from lgsens.dynamics import AbstractSystem, State
+from lgsens.integrate._lanes import most_of_lanes
 from lgsens.integrate._linearized import Node
 
 
@@ -98,6 +99,11 @@ class AbstractGrid(eqx.Module):
         if empty is None:
             return rows
         return jax.tree.map(lambda row, other: jnp.where(empty, other, row), rows, otherwise)
+
+    @property
+    def taken(self) -> Float[Array, ""] | None:
+        """A number of steps that those after it leave as it is, because they are empty; None: all may do something."""
+        return self.count
 
     @property
     @abc.abstractmethod
@@ -182,18 +188,26 @@ class UnevenGrid(AbstractGrid):
     t0: Float[Array, ""]
     h: Float[Array, " n"]
     before: Float[Array, ""]  # the size of the step that led to t0, to which the state there belongs
+    room: bool = eqx.field(static=True, default=False)  # whether there may be many empty places at the end
     resizes: ClassVar[bool] = True
     num_steps: ClassVar[Any] = property(lambda self: self.h.shape[-1])  # no argument, where the base has a field
     count: ClassVar[None] = None
 
     @classmethod
-    def first(cls, t0, h) -> "UnevenGrid":
+    def first(cls, t0, h, *, room: bool = False) -> "UnevenGrid":
         """From a state at t0 that belongs to the first step."""
-        return cls(t0, h, h[0])
+        return cls(t0, h, h[0], room)
 
     @property
     def first_size(self):
         return self.before
+
+    @property
+    def taken(self):
+        if not self.room:
+            return None
+        last = jnp.max(jnp.where(self.h != 0.0, jnp.arange(1, self.num_steps + 1, dtype=self.h.dtype), 0.0))
+        return most_of_lanes(jax.lax.stop_gradient(last))
 
     def times(self):
         return self.t0 + jnp.concatenate([jnp.zeros_like(self.h[:1]), jnp.cumsum(self.h)])

@@ -27,6 +27,17 @@ def _of_all_lanes(axis_size, in_batched, flag):
     return in_any_lane(jnp.any(flag)), False  # a batch of batches comes here again
 
 
+@jax.custom_batching.custom_vmap
+def most_of_lanes(count):
+    """The largest of all lanes of a batch: the turns of a loop whose body leaves lanes alone that are done."""
+    return count
+
+
+@most_of_lanes.def_vmap
+def _most_of_all(axis_size, in_batched, count):
+    return most_of_lanes(jnp.max(count)), False
+
+
 def renewed_where(due, new: Callable[[], Found], earlier: Found) -> Found:
     """`new()` where it is due. A loop of no or one turn, because `cond` would copy what is large."""
     renewed = lambda carry: (jnp.zeros((), bool), new())

@@ -142,7 +142,7 @@ class AdaptiveSteps(AbstractIntegrator):
 
     `num_steps` of `simulate` is the largest number of steps. The trajectory has so many rows; those after the last step
     repeat t1 and the state there, so that integrals and `state(-1)` are right, and its `stats` are `ControlledStats`.
-    Their sweep costs the derivative as much as a step: leave little room, or give the grid found to `GivenSteps`.
+    They take next to no time, but memory.
 
     The derivative is that of the numerical solution on the grid found, exactly, in both modes; under `vmap` each lane
     has its own. The sizes themselves change a little with the parameters, which the derivative leaves out: finite
@@ -179,7 +179,7 @@ class AdaptiveSteps(AbstractIntegrator):
         frozen = lax.stop_gradient((system, start, t0, mean))
         found = lax.stop_gradient(_controlled_steps(self, num_steps, *frozen))
         sizes, states, stats, reached = found
-        grid = UnevenGrid.first(t0, sizes / frozen[-1] * mean)
+        grid = UnevenGrid.first(t0, sizes / frozen[-1] * mean, room=True)
         return Laid(grid, (states, Stats(*stats[: len(Stats._fields)])), stats, reached)
 
     def frozen(self, trajectory):

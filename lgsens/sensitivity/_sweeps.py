@@ -11,6 +11,9 @@ Lᵀ (μ, p̄) = (c, c_p). With c_{n+1} already holding what later steps contrib
 
 and an empty step μ = c_{n+1}, which it adds to c_n. What is kept is the states.
 
+Empty steps at the end of a grid with room for them are not gone through: there δ_{n+1} = δ_n + b, and μ = c_{n+1} with
+c_n += c_{n+1}, are sums.
+
 Blocks. The states are known before the sensitivities are, so what a step needs of them (tangents, factors, pseudo-loads
 and their pull-back) does not wait for the step before it. It is evaluated for a block of steps at once, in the few
 large operations that one step would cost; what remains in the sweep is one solve and a few products.
@@ -64,6 +67,17 @@ class StepBlocks(NamedTuple):
         end = self.blocks.astype(jnp.int32) * self.length
         return jax.tree.map(lambda leaf: lax.dynamic_index_in_dim(leaf, end, keepdims=False), rows)
 
+    def beyond(self, rows: Any, others: Any = None) -> Any:
+        """The rows after the blocks taken, before them those of `others`, or zeros."""
+        others = jax.tree.map(jnp.zeros_like, rows) if others is None else others
+        end = self.blocks * self.length
+
+        def joined(row, other):
+            after = jnp.arange(row.shape[0], dtype=end.dtype) >= end
+            return jnp.where(jnp.expand_dims(after, range(1, row.ndim)), row, other)
+
+        return jax.tree.map(joined, rows, others)
+
     def padded(self, tree: Any, *, repeat: bool) -> Any:
         """What fills the last block along the leading axis: the last entry again, or zeros."""
         if not self.padding:
@@ -98,7 +112,7 @@ def direct_sweep(scheme: AbstractScheme, states: State, parameters: Parameters, 
     """
     system, grid = parameters
     equations = LinearizedSteps.of(scheme, parameters)
-    blocks = StepBlocks.of(grid.num_steps, scheme.numbers(system), grid.count)
+    blocks = StepBlocks.of(grid.num_steps, scheme.numbers(system), grid.taken)
 
     def prepare(step: Step, d_place):
         linear = equations.linearized(step)
@@ -115,7 +129,10 @@ def direct_sweep(scheme: AbstractScheme, states: State, parameters: Parameters, 
 
     first = jax.tree.map(lambda leaf: leaf[0], b)
     inputs = (steps(states, grid), later(b), place_tangents(grid, d.grid))
-    _, rest = blocks.scan(block, first, blocks.padded(inputs, repeat=True))
+    end, rest = blocks.scan(block, first, blocks.padded(inputs, repeat=True))
+    if grid.resizes and blocks.count is not None:  # empty steps, which hand on what they get
+        handed_on = lambda end, b: end[None] + jnp.cumsum(b, axis=0)
+        rest = blocks.beyond(jax.tree.map(handed_on, end, blocks.beyond(later(b))), rest)
     return with_first(first, rest), d
 
 
@@ -123,7 +140,7 @@ def adjoint_sweep(scheme: AbstractScheme, states: State, parameters: Parameters,
     """Solve Lᵀ (μ, p̄) = (c, c_p) backwards in time; returns μ stacked (row 0: the cotangent of δ_0), and p̄."""
     system, grid = parameters
     equations = LinearizedSteps.of(scheme, parameters)
-    blocks = StepBlocks.of(grid.num_steps, scheme.numbers(system), grid.count)
+    blocks = StepBlocks.of(grid.num_steps, scheme.numbers(system), grid.taken)
 
     def one(loads, c: Variation, inputs):
         linear, own = inputs
@@ -139,8 +156,14 @@ def adjoint_sweep(scheme: AbstractScheme, states: State, parameters: Parameters,
         of_parameters, of_places = pull_back(found)
         return (c, jax.tree.map(jnp.add, bar, of_parameters)), (found.mu, of_places)
 
+    with_empty = grid.resizes and blocks.count is not None
+    if with_empty:
+        handed_on = lambda c: jnp.cumsum(c[::-1], axis=0)[::-1]
+        c = blocks.beyond(jax.tree.map(handed_on, blocks.beyond(c)), c)
+    after = later(c)
     # The steps that fill the last block come first, with zero cotangents, and leave them zero.
     c = blocks.padded(c, repeat=False)
     inputs = (blocks.padded(steps(states, grid), repeat=True), earlier(c))
     (first, bar), (rest, of_places) = blocks.scan(block, (blocks.last(c), c_p), inputs, reverse=True)
+    rest = blocks.beyond(after, rest) if with_empty else rest
     return with_first(first, rest), with_places(grid, bar, of_places)
