@@ -80,7 +80,7 @@ def evaluate(integrator, num_steps: int, seconds: float) -> tuple[dict, tuple[np
         "psi": float(value),
         "rates": [float(gradient[name] * p[name]) for name in RATES],
         "hardpoints": np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(gradient["points"])]).tolist(),
-        "ms": 1e3 * median_seconds(lambda: program(p), repeats=3)[0],
+        "ms": 1e3 * median_seconds(lambda: program(p), repeats=9)[0],
         "compile_s": compiled,
     }
     if hasattr(stats, "rejected"):
