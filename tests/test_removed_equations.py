@@ -102,6 +102,7 @@ def test_gradients_by_a_length_are_those_of_the_planar_mechanism(method, integra
     np.testing.assert_allclose(found, expected, rtol=1e-9)  # Newton's tolerance, times the 1e2 of 30 steps
 
 
+@SLOW
 def test_linearize_takes_it():
     found, expected = (lg.linearize(sprung(0.0, planar=planar)).eigenvalues for planar in (False, True))
     np.testing.assert_allclose(found, expected, rtol=1e-9)  # second derivatives at an equilibrium found to 1e-10
