@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from driven_pendulum import P as PENDULUM, make as driven_pendulum
 from helpers import says
 from jax import export
 
@@ -80,6 +81,13 @@ def at_rest(p):
     return jnp.sum(run.values)
 
 
+def controlled(p):
+    """Steps under error control, with room that is not needed."""
+    integrator = lg.AdaptiveSteps(tolerance=1e-4)
+    run = lg.simulate(driven_pendulum(jnp.array(PENDULUM) * p[1]), t1=0.5, num_steps=100, integrator=integrator)
+    return jnp.sum(run.states.v[-1])
+
+
 MESH, SPEC = jax.sharding.Mesh(jax.devices()[:1], ("designs",)), jax.sharding.PartitionSpec("designs")
 
 
@@ -95,14 +103,21 @@ def over_mesh(function):
         (jax.value_and_grad, psi),
         (lambda f: jax.jacfwd(lambda p: (f(p), f(p)), has_aux=True), psi),
         (jax.value_and_grad, at_rest),
+        (jax.value_and_grad, controlled),
     ],
-    ids=["top", "top, forward", "chain, saved"],
+    ids=["top", "top, forward", "chain, saved", "controlled steps"],
 )
 def test_designs_over_a_mesh(derivative, f):
     designs = P[None] + jnp.array([[0.0, 0.0], [0.1, -0.1]])
     both = over_mesh(derivative(f))(designs), jax.jit(jax.vmap(derivative(f)))(designs)
     for found, expected in zip(*map(jax.tree.leaves, both)):
         np.testing.assert_allclose(found, expected, rtol=1e-9)  # two programs
+
+
+@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
+def test_controlled_steps_over_a_mesh_are_lowered(derivative):
+    """What varies is checked there; compiled above."""
+    assert over_mesh(derivative(controlled)).lower(jnp.ones((2, 2))).out_info.shape == (2, 2)
 
 
 def test_constants_in_loops_and_solves_over_a_mesh():

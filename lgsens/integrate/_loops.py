@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from lgsens._xla import scan
+from lgsens._xla import fori_loop, scan
 
 
 def over_steps(step: Callable, carry: Any, inputs: Any, count: Any = None, blank: Any = None, *, reverse: bool = False):
@@ -36,4 +36,4 @@ def over_steps(step: Callable, carry: Any, inputs: Any, count: Any = None, blank
         written = lambda leaf, row: lax.dynamic_update_index_in_dim(leaf, row, place, 0)
         return carry, jax.tree.map(written, found[1], new)
 
-    return lax.fori_loop(0, count, turn, (carry, outputs))
+    return fori_loop(0, count, turn, (carry, outputs))
