@@ -205,12 +205,14 @@ def test_derivative_is_that_on_the_frozen_grid():
 
 
 @pytest.mark.slow
-def test_second_derivatives_with_room():
+@pytest.mark.parametrize("method", [lg.DirectDifferentiation(), lg.AdjointVariable()], ids=lambda m: type(m).__name__)
+def test_second_derivatives_with_room(method):
     """Those on the grid that was found, which has no empty steps: the sums in their place have derivatives, too."""
     p = jnp.array(P)
     grid = lg.GivenSteps.of(DIFFERENTIATED(p)[0][1], SCHEME)
     frozen = lambda p: observed(lg.simulate(make(p), t0=0.2, t1=1.2, num_steps=grid.num_steps, integrator=grid))
-    found, expected = (jax.jit(jax.hessian(of))(p) for of in (lambda p: observed(adaptive()(p)), frozen))
+    controlled = lambda p: observed(adaptive(sensitivity=method)(p))
+    found, expected = (jax.jit(jax.hessian(of))(p) for of in (controlled, frozen))
     # as `test_derivative_is_that_on_the_frozen_grid`, once more over h
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
 

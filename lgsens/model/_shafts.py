@@ -67,10 +67,6 @@ class FrictionGearing(AbstractVelocityConstraint):
     def num_rows(self):
         return 1
 
-    @property
-    def relative(self):
-        return self.gears.relative
-
     def fixed(self, kind, bodies="ab"):
         return self.gears.fixed(kind, bodies)
 

@@ -108,10 +108,10 @@ class AssociativeScan(AbstractSensitivity):
 
 
 class AdjointVariable(AbstractDiscrete):
-    """The backward sweep with Lᵀ as an explicit `custom_vjp`: reverse mode only, first derivatives only.
+    """The backward sweep with Lᵀ as an explicit `custom_vjp`: reverse mode, and forward mode over it (`jax.hessian`).
 
-    The same numbers as `DirectDifferentiation` in reverse mode, from a rule that JAX does not take apart.
-    Forward mode through it raises JAX's TypeError.
+    The same numbers as `DirectDifferentiation` in reverse mode, from a rule that JAX does not take apart until it
+    differentiates it once more. Forward mode alone, and reverse mode over either, raise JAX's errors.
 
     Arguments:
         checkpoints: as in `DirectDifferentiation`.
@@ -320,7 +320,8 @@ def _adjoint_trajectory(scheme, state0, parameters, found):
 
 
 def _adjoint_forward(scheme, state0, parameters, found):
-    states, stats = _run(scheme, state0, parameters, found)
+    # Forward mode over this rule needs the derivative of the states, which those that error control has found lack.
+    states, stats = _direct_trajectory(_SWEEPS, scheme, state0, parameters, found)
     return (states, stats), (scheme, states, parameters)
 
 
