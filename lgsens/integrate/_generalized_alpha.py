@@ -123,6 +123,11 @@ class AbstractGeneralizedAlpha(AbstractAlpha):
         v = consistent_velocity(system, state.q, state.v, t, factors)
         return line._replace(state=dataclasses.replace(line.state, v=v), v_2=state.v - v)
 
+    @staticmethod
+    def resized_acceleration(vdot, a, ratio):
+        """a* of `resized`, where that is all there is of a state."""
+        return vdot + ratio * (a - vdot)
+
     def resizing_factors(self, system, state, t):
         return ConstrainedMass.in_steps(system, state.q, t).factors if self._off_velocities(system) else None
 
@@ -152,7 +157,7 @@ class AbstractGeneralizedAlpha(AbstractAlpha):
     def mismatch(self, before, after, ratio):
         """Of eq. (29)."""
         (vdot, a), (next_vdot, next_a) = before, after
-        a = vdot + ratio * (a - vdot)
+        a = self.resized_acceleration(vdot, a, ratio)
         left = (1.0 - self.alpha_m) * next_a + self.alpha_m * a
         return left - (1.0 - self.alpha_f) * next_vdot - self.alpha_f * vdot
 

@@ -61,7 +61,8 @@ class TranslationDriver(AbstractJoint):
             `lgsens.kinematics` prescribes many.
 
     The multiplier is the force of `b` on `a` along the axis [N]: its negative drives `b`. Raises `ValueError` for a
-    wrong shape or a zero axis. Source: Haug (1989), §9.6.
+    wrong shape, a zero axis, or samples joined by straight lines, at which velocities would jump. Source: Haug (1989),
+    §9.6.
     """
 
     a: str | None = eqx.field(static=True)
@@ -95,7 +96,8 @@ class RotationDriver(AbstractJoint):
             with its rate. `lgsens.kinematics` prescribes many.
 
     The multiplier is the moment of `b` on `a` about the axis [N m]: its negative drives `b`. Raises `ValueError` for a
-    wrong shape or a zero axis. Source: Haug (1989), §9.6.
+    wrong shape, a zero axis, or samples joined by straight lines, at which velocities would jump. Source: Haug (1989),
+    §9.6.
     """
 
     a: str | None = eqx.field(static=True)

@@ -274,9 +274,10 @@ class JointFriction(_AbstractJointFriction):
             exact derivatives and Richardson.
 
     Equations that freed bodies cannot violate carry nothing here (`Trajectory.joint`). `Trajectory.force` gives a
-    `SlidingFriction`. Raises `ValueError` for an unknown joint or another one, a missing radius, numbers ≤ 0, and with
-    `Model(redundant="minimum_norm")`. Sources: Haug, Wu & Yang, Mechanism and Machine Theory 21 (1986) 401; Pennestrì,
-    Rossi, Salvini & Valentini, Nonlinear Dynamics 83 (2016), doi:10.1007/s11071-015-2485-3.
+    `SlidingFriction`. Raises `ValueError` for an unknown joint or another one, a missing radius, numbers ≤ 0
+    (coefficients < 0), and with `Model(redundant="minimum_norm")`. Sources: Haug, Wu & Yang, Mechanism and Machine
+    Theory 21 (1986) 401; Pennestrì, Rossi, Salvini & Valentini, Nonlinear Dynamics 83 (2016),
+    doi:10.1007/s11071-015-2485-3.
     """
 
     joint: str = eqx.field(static=True)

@@ -244,7 +244,7 @@ class DistanceJoint(AbstractJoint):
             the reference configuration. With another length the mechanism is assembled before it moves.
 
     The multiplier is the tension of the rod [N]. Raises `ValueError` for a wrong shape, a length
-    ≤ 0, or coinciding ends. Source: Haug (1989), §9.4.
+    ≤ 0 or along straight lines between samples, or coinciding ends. Source: Haug (1989), §9.4.
     """
 
     a: str | None = eqx.field(static=True)

@@ -39,8 +39,8 @@ class TorsionSpringDamper(AbstractConnection):
         motor: the moment M(t) on b [N m], a number, shape (), or a signal; None: no motor.
 
     Give `free_angle` or `preload`, not both. `Trajectory.force` gives the angle [rad], its rate [rad/s] and the moment
-    on b [N m]. Raises `ValueError` for both, a zero axis, or wrong shapes. Source: Haug (1989), chapter 6 (rotational
-    spring-damper-actuator).
+    on b [N m]. Raises `ValueError` for both, a larger `free_angle`, a zero axis, or wrong shapes. Source: Haug (1989),
+    chapter 6 (rotational spring-damper-actuator).
     """
 
     a: str | None = eqx.field(static=True)
@@ -158,8 +158,8 @@ class BumpStop(AbstractConnection):
         rebound: whether it is a rebound stop, which pulls the points together: x = max(0, ℓ − ℓ₀ − gap).
 
     `Trajectory.force` gives its `LineForce`, of negative tension where it pushes. Raises `ValueError` for wrong shapes,
-    a rounding or progression ≤ 0, or points that coincide. Source, of what it is for: Blundell & Harty, The Multibody
-    Systems Approach to Vehicle Dynamics (2004), chapter 4; the formula is of this library.
+    a rounding or progression ≤ 0, a stiffness < 0, or points that coincide. Source, of what it is for: Blundell &
+    Harty, The Multibody Systems Approach to Vehicle Dynamics (2004), chapter 4; the formula is of this library.
     """
 
     a: str | None = eqx.field(static=True)
@@ -207,8 +207,9 @@ class PlaneContact(AbstractConnection):
         coefficient: μ of friction [–], shape (), the force μ F u/√(u² + u₀²) against the slip u; None: none.
         slip_speed: u₀ [m/s], shape (), > 0, given with `coefficient`.
 
-    `Trajectory.force` gives F [N]. Raises `ValueError` for wrong shapes, a zero axis, a rounding or speed ≤ 0, and one
-    of coefficient and speed without the other. Source: Hunt & Crossley (1975), doi:10.1115/1.3423596.
+    `Trajectory.force` gives F [N]. Raises `ValueError` for wrong shapes, a zero axis, a rounding or speed ≤ 0, other
+    numbers < 0, and one of coefficient and speed without the other. Source: Hunt & Crossley (1975),
+    doi:10.1115/1.3423596.
     """
 
     a: str | None = eqx.field(static=True)
@@ -245,8 +246,8 @@ class Drag(AbstractForce):
         density: ρ [kg/m³], shape ().
         wind: [m/s], inertial frame, shape (3,).
 
-    Its derivatives are continuous, its second ones but for u = 0. Raises `ValueError` for wrong shapes. Source:
-    Hoerner, Fluid-Dynamic Drag (1965), chapter 1.
+    Its derivatives are continuous, its second ones but for u = 0. Raises `ValueError` for wrong shapes, and
+    a drag area or density < 0. Source: Hoerner, Fluid-Dynamic Drag (1965), chapter 1.
     """
 
     body: str = eqx.field(static=True)

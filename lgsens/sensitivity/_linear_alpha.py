@@ -98,7 +98,7 @@ def started(scheme: GeneralizedAlpha, mass, jacobian, exact: LinearMotion, h) ->
 
 def advance(scheme: GeneralizedAlpha, mass, previous: LinearMotion, node: LinearNode, h, ratio) -> LinearMotion:
     """One step, `ratio` times as long as the one before: one factorization, one solve for all columns."""
-    previous = previous._replace(a=previous.acceleration + ratio * (previous.a - previous.acceleration))
+    previous = previous._replace(a=scheme.resized_acceleration(previous.acceleration, previous.a, ratio))
     x = previous.x + h * previous.rate + (h**2 * (0.5 - scheme.beta)) * previous.a
     rate = previous.rate + (h * (1.0 - scheme.gamma)) * previous.a
     acceleration = (scheme.alpha_m * previous.a - scheme.alpha_f * previous.acceleration) / (1.0 - scheme.alpha_f)

@@ -97,7 +97,8 @@ def simulate(
         sensitivity: how the trajectory is differentiated. `DirectDifferentiation` supports every JAX
             transformation; `AdjointVariable` is reverse mode, and forward over it (`jax.hessian`); `AssociativeScan`
             takes all steps at once, for accelerators.
-        state0: the state at t0, used as it is: one of `equilibrium`, or `Trajectory.state` to continue. None: the
+        state0: the state at t0, used as it is: one of `equilibrium`, or `Trajectory.state` to continue. Off its joints
+            by more than a thousandth of the scene it is refused, inside `jit` by the result `off_joints`. None: the
             consistent initial state of the model, from which the scheme begins with its own corrections. A given state
             has none: with `initial_state(model)` accelerations and multipliers of the first steps are of first order.
             For second order leave it out and put initial velocities into the model, or continue from
