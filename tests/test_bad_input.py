@@ -59,7 +59,7 @@ CONSTRUCTORS = {
     ),
     "spring wound up by turns": (
         lambda: lg.TorsionSpringDamper(None, "wheel", axis=Z, stiffness=1.0, free_angle=12.0),
-        ("`free_angle` must be within half a turn", "12.0", "`preload`"),
+        ("`free_angle` must be within half a turn", "12.0", "`turns=True`"),
     ),
     "mass of text": (lambda: body(mass="heavy"), ("RigidBody: `mass`", "must be a number", "'heavy'")),
     "mass a truth value": (lambda: body(mass=True), ("RigidBody: `mass`", "must be a number", "True")),

@@ -21,7 +21,7 @@ from lgsens.criteria._criterion import Criterion, stacked
 from lgsens.criteria._criterion_use import Use, checked_for
 from lgsens.criteria._reference_methods import STENCIL, FiniteDifferences, IndexReduced
 from lgsens.criteria._to_accuracy import differentiate_to
-from lgsens.dynamics import AbstractSystem, State
+from lgsens.dynamics import AbstractSystem, State, Turns
 from lgsens.integrate import AbstractIntegrator, AdaptiveSteps, EqualGrid, GeneralizedAlpha, UnevenGrid
 from lgsens.model import Model
 from lgsens.sensitivity import (
@@ -286,7 +286,7 @@ def _on_the_fly(task: _Task, p) -> _Found:
     found = direct_on_the_fly(scheme, start, stacked(task.criteria, task.unravel), p)
     begun, laid = found.begun
     t = laid.grid.times()
-    ended = outcome(scheme, begun, found.stats, jnp.diff(t) * found.rates, t, laid)
+    ended = outcome(scheme, begun, found.stats, Turns.between(t, found.turning), t, laid)
     return _Found(found.value, found.gradient, *ended)
 
 

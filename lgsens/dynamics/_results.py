@@ -21,6 +21,7 @@ class RESULTS(IntEnum):
     statics_failed = 12
     not_held = 13
     off_joints = 14
+    angle_jumped = 15
 
     @property
     def message(self) -> str:
@@ -63,6 +64,10 @@ _MESSAGES = {
     RESULTS.turn_not_resolved: (
         "A body turns by more than π in a step while its angular velocity changes: what loads do in between, the steps "
         "do not see, and the motion may be quite another one. Take steps of 0.3 rad or less (more `num_steps`)."
+    ),
+    RESULTS.angle_jumped: (
+        "The angle of a spring passes half a turn from where it is free, which poses do not tell from the other half: "
+        "its moment jumped. Let it count whole turns (`TorsionSpringDamper` or `CoordinateForce` with turns=True)."
     ),
     RESULTS.position_failed: (
         "No position satisfies the joints for these values of the driven ones: they are out of reach, or the mechanism "

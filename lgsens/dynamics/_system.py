@@ -130,6 +130,10 @@ class AbstractSystem(eqx.Module):
         Of equations that do not know their bodies, of none."""
         return jnp.zeros((*v.shape[:-1], 0, 3), v.dtype)
 
+    def branches(self, q) -> Float[Array, " w"]:
+        """Angles that q tells within half a turn and that forces depend on, which jump there [rad]; of none."""
+        return jnp.zeros_like(self.reference()[1], shape=0)
+
     # Forces that depend on the multipliers, as friction of joints does: f(q, v, λ, t).
 
     @property

@@ -1,4 +1,4 @@
-"""Turns that time steps do not resolve.
+"""Turns that time steps do not resolve, and such that poses do not tell.
 
 A load that is fixed in space turns against a body of angular velocity Ω, in the frame of the body: by h|Ω| in a step.
 From π on its samples are those of a slower turn as well, or of none at 2π, and Newton converges to the
@@ -12,13 +12,18 @@ for a pendulum that turns over, does not help. So a body counts as unsteady if
     |Ω̇| > ε^(2/3) |Ω|²,
 
 where round-off makes Ω̇ = ε Ω², and more by the multipliers of joints, and no unsteady body may turn by π in a step.
+
+A force that depends on an angle which poses tell within half a turn jumps where that jumps from π to −π.
 """
 
+from typing import NamedTuple
+
+import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from lgsens.dynamics._system import AbstractSystem
+from lgsens.dynamics._system import AbstractSystem, State
 
 
 def unsteady_rate(system: AbstractSystem, v: Float[Array, "*n k"], vdot: Float[Array, "*n k"]) -> Float[Array, "*n"]:
@@ -27,3 +32,32 @@ def unsteady_rate(system: AbstractSystem, v: Float[Array, "*n k"], vdot: Float[A
     square, change = (jnp.sum(system.angular_velocities(each) ** 2, axis=-1) for each in (v, vdot))
     unsteady = change > (jnp.finfo(v.dtype).eps ** (2.0 / 3.0) * square) ** 2
     return jnp.sqrt(jnp.max(jnp.where(unsteady, square, 0.0), axis=-1, initial=0.0))
+
+
+class Turning(NamedTuple):
+    """What tells turns, at some instants: `unsteady_rate` [rad/s], and `AbstractSystem.branches` [rad]."""
+
+    rates: Float[Array, "*n"]
+    branches: Float[Array, "*n w"]
+
+    @classmethod
+    def at(cls, system: AbstractSystem, state: State) -> "Turning":
+        branches = lax.stop_gradient(system.branches(state.q))
+        return cls(unsteady_rate(system, state.v, state.vdot), branches)
+
+    @classmethod
+    def along(cls, system: AbstractSystem, states: State) -> "Turning":
+        """At all instants of a motion."""
+        return jax.vmap(lambda state: cls.at(system, state))(states)
+
+
+class Turns(NamedTuple):
+    """Of each step: how far an unsteady body turns in it [rad], and whether an angle jumps."""
+
+    of_bodies: Float[Array, " n"]
+    jumped: Bool[Array, " n"]
+
+    @classmethod
+    def between(cls, t: Float[Array, " n+1"], turning: Turning) -> "Turns":
+        h, change = jnp.diff(t), jnp.diff(turning.branches, axis=0)
+        return cls(h * turning.rates[1:], jnp.any(jnp.abs(change) > jnp.pi, axis=1) & (h > 0.0))

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_count, as_float, number_field, point_field, require, suggestion
+from lgsens._validate import as_count, as_float, number_field, point_field, require, require_setting, suggestion
 from lgsens.liegroups import SO3, skew, turn_back
 from lgsens.model._constraints import AbstractClosedFormConstraint
 from lgsens.model._forces import AbstractConnection, AbstractForce, Attached, _frame
@@ -20,6 +20,7 @@ from lgsens.model._joints import AbstractJoint
 from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, LoadTangents
 from lgsens.model._relative import Coordinate
 from lgsens.model._signals import Prescribed, at_time, prepared, prescribed_field
+from lgsens.model._turns import CountedTurns, acting, branch_of, force_along
 
 
 def _seen(a: Frame, b: Frame, on_a: Frame, on_b: Frame) -> Frame:
@@ -87,23 +88,24 @@ class CoordinateLoad(AbstractClosedFormLoad):
     balanced = True
     drawn = None
 
-    def _both(self, a, b, va, vb, t):
-        s, row = _row(lambda a, b: self.coordinate.of(_seen(a, b, self.on_a, self.on_b)), (a, b))
-        rate = jnp.sum(row * jnp.concatenate([va, vb]))
+    def value(self, a, b):
+        return _row(lambda a, b: self.coordinate.of(_seen(a, b, self.on_a, self.on_b)), (a, b))
+
+    def along(self, s, rate, t) -> CoordinateMeasure:
         force = -self.stiffness * (s - self.free) - self.damping * rate
-        if self.motor is not None:
-            force += at_time(self.motor, t)
-        return CoordinateMeasure(s, rate, force), row
+        return CoordinateMeasure(s, rate, force if self.motor is None else force + at_time(self.motor, t))
+
+    def branch(self, a, b):
+        return branch_of(self, a, b) if self.coordinate.periodic else None
 
     def measure(self, a, b, va, vb, t) -> CoordinateMeasure:
-        return self._both(a, b, va, vb, t)[0]
+        return acting(self, a, b, va, vb, t)[0]
 
     def force(self, a, b, va, vb, t):
-        found, row = self._both(a, b, va, vb, t)
-        return found.force * row
+        return force_along(self, a, b, va, vb, t)
 
     def tangents(self, a, b, va, vb, t):
-        zero, row = jnp.zeros_like(va, shape=2 * BODY_DIM), self._both(a, b, va, vb, t)[1]
+        zero, (_, row) = jnp.zeros_like(va, shape=2 * BODY_DIM), self.value(a, b)
 
         def force(x):
             one, other = _tilted((a, b), x)
@@ -124,12 +126,14 @@ class CoordinateForce(AbstractForce):
         coordinate: the name of the coordinate, static; None: the only one.
         stiffness: k [N/m or N m/rad], shape ().
         damping: c [N s/m or N m s/rad], shape ().
-        free: s₀ [m or rad], at which the spring is free, shape (). An angle is within half a turn of 0.
+        free: s₀ [m or rad], at which the spring is free, shape ().
         motor: M(t) [N or N m], a number, shape (), or a signal; None: no motor.
+        turns: whether an angle is counted over whole turns, by a state "angle" (`Trajectory.states_of`), static. Else
+            it is within half a turn of 0, where the force of a spring jumps, and a motion that comes there has failed.
 
     `Trajectory.force` gives the coordinate, its rate, and f. Raises `ValueError` for a joint without the coordinate,
-    and for wrong shapes. Source: in minimal coordinates the spring, damper and motor of MuJoCo's joints (its
-    documentation, "Computation": passive forces, actuation model).
+    for `turns` of one that is no angle, and for wrong shapes. Source: in minimal coordinates the spring, damper and
+    motor of MuJoCo's joints (its documentation, "Computation": passive forces, actuation model).
     """
 
     joint: AbstractJoint
@@ -138,9 +142,13 @@ class CoordinateForce(AbstractForce):
     damping: Float[Array, ""] = number_field("damping", default=0.0)
     free: Float[Array, ""] = number_field("free", default=0.0)
     motor: Prescribed | None = prescribed_field("motor")
+    turns: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def __check_init__(self):
-        _coordinate("CoordinateForce", self.joint, self.coordinate)
+        found = _coordinate("CoordinateForce", self.joint, self.coordinate)
+        require_setting(self, "turns", isinstance(self.turns, bool), "True or False")
+        if self.turns and not found.periodic:
+            raise ValueError(f"CoordinateForce: `turns` are those of an angle; {found.name!r} is none. Leave it out.")
 
     @property
     def bodies(self):
@@ -150,9 +158,8 @@ class CoordinateForce(AbstractForce):
         ends = _attached(self.joint, *(_frame(bodies, name, self.stiffness.dtype) for name in self.bodies))
         motor = None if self.motor is None else prepared(self.motor)
         coordinate = _coordinate("CoordinateForce", self.joint, self.coordinate)
-        return (
-            Attached(CoordinateLoad(*ends, self.stiffness, self.damping, self.free, motor, coordinate), *self.bodies),
-        )
+        load = CoordinateLoad(*ends, self.stiffness, self.damping, self.free, motor, coordinate)
+        return (Attached(CountedTurns(load) if self.turns else load, *self.bodies),)
 
 
 class BallLoad(AbstractLoad):

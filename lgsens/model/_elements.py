@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from lgsens.model._frames import ALL
+from lgsens.model._frames import ALL, Frame
 
 
 def body_fixed(kind: str, body: str) -> dict[str, Any]:
@@ -42,6 +42,10 @@ class AbstractElement(eqx.Module):
     def driven(self) -> Float[Array, ""] | None:
         """The number, a leaf, that `kinematics` and `statics` prescribe: a constraint has ∂Φ/∂s = −1, a load is
         multiplied by it; None: there is none."""
+        return None
+
+    def branch(self, a: Frame, b: Frame) -> Float[Array, ""] | None:
+        """An angle that poses tell within half a turn, and with which its force jumps there; None: there is none."""
         return None
 
     def fixed(self, kind: str, bodies: str = "ab") -> list[Array]:

@@ -135,6 +135,9 @@ class _CarriedLoad(AbstractLoad):
     def force(self, a, b, va, vb, t):
         return _carried_force(self, a, b, va, vb, t)
 
+    def branch(self, a, b):
+        return self.element.branch(_frame(a, self.a), _frame(b, self.b))
+
     def measure(self, a, b, va, vb, t):
         return self.element.measure(*_of_parts(self, a, b, va, vb), t)
 

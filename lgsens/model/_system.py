@@ -172,6 +172,11 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     def coordinate_scale(self):
         return coordinate_scale(self)
 
+    def branches(self, q):
+        ends = at_ends(self.loads, self._placed(q))
+        found = [stack.map(lambda load, *frames: load.branch(*frames), at) for stack, at in zip(self.loads, ends)]
+        return jnp.concatenate([super().branches(q), *(angles for angles in found if angles is not None)])
+
     @property
     def num_states(self):
         return sum(map(len, self.free[len(self.body_names) :]))

@@ -18,6 +18,7 @@ from lgsens.model._frames import BODY_B, ROTATION, ROTATION_A, ROTATION_B, TRANS
 from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, BushingLoad, LoadTangents
 from lgsens.model._signals import AbstractSignal, Prescribed, at_time, constant_of
 from lgsens.model._stack import load_tangents
+from lgsens.model._turns import acting, branch_of, force_along
 
 
 class HingeMoment(NamedTuple):
@@ -74,7 +75,7 @@ class CurveBushingLoad(AbstractClosedFormLoad):
 
 
 class TorsionLoad(AbstractLoad):
-    """M = motor(t) − M₀ − k (θ − θ₀) − c θ̇ on b about an axis of a, with θ of `Angle` within half a turn of θ₀."""
+    """M = motor(t) − M₀ − k (θ − θ₀) − c θ̇ on b about an axis of a; θ within half a turn of θ₀, unless counted."""
 
     first_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
     second_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
@@ -92,8 +93,8 @@ class TorsionLoad(AbstractLoad):
     def acts_on(self):
         return TURNING_A + TURNING_B
 
-    def _row(self, a, b):
-        """θ − θ₀ and ∂θ/∂q: with β = Cβ₀, C = R_aᵀR_b, and g = ∂θ/∂β, δβ = β × δθ_a + C (δθ_b × β₀)."""
+    def value(self, a, b):
+        """θ and ∂θ/∂q: with β = Cβ₀, C = R_aᵀR_b, and g = ∂θ/∂β, δβ = β × δθ_a + C (δθ_b × β₀)."""
         relative = a.orientation.T @ b.orientation
         beta = turn(relative, self.first_b)
         x, y = jnp.sum(beta * self.first_a), jnp.sum(beta * self.second_a)
@@ -101,20 +102,21 @@ class TorsionLoad(AbstractLoad):
         sine, cosine = jnp.sin(self.free_angle), jnp.cos(self.free_angle)
         twist = jnp.arctan2(y * cosine - x * sine, x * cosine + y * sine)
         zero = jnp.zeros_like(g)
-        return twist, jnp.concatenate([zero, cross(g, beta), zero, cross(self.first_b, turn_back(relative, g))])
+        row = jnp.concatenate([zero, cross(g, beta), zero, cross(self.first_b, turn_back(relative, g))])
+        return self.free_angle + twist, row
 
-    def _moment(self, twist, rate, t):
-        moment = -self.preload - self.stiffness * twist - self.damping * rate
-        return moment if self.motor is None else moment + at_time(self.motor, t)
+    def along(self, s, rate, t) -> HingeMoment:
+        moment = -self.preload - self.stiffness * (s - self.free_angle) - self.damping * rate
+        return HingeMoment(s, rate, moment if self.motor is None else moment + at_time(self.motor, t))
+
+    def branch(self, a, b):
+        return branch_of(self, a, b)
 
     def measure(self, a, b, va, vb, t) -> HingeMoment:
-        twist, row = self._row(a, b)
-        rate = jnp.sum(row * jnp.concatenate([va, vb]))
-        return HingeMoment(self.free_angle + twist, rate, self._moment(twist, rate, t))
+        return acting(self, a, b, va, vb, t)[0]
 
     def force(self, a, b, va, vb, t):
-        twist, row = self._row(a, b)
-        return self._moment(twist, jnp.sum(row * jnp.concatenate([va, vb])), t) * row
+        return force_along(self, a, b, va, vb, t)
 
 
 class RotationLoad(AbstractClosedFormLoad):

@@ -7,13 +7,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import axis_field, number_field, point_field, require, require_not_negative, require_positive
+from lgsens._validate import (
+    axis_field,
+    number_field,
+    point_field,
+    require,
+    require_not_negative,
+    require_positive,
+    require_setting,
+)
 from lgsens.model._contacts import PlaneContactLoad
 from lgsens.model._curves import CurveLoad
 from lgsens.model._forces import AbstractConnection, AbstractForce, Attached, _distance
 from lgsens.model._frames import normals
 from lgsens.model._signals import AbstractSignal, Prescribed, prepared, prescribed_field
 from lgsens.model._turning_loads import DragLoad, TorsionLoad
+from lgsens.model._turns import CountedTurns
 
 
 def _torsion(a, b, force, stiffness, free_angle=None, preload=None, motor=None) -> TorsionLoad:
@@ -26,17 +35,20 @@ def _torsion(a, b, force, stiffness, free_angle=None, preload=None, motor=None) 
 class TorsionSpringDamper(AbstractConnection):
     """Spring, damper and motor about a hinge axis: the moment M(t) − M₀ − k (θ − θ₀) − c θ̇ on b, its opposite on a.
 
-    θ is the angle by which `b` has turned about the axis, fixed in `a`, since the reference configuration; within half
-    a turn of θ₀, where the moment of the spring jumps. A hinge keeps the axes of both bodies aligned.
+    θ is the angle by which `b` has turned about the axis, fixed in `a`, since the reference configuration. A hinge
+    keeps the axes of both bodies aligned.
 
     Arguments:
         a, b: names of the two bodies; None is the ground.
         axis: direction of the axis in the reference configuration, inertial frame, shape (3,), any length > 0.
         stiffness: k [N m/rad], shape ().
         damping: c [N m s/rad], shape ().
-        free_angle: θ₀, at which the spring is free [rad], within half a turn, shape ().
+        free_angle: θ₀, at which the spring is free [rad], shape (); within half a turn unless `turns` are counted.
         preload: the moment M₀ that turns b back in the reference configuration [N m], shape (). θ₀ is then 0.
         motor: the moment M(t) on b [N m], a number, shape (), or a signal; None: no motor.
+        turns: whether whole turns are counted, as a clock spring needs it, by a state "angle" (`Trajectory.states_of`),
+            static. Else θ is within half a turn of θ₀, where the moment of the spring jumps, and a motion that comes
+            there has failed; without a spring it does not matter.
 
     Give `free_angle` or `preload`, not both. `Trajectory.force` gives the angle [rad], its rate [rad/s] and the moment
     on b [N m]. Raises `ValueError` for both, a larger `free_angle`, a zero axis, or wrong shapes. Source: Haug (1989),
@@ -51,18 +63,20 @@ class TorsionSpringDamper(AbstractConnection):
     free_angle: Float[Array, ""] | None = number_field("free_angle", default=None)
     preload: Float[Array, ""] | None = number_field("preload", default=None)
     motor: Prescribed | None = prescribed_field("motor")
+    turns: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def __check_init__(self):
+        require_setting(self, "turns", isinstance(self.turns, bool), "True or False")
         if self.free_angle is not None and self.preload is not None:
             raise ValueError(
                 "TorsionSpringDamper: give `free_angle` or `preload`, not both: each determines the other "
                 "(preload = −stiffness · free_angle)."
             )
-        if self.free_angle is not None:
+        if self.free_angle is not None and not self.turns:
             require(
                 lambda angle: abs(angle) <= np.pi,
                 f"TorsionSpringDamper: `free_angle` must be within half a turn, as its angle is, got {self.free_angle} "
-                "rad; a spring that is wound up further has its moment in the reference configuration as `preload`.",
+                "rad; a spring that is wound up further counts whole turns, `turns=True`.",
                 self.free_angle,
             )
 
@@ -73,7 +87,8 @@ class TorsionSpringDamper(AbstractConnection):
 
     def load(self, a, b):
         motor = None if self.motor is None else prepared(self.motor)
-        return _torsion(a, b, self, self.stiffness, self.free_angle, self.preload, motor)
+        load = _torsion(a, b, self, self.stiffness, self.free_angle, self.preload, motor)
+        return CountedTurns(load) if self.turns else load
 
 
 class AntiRollBar(AbstractConnection):

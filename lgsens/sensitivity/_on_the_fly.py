@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import State, unsteady_rate
-from lgsens.integrate import AbstractScheme, Stats, Variation, Walk, over_steps
+from lgsens.dynamics import State, Turning
+from lgsens.integrate import AbstractScheme, Stats, Variation, Walk, over_steps, with_first
 from lgsens.sensitivity._criterion_terms import Functional
 from lgsens.sensitivity._linearization import (
     Parameters,
@@ -29,12 +29,12 @@ from lgsens.sensitivity._linearized_steps import LinearizedSteps
 
 
 class OnTheFly(NamedTuple):
-    """Values (c,), gradients (c, p), Newton's statistics, how fast bodies turn, what `begin` has to say besides."""
+    """Values (c,), gradients (c, p), Newton's statistics, what tells turns, what `begin` has to say besides."""
 
     value: Float[Array, " c"]
     gradient: Float[Array, "c p"]
     stats: Stats
-    rates: Float[Array, " n"]  # `unsteady_rate` after each step
+    turning: Turning  # at all instants
     begun: Any
 
 
@@ -80,16 +80,17 @@ def direct_on_the_fly(
         rate = with_derivative(functional.rate, progress.state, node.t, delta)
         weight = grid.unless_empty(place, node.h / 2, jnp.zeros_like(node.h))
         total = jax.tree.map(lambda total, f, g: total + weight * (f + g), total, before, rate)
-        turning = unsteady_rate(system, progress.state.v, progress.state.vdot)
-        return (progress, delta, rate, total), (stats, turning)
+        return (progress, delta, rate, total), (stats, Turning.at(system, progress.state))
 
     delta0 = jax.vmap(lambda tangent: to_algebra(group, state0, tangent))(d_state0)
     first = with_derivative(functional.rate, state0, grid.t0, delta0)
     start = (walk.begin(grid, state0, exact=True), delta0, first, jax.tree.map(jnp.zeros_like, first))
     # places are numbered along the first axis, parameters along the second
     d_places = jax.vmap(lambda d: place_tangents(grid, d), out_axes=1)(d.grid)
-    blank = Stats.none(grid.t0), jnp.zeros_like(grid.t0)
-    (end, delta, _, integral), (stats, rates) = over_steps(step, start, (grid.places(), d_places), grid.count, blank)
+    begin_turning = Turning.at(system, state0)
+    (end, delta, _, integral), (stats, turning) = over_steps(
+        step, start, (grid.places(), d_places), grid.count, (Stats.none(grid.t0), begin_turning)
+    )
     final = with_derivative(functional.final, end.state, grid.times()[-1], delta)
     value, derivative = jax.tree.map(jnp.add, integral, final)
-    return OnTheFly(value, derivative.T, stats, rates, begun)
+    return OnTheFly(value, derivative.T, stats, with_first(begin_turning, turning), begun)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from lgsens.dynamics import AbstractSystem, State, unsteady_rate
+from lgsens.dynamics import AbstractSystem, State, Turning
 from lgsens.simulation._trajectory import Instant
 
 Save = Callable[[Instant], Any]
@@ -30,7 +30,7 @@ class _Given(eqx.Module):
 
 
 class Output(eqx.Module):
-    """`save` as a function of the state, and how fast that turns; equal, for one compilation, where `function` is."""
+    """`save` as a function of the state, and what tells its turns; equal, for one compilation, where `function` is."""
 
     function: Callable[..., Any] = eqx.field(static=True)  # of an instant and the numbers
     numbers: list[Array]
@@ -52,4 +52,4 @@ class Output(eqx.Module):
 
     def __call__(self, system, state: State, t):
         found = self.function(Instant(t=t, state=state, system=system), *self.numbers)
-        return found, unsteady_rate(system, state.v, state.vdot)
+        return found, Turning.at(system, state)

@@ -12,7 +12,7 @@ from jax.core import Tracer
 
 from lgsens._validate import as_count
 from lgsens._xla import alike, tracing
-from lgsens.dynamics import RESULTS, AbstractSystem, State, unsteady_rate
+from lgsens.dynamics import RESULTS, AbstractSystem, State, Turning, Turns
 from lgsens.integrate import (
     AbstractIntegrator,
     AbstractScheme,
@@ -219,16 +219,17 @@ def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, sa
     return run(system, begun, t0, t1, num_steps, integrator, sensitivity, save)
 
 
-def outcome(scheme: AbstractScheme, begun: Begin, stats: Stats, turns, t, laid: Laid):
-    """The result code of a simulation, and what its message needs; `turns`: h `unsteady_rate` of each step."""
+def outcome(scheme: AbstractScheme, begun: Begin, stats: Stats, turns: Turns, t, laid: Laid):
+    """The result code of a simulation, and what its message needs."""
     failed = jnp.argmin(stats.converged)  # the first step that did not converge, 0 if all did
     newton = jnp.where(jnp.all(stats.converged), RESULTS.successful, scheme.failure)
     singular = singular_steps(stats.margin)
     newton = jnp.where(jnp.any(singular), RESULTS.singular_configuration, newton)
     failed = jnp.where(jnp.any(singular), jnp.argmax(singular), failed)
-    unresolved = jnp.any(turns > jnp.pi) & (newton != scheme.failure)  # which may look singular later
-    newton = jnp.where(unresolved, RESULTS.turn_not_resolved, newton)
-    failed = jnp.where(unresolved, jnp.argmax(turns > jnp.pi), failed)
+    for code, steps in ((RESULTS.angle_jumped, turns.jumped), (RESULTS.turn_not_resolved, turns.of_bodies > jnp.pi)):
+        found = jnp.any(steps) & (newton != scheme.failure)  # which may look singular later
+        newton = jnp.where(found, code, newton)
+        failed = jnp.where(found, jnp.argmax(steps), failed)
     result = jnp.where(begun.result == RESULTS.successful, newton, begun.result).astype(jnp.int32)
     time = t[failed + 1]
     if laid.reached is not None:
@@ -246,7 +247,7 @@ def outcome(scheme: AbstractScheme, begun: Begin, stats: Stats, turns, t, laid: 
         "iterations": stats.iterations[failed],
         "increment": stats.increment[failed],
         "residual": stats.residual[failed],
-        "turn": turns[failed],
+        "turn": turns.of_bodies[failed],
         "tolerance": jnp.asarray(scheme.tolerance),
     }
     return result, jax.lax.stop_gradient(details)
@@ -285,11 +286,10 @@ def _single_run(
             states, newton = integrate_ode(scheme, system, grid, scheme.physical(system, state0))
         else:
             states, newton = sensitivity.trajectory(scheme, state0, parameters, laid.found)
-        turns = jnp.diff(t) * unsteady_rate(system, states.v[1:], states.vdot[1:])
+        turning = Turning.along(system, states)
     else:
-        (values, rates), final, newton = saved_run(sensitivity, save, scheme, state0, parameters)
-        turns = jnp.diff(t) * rates[1:]
-    result, details = outcome(scheme, begun, newton, turns, t, laid)
+        (values, turning), final, newton = saved_run(sensitivity, save, scheme, state0, parameters)
+    result, details = outcome(scheme, begun, newton, Turns.between(t, turning), t, laid)
     stats = scheme.statistics(newton) if laid.stats is None else laid.stats
     if save is None:
         stages = scheme.stages(system, grid, states)

@@ -1,0 +1,86 @@
+"""Loads along one coordinate of two bodies, and the whole turns of those along an angle.
+
+A load along s(q) is Q = (∂s/∂q)ᵀ f(s, ṡ, t), whose power is f ṡ. Poses tell an angle but for whole turns, and f of a
+spring, which is not periodic, jumps where s comes to half a turn. Over more turns a state follows the angle,
+
+    ż = ṡ + (s_z − z)/τ,     s_z = s + 2π k,     k = round((z − s)/2π),
+
+and nothing but k depends on it: f(s_z, ṡ, t) and its derivatives are exact while z is right to less than half a turn.
+The second term takes out what a scheme loses in z over many turns, and makes z = s_z the equilibrium; τ = 1 s.
+"""
+
+from typing import Any, Protocol
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens.model._frames import Frame
+from lgsens.model._loads import AbstractDynamicLoad
+
+_TURN = 2.0 * jnp.pi
+
+
+class AlongCoordinate(Protocol):
+    """A load along a coordinate."""
+
+    @property
+    def stiffness(self) -> Float[Array, ""]: ...
+
+    def value(self, a: Frame, b: Frame) -> tuple[Float[Array, ""], Float[Array, "12"]]:
+        """s and ∂s/∂q."""
+        ...
+
+    def along(self, s, rate, t) -> Any:
+        """What is measured there, of which f is the last."""
+        ...
+
+
+def acting(load: AlongCoordinate, a: Frame, b: Frame, va, vb, t, z=None) -> tuple[Any, Float[Array, "12"]]:
+    """What is measured of a load, of which f is the last, and ∂s/∂q; z: what tells the turns."""
+    s, row = load.value(a, b)
+    rate = jnp.sum(row * jnp.concatenate([va, vb]))
+    if z is not None:
+        s += _TURN * jnp.round((z - s) / _TURN)
+    return load.along(s, rate, t), row
+
+
+def force_along(load: AlongCoordinate, a: Frame, b: Frame, va, vb, t, z=None) -> Float[Array, "12"]:
+    """Q."""
+    found, row = acting(load, a, b, va, vb, t, z)
+    return found[-1] * row
+
+
+def branch_of(load: AlongCoordinate, a: Frame, b: Frame) -> Float[Array, ""]:
+    """The angle of a load that jumps with it (`AbstractElement.branch`); 0 where none does, without a spring."""
+    return jnp.where(load.stiffness == 0.0, 0.0, load.value(a, b)[0])
+
+
+class CountedTurns(AbstractDynamicLoad):
+    """A load along an angle over any number of turns, since the reference configuration."""
+
+    of: Any  # AlongCoordinate
+
+    balanced = True
+    drawn = None
+    states = ("angle",)
+
+    @property
+    def acts_on(self):
+        return self.of.acts_on
+
+    def fixed(self, kind, bodies="ab"):
+        return self.of.fixed(kind, bodies)
+
+    def measure(self, a, b, va, vb, t, z):
+        return acting(self.of, a, b, va, vb, t, z[0])[0]
+
+    def force(self, a, b, va, vb, t, z):
+        return force_along(self.of, a, b, va, vb, t, z[0])
+
+    def rate(self, a, b, va, vb, t, z):
+        s, rate, _ = self.measure(a, b, va, vb, t, z)
+        return (rate + s)[None] - z
+
+    def initial(self, a, b, va, vb, t):
+        s, _ = self.of.value(a, b)
+        return (s - _TURN * jnp.round(s / _TURN))[None]

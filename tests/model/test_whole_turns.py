@@ -1,0 +1,152 @@
+"""Springs over whole turns: a clock spring against its closed form, and one that does not count them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import says
+
+import lgsens as lg
+
+Z = (0.0, 0.0, 1.0)
+INERTIA, STIFFNESS, WOUND = 0.02, 0.3, 6 * np.pi  # kg m², N m/rad, rad
+T1, STEPS = 1.0, 100
+
+
+def hinge(rotor="rotor"):
+    return lg.RevoluteJoint(None, rotor, at=(0.0, 0.0, 0.0), axis=Z)
+
+
+def torsion(stiffness, free, **options):
+    return lg.TorsionSpringDamper(None, "rotor", axis=Z, stiffness=stiffness, free_angle=free, **options)
+
+
+def coordinate(stiffness, free, **options):
+    return lg.CoordinateForce(hinge(), stiffness=stiffness, free=free, **options)
+
+
+def scene(spring, **rotor):
+    body = lg.RigidBody(1.0, (0.03, 0.03, INERTIA), free="rz", **rotor)
+    return lg.Model({"rotor": body}, {}, {"spring": spring})
+
+
+def unwinding(p, make=torsion):
+    return scene(make(*p, turns=True))
+
+
+def closed_form(p):
+    """θ = θ₀ (1 − cos ωt), ω² = k/J, from rest in the reference configuration."""
+    stiffness, free = p
+    return free * (1.0 - jnp.cos(jnp.sqrt(stiffness / INERTIA) * T1))
+
+
+def end(p, make, steps, **options):
+    found = lg.simulate(unwinding(p, make), t1=T1, num_steps=steps, **options)
+    return found.force("spring")[0][-1]  # the angle
+
+
+MAKERS = [torsion, pytest.param(coordinate, marks=pytest.mark.slow)]  # a minute of compilation each
+INTEGRATORS = {
+    "alpha": lg.GeneralizedAlpha(),
+    "stabilized": lg.GeneralizedAlpha(stabilized=True),
+    "radau": lg.RadauIIA(),
+    "ode": lg.IndexReducedODE(),
+    "adaptive": lg.AdaptiveSteps(tolerance=1e-5),
+}
+
+
+@pytest.mark.parametrize("make", MAKERS)
+def test_a_clock_spring_unwinds(make):
+    p = jnp.array([STIFFNESS, WOUND])
+    coarse, fine = (end(p, make, n) - closed_form(p) for n in (STEPS, 2 * STEPS))
+    np.testing.assert_allclose(coarse / fine, 4.0, rtol=0.02)  # second order; the next term is (ωh)² = 0.0015 of it
+    exact = jax.grad(closed_form)(p)
+    direct = jax.jacfwd(end)(p, make, STEPS)
+    # the frequency is off by (ωh)² = 0.0015 times ½ or less
+    np.testing.assert_allclose(direct, exact, rtol=2e-3)
+    adjoint = jax.grad(end)(p, make, STEPS, sensitivity=lg.AdjointVariable())
+    np.testing.assert_allclose(adjoint, direct, rtol=1e-11)  # round-off of 100 steps
+
+
+@pytest.mark.slow  # a program each
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_whatever_the_integrator(name):
+    p, step = jnp.array([STIFFNESS, WOUND]), 1e-5
+    room = 10 * STEPS if name == "adaptive" else STEPS
+    of = lambda p: end(p, torsion, room, integrator=INTEGRATORS[name])
+    np.testing.assert_allclose(of(p), closed_form(p), rtol=2e-3)
+    if name == "adaptive":  # its steps are not those of the next p
+        return
+    difference = [(of(p + d) - of(p - d)) / (2 * step) for d in step * jnp.eye(2)]
+    np.testing.assert_allclose(
+        jax.grad(of)(p), difference, rtol=1e-6
+    )  # step² of the third derivative, 1e3 of the first
+
+
+@pytest.mark.parametrize("moment", [pytest.param(0.2, marks=pytest.mark.slow), 40.0])
+def test_equilibrium_winds_it_up(moment):
+    """By many turns in one of Newton's steps."""
+    found = lg.equilibrium(scene(torsion(STIFFNESS, 0.0, turns=True, motor=moment)))
+    angle = moment / STIFFNESS
+    np.testing.assert_allclose(found.v[-1], angle, rtol=1e-12)
+    turned = np.arctan2(found.q.orientation[0, 1, 0], found.q.orientation[0, 0, 0])
+    np.testing.assert_allclose(np.sin(turned - angle), 0.0, atol=1e-12 * angle)
+    model = scene(torsion(STIFFNESS, 0.0, turns=True, motor=moment))
+    run = lg.simulate(model, t1=0.1, num_steps=5, state0=found)
+    np.testing.assert_allclose(run.force("spring").moment, 0.0, atol=1e-11 * moment)
+    np.testing.assert_allclose(run.states_of("spring")["angle"], angle, rtol=1e-12)
+
+
+def test_a_spring_that_passes_half_a_turn_has_failed():
+    """ω₀ sin(ωt)/ω comes to π at 0.3 s of 1: later on the spring would push where it pulled."""
+    rate, start = np.sqrt(STIFFNESS / INERTIA), 13.0
+    step = int(np.ceil(np.arcsin(np.pi * rate / start) / rate * STEPS / T1))
+    uncounted = scene(torsion(STIFFNESS, 0.0), angular_velocity=(0.0, 0.0, start))
+    message = says("passes half a turn", "turns=True", f"in step {step} of {STEPS}, t = {step * T1 / STEPS:.6g} s")
+    with pytest.raises(lg.SimulationError, match=message):
+        lg.simulate(uncounted, t1=T1, num_steps=STEPS)
+    for spring in (torsion(STIFFNESS, 0.0, turns=True), torsion(0.0, 0.0, motor=-0.1)):
+        passed = scene(spring, angular_velocity=(0.0, 0.0, start))
+        assert lg.simulate(passed, t1=T1, num_steps=STEPS).result == lg.RESULTS.successful
+
+
+def test_so_it_has_where_no_trajectory_is_kept():
+    build = lambda k: scene(torsion(k, 0.0), angular_velocity=(0.0, 0.0, 13.0))
+    angle = lambda instant: instant.force("spring").angle
+    with pytest.raises(lg.SimulationError, match="passes half a turn"):
+        lg.simulate(build(STIFFNESS), t1=T1, num_steps=STEPS, save=angle)
+    criterion = lg.Criterion(terminal=lambda instant, p: angle(instant))
+    with pytest.raises(lg.SimulationError, match="passes half a turn"):
+        options = {"t1": T1, "num_steps": STEPS, "method": lg.DirectDifferentiation()}
+        lg.differentiate(criterion, build, STIFFNESS, **options)
+
+
+@pytest.mark.slow
+def test_on_a_part_of_a_merged_body():
+    """The same motion as of one body, and the same failure."""
+    whole = scene(coordinate(STIFFNESS, WOUND, turns=True))
+    shaft = lg.RigidBody(0.5, (0.01, 0.01, INERTIA / 2))
+    bodies = {"shaft": shaft, "rotor": lg.RigidBody(0.5, (0.01, 0.01, INERTIA / 2))}
+    joints = {"hinge": hinge("shaft"), "weld": lg.FixedJoint("shaft", "rotor", at=(0.0, 0.0, 0.3))}
+    of_parts = lambda spring: lg.Model(bodies, joints, {"spring": spring}, merge_fixed=True)
+    run = lambda model: lg.simulate(model, t1=T1, num_steps=STEPS)
+    found, expected = (run(model).force("spring").force for model in (of_parts(whole.forces["spring"]), whole))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * STIFFNESS * WOUND)  # Newton's tolerance, 1e-10
+    with pytest.raises(lg.SimulationError, match="passes half a turn"):
+        run(of_parts(coordinate(STIFFNESS, 3.0)))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: torsion(1.0, 0.0, turns=2), "`turns` must be True or False"),
+        (lambda: torsion(1.0, 4.0), "turns=True"),
+        (
+            lambda: lg.CoordinateForce(lg.PrismaticJoint(None, "rotor", at=Z, axis=Z), turns=True),
+            "'displacement' is none",
+        ),
+    ],
+)
+def test_what_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
