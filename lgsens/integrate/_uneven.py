@@ -37,7 +37,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._validate import as_float, is_concrete, require, require_setting
 from lgsens._xla import alike, scan, while_loop
-from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk, unsteady_rate
+from lgsens.dynamics import RESULTS, AbstractSystem, State, acceleration_and_jerk, unsteady_rate
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
 from lgsens.integrate._grid import UnevenGrid, with_first
 from lgsens.integrate._lanes import in_any_lane
@@ -87,12 +87,19 @@ class GivenSteps(AbstractIntegrator):
     def of(cls, trajectory: Any, integrator: AbstractScheme = GeneralizedAlpha()) -> "GivenSteps":
         """The steps of a trajectory; those of size 0 are left out, unless it is traced.
 
-        Raises `ValueError` for a batch of trajectories, each of which has its own: `jax.vmap` this.
+        Raises `ValueError` for a trajectory that has failed, and for a batch, each of which has its own: `jax.vmap`
+        this.
         """
         if jnp.ndim(trajectory.t) != 1:
             raise ValueError(
                 f"GivenSteps.of: this is a batch of trajectories, of shape {jnp.shape(trajectory.t)[:-1]}; each has "
                 "steps of its own: jax.vmap(GivenSteps.of)(trajectories), for simulations under `vmap`."
+            )
+        result = getattr(trajectory, "result", None)
+        if is_concrete(result) and result is not None and int(result) != RESULTS.successful:
+            raise ValueError(
+                f"GivenSteps.of: the trajectory has failed, and its steps are not those of the whole interval. "
+                f"{RESULTS(int(result)).message}"
             )
         sizes = lax.stop_gradient(jnp.diff(trajectory.t))
         if is_concrete(sizes):

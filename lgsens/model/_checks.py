@@ -9,7 +9,8 @@ seven principal minors are not negative.
 """
 
 import dataclasses
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, get_args
 
 import equinox as eqx
 import jax
@@ -19,7 +20,37 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float, is_float_array, leaf_name
+from lgsens._validate import as_float, is_concrete, is_float_array, leaf_name
+
+_ALIGNED = 1e-2  # rad: a turn about axes further apart is none about either
+
+
+def check_axes(bodies: Mapping[str, Any], joints: Mapping[str, Any], forces: Mapping[str, Any]) -> None:
+    """Raise `ValueError` for a driver or spring about another axis than that about which its bodies turn, as far as
+    their hinge or the rotations that they have tell, and numbers are known."""
+    ends_of = {name: (joint.a, joint.b) for name, joint in joints.items()}
+    hinges = {frozenset(ends_of[name]): name for name, joint in joints.items() if joint.hinge is not None}
+    for what, members in (("Joint", joints), ("Force", forces)):
+        for name, member in members.items():
+            if member.about is None:
+                continue
+            pair = ends_of[name] if what == "Joint" else member.bodies
+            ends = frozenset(pair)
+            hinge = hinges.get(ends)
+            axis = None if hinge is None else joints[hinge].hinge
+            turning = {"xyz".index(free[1]) for end in ends - {None} for free in bodies[end].free if free[0] == "r"}
+            where = f"as their joint {hinge!r} lets them"
+            if axis is None and len(turning) == 1:
+                axis, where = np.eye(3)[turning.pop()], "as their `free` rotations let them"
+            if axis is None or not is_concrete(axis, member.about):
+                continue
+            one, other = (np.asarray(each) / np.linalg.norm(each) for each in (axis, member.about))
+            if np.linalg.norm(np.cross(one, other)) > _ALIGNED:
+                raise ValueError(
+                    f"{what} {name!r}: {type(member).__name__} between {pair[0]!r} and {pair[1]!r} about "
+                    f"{np.asarray(member.about)}, but these turn about {np.asarray(axis)} only, {where}; give it that "
+                    "axis."
+                )
 
 
 def strong(element: Any) -> Any:
@@ -58,6 +89,11 @@ def _check_again(module: eqx.Module) -> None:
     """The checks of the constructors of a module and of those in it: shapes first."""
     for field in dataclasses.fields(module):
         shape, value = field.metadata.get("shape"), getattr(module, field.name)
+        if value is None and not field.metadata.get("static") and type(None) not in get_args(field.type):
+            raise ValueError(
+                f"`{field.name}` is None where a number belongs; of a model that `eqx.partition` has divided "
+                "`eqx.combine` makes one again."
+            )
         if shape is not None and value is not None and value.shape != shape:
             raise ValueError(
                 f"`{field.name}` must have shape {shape}, got shape {value.shape}; for many models at once jax.vmap "

@@ -169,6 +169,10 @@ class _AbstractAlong(AbstractForce):
     def bodies(self):
         return (self.along.a, self.along.b)
 
+    @property
+    def about(self):
+        return self.along.about
+
     @abc.abstractmethod
     def _load(self, along: AbstractConstraint) -> AbstractLoad | AbstractDynamicLoad:
         """The load, given the equation of the driver."""

@@ -15,12 +15,20 @@ from lgsens._validate import as_count, as_float, number_field, point_field, requ
 from lgsens.liegroups import SO3, skew, turn_back
 from lgsens.model._constraints import AbstractClosedFormConstraint
 from lgsens.model._forces import AbstractConnection, AbstractForce, Attached, _frame
-from lgsens.model._frames import BODY_DIM, ROTATION, TURNING_A, TURNING_B, Frame
+from lgsens.model._frames import BODY_DIM, Frame
 from lgsens.model._joints import AbstractJoint
-from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, LoadTangents
+from lgsens.model._loads import AbstractClosedFormLoad, LoadTangents
 from lgsens.model._relative import Coordinate
 from lgsens.model._signals import Prescribed, at_time, prepared, prescribed_field
-from lgsens.model._turns import CountedTurns, acting, branch_of, force_along
+from lgsens.model._turning_loads import BallLoad
+from lgsens.model._turns import (
+    CountedTurns,
+    acting,
+    branch_of,
+    force_along,
+    require_half_a_turn,
+    within_half_a_turn,
+)
 
 
 def _seen(a: Frame, b: Frame, on_a: Frame, on_b: Frame) -> Frame:
@@ -89,7 +97,8 @@ class CoordinateLoad(AbstractClosedFormLoad):
     drawn = None
 
     def value(self, a, b):
-        return _row(lambda a, b: self.coordinate.of(_seen(a, b, self.on_a, self.on_b)), (a, b))
+        s, row = _row(lambda a, b: self.coordinate.of(_seen(a, b, self.on_a, self.on_b)), (a, b))
+        return (within_half_a_turn(s, self.free) if self.coordinate.periodic else s), row
 
     def along(self, s, rate, t) -> CoordinateMeasure:
         force = -self.stiffness * (s - self.free) - self.damping * rate
@@ -129,7 +138,7 @@ class CoordinateForce(AbstractForce):
         free: s₀ [m or rad], at which the spring is free, shape ().
         motor: M(t) [N or N m], a number, shape (), or a signal; None: no motor.
         turns: whether an angle is counted over whole turns, by a state "angle" (`Trajectory.states_of`), static. Else
-            it is within half a turn of 0, where the force of a spring jumps, and a motion that comes there has failed.
+            it is within half a turn of s₀, where the force of a spring jumps; a motion that comes there has failed.
 
     `Trajectory.force` gives the coordinate, its rate, and f. Raises `ValueError` for a joint without the coordinate,
     for `turns` of one that is no angle, and for wrong shapes. Source: in minimal coordinates the spring, damper and
@@ -149,6 +158,8 @@ class CoordinateForce(AbstractForce):
         require_setting(self, "turns", isinstance(self.turns, bool), "True or False")
         if self.turns and not found.periodic:
             raise ValueError(f"CoordinateForce: `turns` are those of an angle; {found.name!r} is none. Leave it out.")
+        if found.periodic and not self.turns:
+            require_half_a_turn("CoordinateForce", "free", self.free)
 
     @property
     def bodies(self):
@@ -160,32 +171,6 @@ class CoordinateForce(AbstractForce):
         coordinate = _coordinate("CoordinateForce", self.joint, self.coordinate)
         load = CoordinateLoad(*ends, self.stiffness, self.damping, self.free, motor, coordinate)
         return (Attached(CountedTurns(load) if self.turns else load, *self.bodies),)
-
-
-class BallLoad(AbstractLoad):
-    """The moment −k φ − c ω on b, its opposite on a: φ the rotation vector of b in a, ω their relative velocity.
-
-    With S = (R_a T_a)ᵀ R_b T_b = exp(φ̃), φ is along the same axis for both; the moment −k φ has the energy ½ k |φ|².
-    """
-
-    triad_a: Float[Array, "3 3"]
-    triad_b: Float[Array, "3 3"]
-    stiffness: Float[Array, ""]
-    damping: Float[Array, ""]
-
-    balanced = True
-    drawn = None
-
-    @property
-    def acts_on(self):
-        return TURNING_A + TURNING_B
-
-    def force(self, a, b, va, vb, t):
-        axes_a, axes_b = a.orientation @ self.triad_a, b.orientation @ self.triad_b
-        phi = axes_a @ SO3().log(axes_a.T @ axes_b)
-        moment = self.stiffness * phi + self.damping * (b.axis(vb[ROTATION]) - a.axis(va[ROTATION]))
-        zero = jnp.zeros_like(moment)
-        return jnp.concatenate([zero, a.local_axis(moment), zero, -b.local_axis(moment)])
 
 
 class RotationalSpringDamper(AbstractConnection):

@@ -113,6 +113,10 @@ class RotationDriver(AbstractJoint):
     coordinates = (ANGLE,)
 
     @property
+    def about(self):
+        return self.axis
+
+    @property
     def frames(self):
         anywhere = jnp.zeros_like(self.axis)  # it transmits no force
         return frames_along(anywhere, anywhere, self.axis)

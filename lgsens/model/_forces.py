@@ -63,6 +63,11 @@ class AbstractForce(eqx.Module):
     def bodies(self) -> tuple[str | None, ...]:
         """The bodies that it names; None is the ground."""
 
+    @property
+    def about(self) -> Float[Array, "3"] | None:
+        """The axis of the turn that it resists, inertial frame, that of the hinge between its bodies; None: of none."""
+        return None
+
     def with_preload(self, preload) -> "AbstractForce":
         """The same element with this preload in the reference configuration."""
         return dataclasses.replace(self, preload=preload)

@@ -77,6 +77,12 @@ class AbstractJoint(eqx.Module):
         Of bodies with one rotation it must be that of the rotation."""
         return None
 
+    @property
+    def about(self) -> Float[Array, "3"] | None:
+        """The axis about which it prescribes a turn, inertial frame, that of the hinge between its bodies; None: it
+        prescribes none."""
+        return None
+
     def violable(self, constraints: Sequence[AbstractRows], free: Set[str]) -> Sequence[tuple[bool, ...]]:
         """Which equations of each of its constraints its bodies could violate, as in `AbstractConstraint.violable`."""
         return [constraint.violable(free) for constraint in constraints]

@@ -17,7 +17,7 @@ from lgsens.linear import AbstractLinearSolver, BlockSparse
 from lgsens.model._assemble import assemble, assemble_merged
 from lgsens.model._beam_sections import BeamSection
 from lgsens.model._body import RigidBody
-from lgsens.model._checks import checked, far_from_rotation, is_inertia, strong
+from lgsens.model._checks import check_axes, checked, far_from_rotation, is_inertia, strong
 from lgsens.model._evaluate_by_kind import stacked, unstacked
 from lgsens.model._flexible import flexible
 from lgsens.model._forces import AbstractForce
@@ -122,6 +122,7 @@ class Model(eqx.Module):
             )
         if not self.bodies:
             raise ValueError("Model: `bodies` is empty; a scene needs at least one RigidBody.")
+        homes = {"bodies": RigidBody, "joints": AbstractJoint, "forces": AbstractForce}
         for what, kind, members in (
             ("Body", RigidBody, self.bodies),
             ("Joint", AbstractJoint, self.joints),
@@ -129,7 +130,11 @@ class Model(eqx.Module):
         ):
             for name, member in members.items():
                 if not isinstance(member, kind):
-                    raise ValueError(f"{what} {name!r} must be a {kind.__name__}, got {type(member).__name__}.")
+                    into = next((into for into, of in homes.items() if isinstance(member, of)), None)
+                    advice = "" if into is None else f"; put it into `{into}`"
+                    raise ValueError(
+                        f"{what} {name!r} must be of type {kind.__name__}, got {type(member).__name__}{advice}."
+                    )
                 if names := [leaf for leaf in jax.tree.leaves(member) if isinstance(leaf, str)]:
                     raise ValueError(
                         f"{what} {name!r}: {type(member).__name__} has names among its numbers, {names}; declare their "
@@ -143,6 +148,7 @@ class Model(eqx.Module):
         for name, force in self.forces.items():
             _check_connection(f"Force {name!r}", force.on(self.joints).bodies, self.bodies)
         self._check_duplicates()
+        check_axes(self.bodies, self.joints, self.forces)
         if self._groups is not None and all(group.name is None for group in self._groups):
             raise ValueError("Model: fixed joints hold all bodies on the ground; let at least one of them move.")
         if redundant == "remove":
@@ -298,7 +304,7 @@ class Model(eqx.Module):
 def _check_connection(what: str, ends: tuple[str | None, ...], bodies: Mapping[str, RigidBody]) -> None:
     for end in ends:
         if end is not None and end not in bodies:
-            raise ValueError(f"{what} refers to body {end!r}; the bodies are {sorted(bodies)}.")
+            raise ValueError(f"{what} refers to body {end!r}; the bodies are {sorted(bodies)}, and None is the ground.")
     if len(ends) == 2 and ends[0] == ends[1]:
         where = "the ground" if ends[0] is None else f"body {ends[0]!r}"
         raise ValueError(f"{what} connects {where} to itself; name two different bodies.")

@@ -99,6 +99,9 @@ class SE3System(AbstractRedundantSystem):
     def is_valid(self):
         return self.bodies.is_valid()
 
+    def is_configuration(self, q):
+        return self.bodies.is_configuration(q)
+
     @property
     def compliance(self):
         return self.bodies.compliance

@@ -14,7 +14,7 @@ from lgsens._validate import suggestion
 from lgsens.dynamics import AbstractRedundantSystem, AbstractSparseSystem, Tangents, finite, least_norm
 from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew, turn
 from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, chosen
-from lgsens.model._checks import are_bodies
+from lgsens.model._checks import are_bodies, far_from_rotation
 from lgsens.model._constraints import AbstractRows
 from lgsens.model._frames import BODY_DIM, ROTATION, motion_at
 from lgsens.model._loads import AbstractDynamicLoad, AbstractLoad, generalized_force
@@ -165,6 +165,9 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     def is_valid(self):
         known = finite(self.pose, self.velocity, self.constraints, self.loads)
         return known & are_bodies(self.mass, self.inertia, self.pose.orientation)
+
+    def is_configuration(self, q):
+        return ~jnp.any(far_from_rotation(q.orientation, 1e-3))
 
     def reference(self):
         return self.pose, self.velocity

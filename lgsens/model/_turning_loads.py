@@ -189,6 +189,32 @@ class RotationLoad(AbstractClosedFormLoad):
         return LoadTangents(-gradient.T @ position - geometric, -gradient.T @ by_rate @ by_turns)
 
 
+class BallLoad(AbstractLoad):
+    """The moment −k φ − c ω on b, its opposite on a: φ the rotation vector of b in a, ω their relative velocity.
+
+    With S = (R_a T_a)ᵀ R_b T_b = exp(φ̃), φ is along the same axis for both; the moment −k φ has the energy ½ k |φ|².
+    """
+
+    triad_a: Float[Array, "3 3"]
+    triad_b: Float[Array, "3 3"]
+    stiffness: Float[Array, ""]
+    damping: Float[Array, ""]
+
+    balanced = True
+    drawn = None
+
+    @property
+    def acts_on(self):
+        return TURNING_A + TURNING_B
+
+    def force(self, a, b, va, vb, t):
+        axes_a, axes_b = a.orientation @ self.triad_a, b.orientation @ self.triad_b
+        phi = axes_a @ SO3().log(axes_a.T @ axes_b)
+        moment = self.stiffness * phi + self.damping * (b.axis(vb[ROTATION]) - a.axis(va[ROTATION]))
+        zero = jnp.zeros_like(moment)
+        return jnp.concatenate([zero, a.local_axis(moment), zero, -b.local_axis(moment)])
+
+
 class LoadSum(AbstractClosedFormLoad):
     """Several loads at one place, as one; what is fixed to bodies and drawn is of the first."""
 

@@ -12,8 +12,10 @@ The second term takes out what a scheme loses in z over many turns, and makes z 
 from typing import Any, Protocol
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from lgsens._validate import require
 from lgsens.model._frames import Frame
 from lgsens.model._loads import AbstractDynamicLoad
 
@@ -40,7 +42,7 @@ def acting(load: AlongCoordinate, a: Frame, b: Frame, va, vb, t, z=None) -> tupl
     s, row = load.value(a, b)
     rate = jnp.sum(row * jnp.concatenate([va, vb]))
     if z is not None:
-        s += _TURN * jnp.round((z - s) / _TURN)
+        s = within_half_a_turn(s, z)
     return load.along(s, rate, t), row
 
 
@@ -53,6 +55,21 @@ def force_along(load: AlongCoordinate, a: Frame, b: Frame, va, vb, t, z=None) ->
 def branch_of(load: AlongCoordinate, a: Frame, b: Frame) -> Float[Array, ""]:
     """The angle of a load that jumps with it (`AbstractElement.branch`); 0 where none does, without a spring."""
     return jnp.where(load.stiffness == 0.0, 0.0, load.value(a, b)[0])
+
+
+def within_half_a_turn(s: Float[Array, ""], of: Float[Array, ""]) -> Float[Array, ""]:
+    """An angle, or that and whole turns, within half a turn of another one."""
+    return s - _TURN * jnp.round((s - of) / _TURN)
+
+
+def require_half_a_turn(what: str, name: str, free: Float[Array, ""]) -> None:
+    """Raise `ValueError` for a spring that is free where it is not before its bodies have turned."""
+    require(
+        lambda angle: abs(angle) <= np.pi,
+        f"{what}: `{name}` must be within half a turn, as its angle is, got {free} rad (not degrees); a spring that is "
+        "wound up further counts whole turns, `turns=True`.",
+        free,
+    )
 
 
 class CountedTurns(AbstractDynamicLoad):
@@ -83,4 +100,4 @@ class CountedTurns(AbstractDynamicLoad):
 
     def initial(self, a, b, va, vb, t):
         s, _ = self.of.value(a, b)
-        return (s - _TURN * jnp.round(s / _TURN))[None]
+        return within_half_a_turn(s, jnp.zeros_like(s))[None]

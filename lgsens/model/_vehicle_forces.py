@@ -4,7 +4,6 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import (
@@ -22,7 +21,7 @@ from lgsens.model._forces import AbstractConnection, AbstractForce, Attached, _d
 from lgsens.model._frames import normals
 from lgsens.model._signals import AbstractSignal, Prescribed, prepared, prescribed_field
 from lgsens.model._turning_loads import DragLoad, TorsionLoad
-from lgsens.model._turns import CountedTurns
+from lgsens.model._turns import CountedTurns, require_half_a_turn
 
 
 def _torsion(a, b, force, stiffness, free_angle=None, preload=None, motor=None) -> TorsionLoad:
@@ -73,12 +72,11 @@ class TorsionSpringDamper(AbstractConnection):
                 "(preload = −stiffness · free_angle)."
             )
         if self.free_angle is not None and not self.turns:
-            require(
-                lambda angle: abs(angle) <= np.pi,
-                f"TorsionSpringDamper: `free_angle` must be within half a turn, as its angle is, got {self.free_angle} "
-                "rad; a spring that is wound up further counts whole turns, `turns=True`.",
-                self.free_angle,
-            )
+            require_half_a_turn("TorsionSpringDamper", "free_angle", self.free_angle)
+
+    @property
+    def about(self):
+        return self.axis
 
     preload_shape = ()
 
@@ -131,6 +129,10 @@ class AntiRollBar(AbstractConnection):
             self.length,
             self.shear_modulus,
         )
+
+    @property
+    def about(self):
+        return self.axis
 
     def load(self, a, b):
         section = jnp.pi * (self.diameter**4 - self.bore**4) / 32.0

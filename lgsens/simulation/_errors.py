@@ -47,8 +47,8 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
     step, num_steps = int(details.get("step", 0)), int(details.get("num_steps", 0))
     place, time = f"step {step} of {num_steps}", f"t = {details.get('time', 0.0):.6g} s"
     violation, worst = np.abs(details.get("violation", ())), ""
-    if violation.size:
-        i = int(np.argmax(np.where(np.isfinite(violation), violation, np.inf)))
+    if violation.size and np.all(np.isfinite(violation)):
+        i = int(np.argmax(violation))
         worst = f"Left over: |Φ| = {violation[i]:.3g}, largest in joint {names[i]!r}."
     match code:
         case RESULTS.assembly_failed | RESULTS.off_joints:
@@ -103,7 +103,6 @@ def _exception(result: int, details: dict[str, Any], names: tuple[str, ...], not
         RESULTS.not_held,
     )
     kind = ValueError if result in bad_input else SimulationError
-    note = note if result == RESULTS.redundant_constraints else ""
     return kind(f"{note} {_describe(result, details, names)}".strip())
 
 
@@ -116,20 +115,22 @@ def throw_if_failed(tree: Any, result: Any, details: dict[str, Any], names: tupl
     runs only in the failing branch (under `vmap`, always, and names the first lane that failed).
     """
 
+    noted = lambda code: note if code == RESULTS.redundant_constraints else ""
+
     def host(result, details) -> np.ndarray:
         codes = np.asarray(result)
         failed = np.argwhere(codes != RESULTS.successful)
         if len(failed):  # not its size: a scalar that has failed has an index of no entries
             lane = tuple(failed[0])
             message_details = jax.tree.map(lambda value: np.asarray(value)[lane], details)
-            raise _exception(int(codes[lane]), message_details, names, note)
+            raise _exception(int(codes[lane]), message_details, names, noted(int(codes[lane])))
         return np.ones(codes.shape, bool)
 
     if not isinstance(result, Tracer):
         # Details may be traced (by grad) where the result is not; their values are all that is needed.
         if int(result) != RESULTS.successful:
             values = jax.tree.map(lambda value: np.asarray(primal_value(value)), details)
-            raise _exception(int(result), values, names, note)
+            raise _exception(int(result), values, names, noted(int(result)))
         return tree
 
     passed = result == RESULTS.successful
@@ -169,6 +170,7 @@ def raise_if_failed(found: Any) -> Any:
         return found
     lane = tuple(failed[0])
     code = int(codes[lane])
+    of_batch = f"{len(failed)} of {codes.size} runs failed, the first at {list(map(int, lane))}." if lane else ""
     one = lambda name: jax.tree.map(lambda leaf: jnp.asarray(leaf)[lane], getattr(found, name, None))
     system, stats = one("system"), one("stats")
     t: Any = jax.tree.map(jnp.atleast_1d, one("t"))
@@ -187,7 +189,7 @@ def raise_if_failed(found: Any) -> Any:
         )
     elif code in (RESULTS.newton_failed, RESULTS.integration_failed, RESULTS.singular_configuration):
         details = _of_steps(code, t, stats)
-    raise _exception(code, details, () if system is None else system.constraint_names, "")
+    raise _exception(code, details, () if system is None else system.constraint_names, of_batch)
 
 
 def _of_steps(code: int, t, stats: Any) -> dict[str, Any]:

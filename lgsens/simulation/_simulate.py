@@ -98,7 +98,8 @@ def simulate(
             transformation; `AdjointVariable` is reverse mode, and forward over it (`jax.hessian`); `AssociativeScan`
             takes all steps at once, for accelerators.
         state0: the state at t0, used as it is: one of `equilibrium`, or `Trajectory.state` to continue. Off its joints
-            by more than a thousandth of the scene it is refused, inside `jit` by the result `off_joints`. None: the
+            by more than a thousandth of the scene, or with velocities that these forbid, it is refused, inside `jit` by
+            the result `off_joints`; with orientations that are no rotations, too (`invalid_numbers`). None: the
             consistent initial state of the model, from which the scheme begins with its own corrections. A given state
             has none: with `initial_state(model)` accelerations and multipliers of the first steps are of first order.
             For second order leave it out and put initial velocities into the model, or continue from
@@ -114,7 +115,7 @@ def simulate(
             to see the shortest event (the bump of a road). Derivatives go through the last run.
         throw: raise if the simulation fails; inside `jit` and `vmap`, where nothing can be raised, all data are NaN and
             `Trajectory.result` says why (`raise_if_failed`). With False it says so, and the data are finite up to the
-            failure and NaN from there on.
+            step that failed and NaN from there on; of `AdaptiveSteps` that ran out of steps they end before t1.
 
     The derivative of the trajectory with respect to every number of the model, the initial state and the
     times is that of the numerical solution, to round-off.

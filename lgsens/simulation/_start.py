@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._validate import as_float, is_concrete
 from lgsens._xla import alike
@@ -17,6 +17,7 @@ from lgsens.dynamics import (
     Initial,
     State,
     constraint_jacobian,
+    constraint_velocity,
     equilibrium as _equilibrium,
     finite,
     full_jacobian,
@@ -101,29 +102,69 @@ def check_state0(system: AbstractSystem, state0: State | None, t0) -> None:
     if not is_concrete(known):
         _as_state(system, state0)
         return
-    violation, least = map(np.asarray, _violation_jit(*known))
-    if violation.size and np.max(np.abs(violation)) > least:
-        i = np.argmax(np.abs(violation))
+    off = jax.tree.map(np.asarray, _off_jit(*known))
+    time = f"t0 = {float(known[2]):.6g} s"
+    if not off.known:
         raise ValueError(
-            f"`state0` does not satisfy the joints at t0 = {float(known[2]):.6g} s: |Φ| = {abs(violation[i]):.3g}, "
-            f"largest in joint {system.constraint_names[i]!r}. Give a state of this model at this time: "
-            "`initial_state(model, t0=t0)`, `equilibrium(model, t0=t0)`, or `trajectory.state(-1)` with t0 = "
-            "trajectory.t[-1]."
+            "`state0` is no configuration: the orientation of a body is not a rotation matrix, as a mean of several is "
+            "none. Give a state of this model, `initial_state(model)` or `trajectory.state(i)`."
         )
+    for values, most, what, advice in (
+        (off.positions, off.most_position, "|Φ|", ""),
+        (
+            off.velocities,
+            off.most_velocity,
+            "|Φ̇|",
+            " Velocities of your own belong into the model, which projects them on those that the joints allow: "
+            "`RigidBody(velocity=…, angular_velocity=…)`.",
+        ),
+    ):
+        beyond = np.abs(values) - most
+        if np.max(beyond, initial=0.0) > 0.0:
+            i = int(np.argmax(beyond))
+            raise ValueError(
+                f"`state0` does not satisfy the joints at {time}: {what} = {abs(values[i]):.3g}, largest in joint "
+                f"{system.constraint_names[i]!r}. Give a state of this model at this time: `initial_state(model, "
+                "t0=t0)`, `equilibrium(model, t0=t0)`, or `trajectory.state(-1)` with t0 = trajectory.t[-1]." + advice
+            )
+
+
+class _Off(NamedTuple):
+    """Φ and c = [B v + Φ_t; A v + b] of a state, what no step leaves of them, and whether q is a configuration.
+
+    Rows are lengths or sines of angles: of Φ a thousandth of the scene, or of 1 in a larger one. Loose tolerances and
+    drift leave less, and so does a state written with four digits. In index 3 B v is −h² B c (`GeneralizedAlpha`), some
+    hundredths of v at six steps in a period and ρ∞ = 0.9: of c a tenth of the sum of its terms, a hundredth of the
+    largest such sum, and what of Φ in a second.
+    """
+
+    positions: Float[Array, " m_p"]
+    most_position: Float[Array, ""]
+    velocities: Float[Array, " m"]
+    most_velocity: Float[Array, " m"]
+    known: Bool[Array, ""]
+
+    @classmethod
+    def of(cls, system: AbstractSystem, state0: State, t0, jacobian: Matrix) -> "_Off":
+        scale = system.coordinate_scale()
+        least = 1e-3 * jnp.min(scale[: scale.shape[0] - system.num_states], initial=1.0)
+        velocities = constraint_velocity(system, state0.q, state0.v, t0)
+        size: Any = jax.tree.map(jnp.abs, jacobian)
+        terms = size @ jnp.abs(state0.v) + jnp.abs(velocities - jacobian @ state0.v)
+        most = 0.1 * terms + 0.01 * jnp.max(terms, initial=0.0) + least
+        positions = system.constraint(state0.q, t0)
+        return cls(positions, least, velocities, most, system.is_configuration(state0.q))
+
+    @property
+    def on_joints(self) -> Bool[Array, ""]:
+        off = jnp.any(jnp.abs(self.positions) > self.most_position)
+        return ~(off | jnp.any(jnp.abs(self.velocities) > self.most_velocity))
 
 
 @eqx.filter_jit
-def _violation_jit(system: AbstractSystem, state0: State, t0):
-    return _violation(system, _as_state(system, state0), t0)
-
-
-def _violation(system: AbstractSystem, state0: State, t0):
-    """Φ, and a violation that no step leaves. Rows are lengths or sines of angles, so that is a thousandth of the
-    scene, or of 1 in a larger one: loose tolerances and drift leave less, and so does a state written with four digits.
-    """
-    scale = system.coordinate_scale()
-    of_bodies = scale[: scale.shape[0] - system.num_states]
-    return system.constraint(state0.q, t0), 1e-3 * jnp.min(of_bodies, initial=1.0)
+def _off_jit(system: AbstractSystem, state0: State, t0) -> _Off:
+    state0 = _as_state(system, state0)
+    return _Off.of(system, state0, t0, constraint_jacobian(system, state0.q, t0))
 
 
 def _as_state(system: AbstractSystem, state0: Any) -> State:
@@ -169,13 +210,13 @@ def begin(
     if state0 is not None:
         state0 = _as_state(system, state0)
         jacobian, start = constraint_jacobian(system, state0.q, t0), scheme.resumed(system, state0, t0)
-        violation, most = _violation(system, state0, t0)
-        on_joints = ~jnp.any(jnp.abs(violation) > most)
-        start = Start(jax.tree.map(lambda leaf: jnp.where(on_joints, leaf, jnp.nan), start))
-        valid = system.is_valid() & finite(state0)
-        result = jnp.where(on_joints, RESULTS.successful, RESULTS.off_joints)
+        off = jax.lax.stop_gradient(_Off.of(system, state0, t0, jacobian))
+        valid = system.is_valid() & finite(state0) & off.known
+        result = jnp.where(off.on_joints, RESULTS.successful, RESULTS.off_joints)
         result = jnp.where(valid, result, RESULTS.invalid_numbers).astype(jnp.int32)
-        return Begin(start, state0.v, result, violation, jacobian)
+        usable = result == RESULTS.successful
+        start = Start(jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), start))
+        return Begin(start, state0.v, result, off.positions, jacobian)
     initial = _initial(system, t0) if initial is None else initial
     usable = initial.result == RESULTS.successful
     start = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), scheme.start(system, initial, t0))

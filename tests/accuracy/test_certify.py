@@ -83,8 +83,8 @@ def pushed(p):
 
 def test_a_kink_inside_of_a_step_is_found():
     trajectory = lg.simulate(pushed(1.0), t1=1.0, num_steps=100)
-    ((t, body, forces),) = kinks(trajectory, eqx.filter_jit(roughness)(trajectory))
-    assert body == "mass"
+    ((t, body, forces, jump),) = kinks(trajectory, eqx.filter_jit(roughness)(trajectory))
+    assert body == "mass" and not jump
     assert forces == ("push",)  # not the spring
     assert t - 0.01 <= 0.5037 <= t
 
@@ -96,6 +96,46 @@ def test_a_certificate_names_the_kink():
     assert not found.good
     assert "have a kink" in str(found)
     assert "'push'" in str(found)
+
+
+class Switched(lg.model.AbstractLoad):
+    """A force of 3 N on b along z that ends where b has come to 0.05 m."""
+
+    drawn = None
+
+    def force(self, a, b, va, vb, t):
+        return jnp.zeros(12).at[8].set(jnp.where(b.position[2] < 0.05, 3.0, 0.0))
+
+
+class Switch(lg.model.AbstractForce):
+    bodies = ("mass",)
+
+    def loads(self, bodies):
+        return (lg.model.Attached(Switched(), None, "mass"),)
+
+
+def switched(mass):
+    """It is thrown to 0.05 m in √(0.1 m/3) s, and flies on with √(0.3/m)."""
+    return lg.Model({"mass": lg.RigidBody(mass=mass, inertia=None, free="z")}, {}, {"switch": Switch()})
+
+
+def test_a_jump_is_told_from_a_kink():
+    trajectory = lg.simulate(switched(1.0), t1=0.5, num_steps=100)
+    ((t, body, forces, jump),) = kinks(trajectory, eqx.filter_jit(roughness)(trajectory))
+    assert (body, forces, jump) == ("mass", ("switch",), True)
+    at = np.sqrt(0.1 / 3.0)
+    assert t - 0.005 <= at <= t + 0.005  # the numerical motion is as late as a step
+
+
+@pytest.mark.slow
+def test_a_gradient_across_a_jump_is_not_called_good():
+    """Its sign is right here and its size is not: z(T) = 0.05 + √(0.3/m) (T − √(0.1 m/3))."""
+    found = certify(HEIGHT, switched, 1.0, t1=0.5, num_steps=2000)
+    exact = jax.grad(lambda m: 0.05 + jnp.sqrt(0.3 / m) * (0.5 - jnp.sqrt(0.1 * m / 3.0)))(1.0)
+    assert abs(found.gradient / exact - 1.0) > 0.1
+    assert max(found.relative) < 1e-2  # the estimates do not see it
+    assert not found.good
+    assert "accelerations jump" in str(found) and "'switch'" in str(found)
 
 
 def smoothly(p):
