@@ -57,7 +57,7 @@ def columns(argument: str, given: Mapping[str, Any], known: Collection[str], wha
     """Values by name, in sorted order; `what` the known names are."""
     for name in given:
         if not known:
-            raise ValueError(f"`{argument}`: {name!r} is unknown, as it holds none of {what}; add one.")
+            raise ValueError(f"`{argument}`: {name!r} is not one of {what}: there are none, add one.")
         if name not in known:
             raise ValueError(f"`{argument}`: {suggestion(name, known)}, {what}.")
     return {name: as_float(given[name], None, f"`{argument}[{name!r}]`") for name in sorted(given)}

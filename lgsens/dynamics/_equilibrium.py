@@ -50,6 +50,8 @@ class _Search(NamedTuple):
     path: Float[Array, ""]  # the sum of the largest motions of all steps
     iteration: Int[Array, ""]
     done: Bool[Array, ""]
+    refined: Bool[Array, ""]  # by one step more
+    stiffest: Float[Array, ""]  # of the last matrix
 
 
 def equilibrium(system: AbstractSystem, t) -> Initial:
@@ -99,10 +101,10 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
     largest = lambda z: jnp.max(jnp.abs(z[k:]), initial=0.0)
     stiffest = lambda slope: jnp.max(jnp.sum(jnp.abs(slope[:k, :k]), axis=1), initial=0.0)
 
-    def balanced(z, left, slope):
+    def balanced(z, left, stiffest):
         """To √eps of the largest joint force or moment, taken as mass scale × 1 m/s² at least; and to what stiff forces
         make of round-off of a place, 16 eps of 1 rad or the length of the scene: EA eps of a beam is more."""
-        return jnp.max(jnp.abs(left)) <= jnp.sqrt(eps) * (1.0 + largest(z)) + 16.0 * eps * stiffest(slope)
+        return jnp.max(jnp.abs(left)) <= jnp.sqrt(eps) * (1.0 + largest(z)) + 16.0 * eps * stiffest
 
     def shortest(slope, right, solve):
         """The shortest solution, by `solve` of scaled rows and columns: constraints by the root of the stiffest. Of a
@@ -130,31 +132,32 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
             # At most 0.2 rad or a fifth of the scene at a time.
             z = z - step * jnp.minimum(1.0, 0.2 / jnp.maximum(moved, 0.2))
             left, count = equation(z), carry.iteration + 1
-            done = (size <= jnp.sqrt(eps)) & balanced(z, left, slope)
+            done = carry.done | ((size <= jnp.sqrt(eps)) & balanced(z, left, stiffest(slope)))
             path = carry.path + jnp.minimum(moved, 0.2)
             stuck = (size <= jnp.sqrt(eps)) | (path > _FAR) | (count >= _MAX_ITERATIONS)
             lost = (mu == 0.0) & ~done & stuck
             again = lambda first, new: jnp.where(lost, first, new)
             mu = again(jnp.max(jnp.abs(left_first)) / _STRIDE, mu * jnp.clip(moved / _STRIDE, 0.5, 4.0))
-            return _Search(again(begin, z), again(left_first, left), mu, path, count, done)
+            mu = jnp.where(done, 0.0, mu)
+            # Newton is quadratic: one step from √eps is at round-off. In the loop, where its matrix is compiled anyway.
+            return _Search(again(begin, z), again(left_first, left), mu, path, count, done, carry.done, stiffest(slope))
 
         def unfinished(carry: _Search):
-            return ~carry.done & (carry.iteration < _MAX_ITERATIONS + _MAX_SINKING)
+            return ~carry.refined & (carry.iteration < _MAX_ITERATIONS + _MAX_SINKING)
 
-        none = jnp.zeros((), dtype)
-        start = _Search(begin, left_first, none, none, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
+        none, never = jnp.zeros((), dtype), jnp.zeros((), bool)
+        start = _Search(begin, left_first, none, none, jnp.zeros((), jnp.int32), never, never, none)
         found = while_loop(unfinished, body, start)
-        # Newton is quadratic: one step from √eps is at round-off.
-        return found.z - shortest(matrix(found.z), found.left, least_squares)
+        return found.z, found.stiffest
 
     def tangent_solve(linear, rhs):
         slope = jax.jacfwd(linear)(jnp.zeros_like(rhs))
         return shortest(slope, rhs, lambda slope, rhs: jnp.linalg.pinv(slope, rtol=1e3 * eps) @ rhs)
 
-    z = lax.custom_root(equation, jnp.zeros(k + m, dtype), newton, tangent_solve)
+    z, stiff = lax.custom_root(equation, jnp.zeros(k + m, dtype), newton, tangent_solve, has_aux=True)
     x, v, lam = split(z)
     q, vdot = group.retract(q_ref, x), zero
-    rests = balanced(z, jnp.concatenate([equation(z), system.velocity_constraint(q, v, t)]), matrix(z))
+    rests = balanced(z, jnp.concatenate([equation(z), system.velocity_constraint(q, v, t)]), stiff)
     result = jnp.where(rests, RESULTS.successful, RESULTS.equilibrium_failed).astype(jnp.int32)
     if depends_on_time(system, q, v, t):
         v = consistent_velocity(system, q, v, t)

@@ -88,7 +88,7 @@ def _equilibrium_jit(system, t0) -> Initial:
 def _found_state(find: Callable[..., Initial], model: Model | AbstractSystem, t0, throw: bool) -> State:
     system, t0 = as_system(model), as_float(t0, (), "`t0`")
     initial = find(system, t0)
-    if not throw:
+    if not throw or (is_concrete(initial.result) and int(initial.result) == RESULTS.successful):
         return initial.state
     details = {"violation": initial.violation, "jacobian": full_jacobian(system, initial.state.q, t0)}
     return throw_if_failed(initial.state, initial.result, details, system.constraint_names)
