@@ -45,12 +45,12 @@ class _Search(NamedTuple):
     """How far an iteration has come."""
 
     z: Float[Array, " k+m"]
-    left: Float[Array, " k+m"]  # of the equations there
+    first: Float[Array, ""]  # the largest of what the equations leave at the start
     mu: Float[Array, ""]  # μ, 0 as long as it is Newton's
+    size: Float[Array, ""]  # of the last step
     path: Float[Array, ""]  # the sum of the largest motions of all steps
     iteration: Int[Array, ""]
     done: Bool[Array, ""]
-    refined: Bool[Array, ""]  # by one step more
     stiffest: Float[Array, ""]  # of the last matrix
 
 
@@ -116,37 +116,36 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
 
     least_squares = lambda slope, right: jnp.linalg.lstsq(slope, right, rcond=1e3 * eps)[0]
 
-    inertia = system.mass_matrix() * scale[:, None] * scale[None, :] / weight
+    # Not of states: that which counts the turns of a spring must follow it.
+    inertia = system.mass_matrix() * scale[:, None] * jnp.where(states, 0.0, scale)[None, :] / weight
     viscous = jnp.zeros((k + m, k + m), dtype).at[:k, :k].set(lax.stop_gradient(inertia))
 
     def newton(equation, begin):
-        left_first = equation(begin)
-
         def body(carry: _Search) -> _Search:
-            z, mu = carry.z, carry.mu
-            slope = matrix(z)
-            step = shortest(slope + mu * viscous, carry.left, least_squares)
+            """A step; the state that the last one came to is judged here, where its equations are compiled anyway."""
+            z, left, slope = carry.z, equation(carry.z), matrix(carry.z)
+            stiff = stiffest(slope)
+            first = jnp.where(carry.iteration == 0, jnp.max(jnp.abs(left)), carry.first)
+            small = carry.size <= jnp.sqrt(eps)
+            done = small & balanced(z, left, stiff)
+            lost = (carry.mu == 0.0) & ~done & (small | (carry.path > _FAR) | (carry.iteration >= _MAX_ITERATIONS))
+            # Newton is quadratic: one step from √eps is at round-off.
+            step = shortest(slope + jnp.where(done, 0.0, carry.mu) * viscous, left, least_squares)
             # Multipliers too: where joint forces alone are stiff, as in a pendulum, the first step moves nothing.
             size = jnp.max(jnp.abs(step) / jnp.where(np.arange(k + m) < k, 1.0, 1.0 + largest(z)))
             moved = jnp.max(jnp.abs(step[: k - system.num_states]))
             # At most 0.2 rad or a fifth of the scene at a time.
             z = z - step * jnp.minimum(1.0, 0.2 / jnp.maximum(moved, 0.2))
-            left, count = equation(z), carry.iteration + 1
-            done = carry.done | ((size <= jnp.sqrt(eps)) & balanced(z, left, stiffest(slope)))
-            path = carry.path + jnp.minimum(moved, 0.2)
-            stuck = (size <= jnp.sqrt(eps)) | (path > _FAR) | (count >= _MAX_ITERATIONS)
-            lost = (mu == 0.0) & ~done & stuck
-            again = lambda first, new: jnp.where(lost, first, new)
-            mu = again(jnp.max(jnp.abs(left_first)) / _STRIDE, mu * jnp.clip(moved / _STRIDE, 0.5, 4.0))
-            mu = jnp.where(done, 0.0, mu)
-            # Newton is quadratic: one step from √eps is at round-off. In the loop, where its matrix is compiled anyway.
-            return _Search(again(begin, z), again(left_first, left), mu, path, count, done, carry.done, stiffest(slope))
+            again = lambda new, old: jnp.where(lost, new, old)
+            mu = again(first / _STRIDE, carry.mu * jnp.clip(moved / _STRIDE, 0.5, 4.0))
+            path, count = carry.path + jnp.minimum(moved, 0.2), carry.iteration + 1
+            return _Search(again(begin, z), first, mu, again(jnp.inf, size), path, count, done, stiff)
 
         def unfinished(carry: _Search):
-            return ~carry.refined & (carry.iteration < _MAX_ITERATIONS + _MAX_SINKING)
+            return ~carry.done & (carry.iteration < _MAX_ITERATIONS + _MAX_SINKING)
 
-        none, never = jnp.zeros((), dtype), jnp.zeros((), bool)
-        start = _Search(begin, left_first, none, none, jnp.zeros((), jnp.int32), never, never, none)
+        none, far = jnp.zeros((), dtype), jnp.full((), jnp.inf, dtype)
+        start = _Search(begin, none, none, far, none, jnp.zeros((), jnp.int32), jnp.zeros((), bool), none)
         found = while_loop(unfinished, body, start)
         return found.z, found.stiffest
 

@@ -17,11 +17,11 @@ from lgsens.dynamics import (
     Initial,
     State,
     constraint_jacobian,
-    constraint_velocity,
     equilibrium as _equilibrium,
     finite,
     full_jacobian,
     initial_state as _initial,
+    prescribed_velocity,
 )
 from lgsens.integrate import AbstractScheme, Start
 from lgsens.linear import Matrix
@@ -148,9 +148,9 @@ class _Off(NamedTuple):
     def of(cls, system: AbstractSystem, state0: State, t0, jacobian: Matrix) -> "_Off":
         scale = system.coordinate_scale()
         least = 1e-3 * jnp.min(scale[: scale.shape[0] - system.num_states], initial=1.0)
-        velocities = constraint_velocity(system, state0.q, state0.v, t0)
-        size: Any = jax.tree.map(jnp.abs, jacobian)
-        terms = size @ jnp.abs(state0.v) + jnp.abs(velocities - jacobian @ state0.v)
+        prescribed = prescribed_velocity(system, state0.q, t0)  # J is known, and this zero in most scenes
+        velocities, size = jacobian @ state0.v + prescribed, jax.tree.map(jnp.abs, jacobian)
+        terms = size @ jnp.abs(state0.v) + jnp.abs(prescribed)
         most = 0.1 * terms + 0.01 * jnp.max(terms, initial=0.0) + least
         positions = system.constraint(state0.q, t0)
         return cls(positions, least, velocities, most, system.is_configuration(state0.q))
