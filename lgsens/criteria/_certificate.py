@@ -32,7 +32,8 @@ class Certificate(NamedTuple):
         growth: how much the motion changes for a relative change of p of 1, in rad or lengths of the scene, shape ().
         exponential: whether it grows exponentially, shape ().
         margin: the least margin to a singular configuration of those looked at, relative to the largest, shape ().
-        kinks: where in time an acceleration has a kink or a jump inside of a step, of which body, by which forces.
+        kinks: where in time an acceleration has a kink or a jump inside of a step, of which body, by which forces, as
+            far as it stands out: such as are small beside a smooth change are not seen, nor two within five steps.
         unresolved: the share of steps in which accelerations change as much as they are large, shape ().
         result: a value of `RESULTS`, shape (), int32.
     """

@@ -115,7 +115,7 @@ def kinks(trajectory: Trajectory, found: Roughness) -> tuple[Kink, ...]:
         names, owners = system.body_names, [owner for stack in system.loads for owner in stack.owners]
 
     def at(n: int, i: int, jump: bool) -> Kink:
-        acting = dict.fromkeys(owners[k] for k in np.flatnonzero(forces[:, n - 1 : n + 2].any(axis=(0, 1))))
+        acting = dict.fromkeys(owners[k] for k in np.flatnonzero(forces[int(jump), n - 1 : n + 2].any(axis=0)))
         return Kink(float(trajectory.t[n]), names[i], tuple(acting), jump)
 
     return tuple(at(n, i, bool(jump)) for n, i, jump in np.argwhere(np.moveaxis(bodies, 0, 2)))

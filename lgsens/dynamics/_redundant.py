@@ -36,19 +36,24 @@ in the corner of K_c leaves ε^k of the error after k iterations (proximal point
 import abc
 from collections.abc import Callable
 from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from lgsens._xla import while_loop
 from lgsens.dynamics._constraints import full_jacobian
 from lgsens.dynamics._system import AbstractSystem
 
 SOFTNESS = 1e-7  # ε
 _REGULARIZATION = 1e-7  # δ, relative to the mean square of a row of B̂: three iterations leave 1e-21/σ⁶
 _ITERATIONS = 3
+_MOST_ITERATIONS = 300
+_FALLS = 0.99  # what round-off leaves along n does not
+_ENOUGH = 1e-12  # of the first correction
 
 
 class AbstractRedundantSystem(AbstractSystem):
@@ -78,13 +83,38 @@ def require_independent(system: AbstractSystem, method: str) -> None:
         )
 
 
+class _Refined(NamedTuple):
+    solution: Any
+    first: Any  # the largest entry of each part of the first correction
+    change: Float[Array, ""]  # by the last one, in such
+    before: Float[Array, ""]  # by the one before
+    count: Int[Array, ""]
+
+
 def refined(product: Callable, solve: Callable, rhs):
-    """The solution of K y = b by solves with K_c."""
-    solution = solve(rhs)
-    for _ in range(_ITERATIONS - 1):
-        left = jax.tree.map(jnp.subtract, rhs, product(solution))
-        solution = jax.tree.map(jnp.add, solution, solve(left))
-    return solution
+    """The solution of K y = b by solves with K_c, as long as each changes it by less than the one before.
+
+    What ε^k is where all is alike is (ε/(ε + σ²))^k beside a body that is lighter than others by 1/σ².
+    """
+    largest = lambda tree: jax.tree.map(lambda part: jnp.max(jnp.abs(part), initial=0.0), tree)
+
+    def corrected(solution):
+        correction = solve(jax.tree.map(jnp.subtract, rhs, product(solution)))
+        return jax.tree.map(jnp.add, solution, correction), largest(correction)
+
+    def iterate(now: _Refined) -> _Refined:
+        solution, sizes = corrected(now.solution)
+        parts = zip(jax.tree.leaves(sizes), jax.tree.leaves(now.first))
+        change = jnp.max(jnp.stack([own / jnp.where(of == 0.0, 1.0, of) for own, of in parts]))
+        return _Refined(solution, now.first, change, now.change, now.count + 1)
+
+    def improves(now: _Refined):
+        falls = (now.change < _FALLS * now.before) & (now.change > _ENOUGH) & (now.count < _MOST_ITERATIONS)
+        return (now.count < _ITERATIONS - 2) | falls
+
+    solution, first = corrected(solve(rhs))
+    one = jnp.ones((), jax.tree.leaves(first)[0].dtype)
+    return while_loop(improves, iterate, _Refined(solution, first, one, 2.0 * one, jnp.zeros((), jnp.int32))).solution
 
 
 @partial(jax.jit, inline=True)  # one program where it is not called inside another

@@ -26,7 +26,7 @@ y left, z up. TOML, or JSON of the same structure.
 
 Of a spring or damper `link`, `link_point`, `chassis_point` mean the same as the names of its two bodies.
 
-Of an axle, in SI units; points are those of the side of the file:
+Of an axle; points (of the side of the file) and masses are in `units` here as well, all else in SI units:
 
     [subframe]     centre_of_mass, mass, inertia: a body that links, joints and springs may hold on to in place of the
                    chassis; without mounts it is fixed to it
@@ -122,7 +122,7 @@ def members(document: dict, path: str) -> dict[str, Any]:
             "centre",
             f"is {float(wheel.centre[2]):.4g} m over the road, which is at z = {root.road:g} of the file, and no "
             f"tyre has a loaded radius outside of {LEAST_RADIUS} to {LARGEST_RADIUS} m; set the key 'road.height' to "
-            "the z of the road at the design position.",
+            "the z of the road at the design position, or 'units.length' to what the file is written in (0.001: mm).",
         )
     bars = [link for link in links.values() if link.inertia is None and link.beam is None]
     bump = root.table("bump")
