@@ -329,7 +329,7 @@ def test_a_reference_that_lies_flat_is_singular():
 
 
 def scissor_lift(roller):
-    """A platform of 100 kg on two crossed bars of 1.2 m, which a rod between their feet holds; rollers of so many kg."""
+    """A platform of 100 kg on two crossed bars, which a rod between their feet holds; rollers of so many kg."""
     c, s, y, x = 0.6 * np.cos(0.5), 0.6 * np.sin(0.5), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)
     bar = lambda: lg.RigidBody(5.0, (0.1, 0.6, 0.6), position=(c, 0.0, s))
     light = lambda z: lg.RigidBody(roller, (roller / 100.0,) * 3, position=(2 * c, 0.0, z))
