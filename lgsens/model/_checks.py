@@ -89,7 +89,7 @@ def _check_again(module: eqx.Module) -> None:
     """The checks of the constructors of a module and of those in it: shapes first."""
     for field in dataclasses.fields(module):
         shape, value = field.metadata.get("shape"), getattr(module, field.name)
-        if value is None and not field.metadata.get("static") and type(None) not in get_args(field.type):
+        if shape is not None and value is None and type(None) not in get_args(field.type):
             raise ValueError(
                 f"`{field.name}` is None where a number belongs; of a model that `eqx.partition` has divided "
                 "`eqx.combine` makes one again."

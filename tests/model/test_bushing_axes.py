@@ -65,7 +65,7 @@ def test_bushings_share_a_load_as_they_yield():
         for i, (x, k) in enumerate(zip(at, rates))
     }
     stay = lg.SpringDamper(None, "beam", at_a=(1.5, 0.0, 1.0), at_b=(1.5, 0.0, 0.0), stiffness=1e3)
-    roll = lg.TorsionSpringDamper(None, "beam", axis=(1.0, 0.0, 0.0), stiffness=1.0)
+    roll = lg.TorsionSpringDamper(None, "beam", axis=(0.0, 1.0, 0.0), stiffness=1.0)
     model = lg.Model(
         {"beam": beam},
         {"guide": lg.PlanarJoint(None, "beam", at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))},
