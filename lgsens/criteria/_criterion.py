@@ -33,7 +33,7 @@ class Criterion(eqx.Module):
     `differentiate` gives its value and gradient by every method of the paper. Numbers that F and G depend on come
     through `p`, or are constants.
 
-    Raises `ValueError` if both are None or one cannot be called, and, when it is evaluated, for a value that is
+    Raises `ValueError` if both are None or one cannot be called so, and, when it is evaluated, for a value that is
     not a scalar. Source: Sonneville & Brüls (2014), §5.
     """
 
@@ -46,6 +46,8 @@ class Criterion(eqx.Module):
         for name, function in (("integrand", self.integrand), ("terminal", self.terminal)):
             if function is not None and not callable(function):
                 raise ValueError(f"Criterion: `{name}` must be a function of (instant, parameters), got {function!r}.")
+            if function is not None and not _takes_two(function):
+                raise ValueError(f"Criterion: `{name}` must take two arguments, (instant, parameters): lambda s, p: …")
 
     def rate(self, system: AbstractSystem, state: State, t, p) -> Float[Array, ""]:
         """F at one state, shape ()."""
@@ -69,19 +71,20 @@ class Criterion(eqx.Module):
         return value + time_integral(t, rates, order=trajectory.order)
 
 
+def _takes_two(function: Pointwise) -> bool:
+    try:
+        inspect.signature(function).bind(None, None)
+    except TypeError:
+        return False
+    except ValueError:  # of a builtin it is not known
+        pass
+    return True
+
+
 def _scalar(name: str, function: Pointwise | None, system, state: State, t, p) -> Float[Array, ""]:
     if function is None:
         return jnp.zeros_like(t)
-    instant = Instant(t=t, state=state, system=system)
-    try:
-        inspect.signature(function).bind(instant, p)
-    except TypeError:
-        raise ValueError(
-            f"Criterion: `{name}` must take two arguments, (instant, parameters): lambda s, p: …"
-        ) from None
-    except ValueError:  # a builtin without a signature
-        pass
-    value = function(instant, p)
+    value = function(Instant(t=t, state=state, system=system), p)
     shape, dtype = getattr(value, "shape", ()), getattr(value, "dtype", None)
     if not isinstance(value, jax.Array | float | int) or shape != ():
         what = f"an array of shape {shape}" if isinstance(value, jax.Array) else f"{type(value).__name__}"

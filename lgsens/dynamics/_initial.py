@@ -126,7 +126,8 @@ def acceleration_and_jerk(system: AbstractSystem, q, v, t, factors: Factors | No
 
 
 def assemble(system: AbstractSystem, t):
-    """The configuration closest to the reference that satisfies Φ(q, t) = 0, and its last violation.
+    """The configuration closest to the reference that satisfies Φ(q, t) = 0, and its last violation; the reference and
+    NaN where none is found.
 
     q = q_ref exp((N μ)~) with N = M⁻¹B(q_ref)ᵀ: the motion that an impulse along the constraint directions
     would give. The m_p equations Φ = 0 determine μ; the implicit function theorem, its derivative.
@@ -174,7 +175,9 @@ def assemble(system: AbstractSystem, t):
         tangent_solve,
     )
     q = place(mu)
-    return q, system.constraint(q, t)
+    lost = ~finite(q)  # by equations that contradict each other: those of the reference say which
+    at = jax.tree.map(lambda own, reference: jnp.where(lost, reference, own), q, q_ref)
+    return at, system.constraint(q, t)
 
 
 def _shortest(matrix, rhs):
@@ -210,9 +213,7 @@ def initial_state(system: AbstractSystem, t) -> Initial:
     joints leaves of v_ref, and what the rates of drivers add.
     """
     q, violation = assemble(system, t)
-    q_ref, v_ref = system.reference()
-    lost = ~finite(q)  # by equations that contradict each other: those of the reference say which
-    q = jax.tree.map(lambda own, reference: jnp.where(lost, reference, own), q, q_ref)
+    _, v_ref = system.reference()
     factors = ConstrainedMass.of(system, q, t).factors
     v = system.settled(q, consistent_velocity(system, q, v_ref, t, factors), t)
     vdot, lam = accelerations(system, q, v, t, factors)
@@ -224,6 +225,6 @@ def initial_state(system: AbstractSystem, t) -> Initial:
     assembled = largest <= 1e3 * jnp.finfo(dtype).eps * jnp.maximum(length, 1.0)  # NaN is not assembled
     result = jnp.where(finite(state), RESULTS.successful, RESULTS.invalid_numbers)
     result = jnp.where(redundant, RESULTS.redundant_constraints, result)
-    result = jnp.where(assembled | (lost & redundant), result, RESULTS.assembly_failed)
+    result = jnp.where(assembled | (jnp.isnan(largest) & redundant), result, RESULTS.assembly_failed)
     result = jnp.where(system.is_valid(), result, RESULTS.invalid_numbers).astype(jnp.int32)
     return Initial(state, result, violation, factors)

@@ -109,8 +109,7 @@ def refined(product: Callable, solve: Callable, rhs):
         return _Refined(solution, now.first, change, now.change, now.count + 1)
 
     def improves(now: _Refined):
-        falls = (now.change < _FALLS * now.before) & (now.change > _ENOUGH) & (now.count < _MOST_ITERATIONS)
-        return (now.count < _ITERATIONS - 2) | falls
+        return (now.change < _FALLS * now.before) & (now.change > _ENOUGH) & (now.count < _MOST_ITERATIONS)
 
     solution, first = corrected(solve(rhs))
     one = jnp.ones((), jax.tree.leaves(first)[0].dtype)

@@ -94,8 +94,9 @@ _MESSAGES = {
         "hinge: `FixedJoint`), hold it (`RigidBody.free`), or give it a spring, however weak; or drive it."
     ),
     RESULTS.off_joints: (
-        "`state0` does not satisfy the joints at t0. Give a state of this model at this time: `initial_state(model, "
-        "t0=t0)`, `equilibrium(model, t0=t0)`, or the last one of a run of a model with the same hardpoints."
+        "`state0` does not satisfy the joints at t0, by its positions or by its velocities. Give a state of this model "
+        "at this time: `initial_state(model, t0=t0)`, `equilibrium(model, t0=t0)`, or the last one of a run of a model "
+        "with the same hardpoints."
     ),
     RESULTS.steps_exhausted: (
         "Error control needs more steps than `num_steps` allows. Try more `num_steps` or a looser `tolerance`."

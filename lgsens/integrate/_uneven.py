@@ -96,9 +96,9 @@ class GivenSteps(AbstractIntegrator):
                 "steps of its own: jax.vmap(GivenSteps.of)(trajectories), for simulations under `vmap`."
             )
         result = getattr(trajectory, "result", None)
-        if is_concrete(result) and result is not None and int(result) != RESULTS.successful:
+        if result is not None and is_concrete(result) and int(result) != RESULTS.successful:
             raise ValueError(
-                f"GivenSteps.of: the trajectory has failed, and its steps are not those of the whole interval. "
+                "GivenSteps.of: the trajectory has failed, and its steps are not those of the whole interval. "
                 f"{RESULTS(int(result)).message}"
             )
         sizes = lax.stop_gradient(jnp.diff(trajectory.t))

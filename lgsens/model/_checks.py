@@ -21,6 +21,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, is_concrete, is_float_array, leaf_name
+from lgsens.model._free import single_rotation
 
 _ALIGNED = 1e-2  # rad: a turn about axes further apart is none about either
 
@@ -35,14 +36,14 @@ def check_axes(bodies: Mapping[str, Any], joints: Mapping[str, Any], forces: Map
             if member.about is None:
                 continue
             pair = ends_of[name] if what == "Joint" else member.bodies
-            ends = frozenset(pair)
-            hinge = hinges.get(ends)
-            axis = None if hinge is None else joints[hinge].hinge
-            turning = {"xyz".index(free[1]) for end in ends - {None} for free in bodies[end].free if free[0] == "r"}
-            where = f"as their joint {hinge!r} lets them"
-            if axis is None and len(turning) == 1:
-                axis, where = np.eye(3)[turning.pop()], "as their `free` rotations let them"
-            if axis is None or not is_concrete(axis, member.about):
+            one_rotation = single_rotation(free for end in pair if end is not None for free in bodies[end].free)
+            if (hinge := hinges.get(frozenset(pair))) is not None:
+                axis, where = joints[hinge].hinge, f"as their joint {hinge!r} lets them"
+            elif one_rotation is not None:
+                axis, where = np.eye(3)[one_rotation], "as their `free` rotations let them"
+            else:
+                continue
+            if not is_concrete(axis, member.about):
                 continue
             one, other = (np.asarray(each) / np.linalg.norm(each) for each in (axis, member.about))
             if np.linalg.norm(np.cross(one, other)) > _ALIGNED:

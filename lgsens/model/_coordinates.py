@@ -18,17 +18,10 @@ from lgsens.model._forces import AbstractConnection, AbstractForce, Attached, _f
 from lgsens.model._frames import BODY_DIM, Frame
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._loads import AbstractClosedFormLoad, LoadTangents
-from lgsens.model._relative import Coordinate
+from lgsens.model._relative import Coordinate, but_for_turns
 from lgsens.model._signals import Prescribed, at_time, prepared, prescribed_field
 from lgsens.model._turning_loads import BallLoad
-from lgsens.model._turns import (
-    CountedTurns,
-    acting,
-    branch_of,
-    force_along,
-    require_half_a_turn,
-    within_half_a_turn,
-)
+from lgsens.model._turns import CountedTurns, acting, branch_of, force_along, require_half_a_turn
 
 
 def _seen(a: Frame, b: Frame, on_a: Frame, on_b: Frame) -> Frame:
@@ -98,7 +91,7 @@ class CoordinateLoad(AbstractClosedFormLoad):
 
     def value(self, a, b):
         s, row = _row(lambda a, b: self.coordinate.of(_seen(a, b, self.on_a, self.on_b)), (a, b))
-        return (within_half_a_turn(s, self.free) if self.coordinate.periodic else s), row
+        return (but_for_turns(s, self.free) if self.coordinate.periodic else s), row
 
     def along(self, s, rate, t) -> CoordinateMeasure:
         force = -self.stiffness * (s - self.free) - self.damping * rate
@@ -135,14 +128,14 @@ class CoordinateForce(AbstractForce):
         coordinate: the name of the coordinate, static; None: the only one.
         stiffness: k [N/m or N m/rad], shape ().
         damping: c [N s/m or N m s/rad], shape ().
-        free: s₀ [m or rad], at which the spring is free, shape ().
+        free: s₀ [m or rad], at which the spring is free, shape (); of an angle within half a turn unless counted.
         motor: M(t) [N or N m], a number, shape (), or a signal; None: no motor.
         turns: whether an angle is counted over whole turns, by a state "angle" (`Trajectory.states_of`), static. Else
             it is within half a turn of s₀, where the force of a spring jumps; a motion that comes there has failed.
 
     `Trajectory.force` gives the coordinate, its rate, and f. Raises `ValueError` for a joint without the coordinate,
-    for `turns` of one that is no angle, and for wrong shapes. Source: in minimal coordinates the spring, damper and
-    motor of MuJoCo's joints (its documentation, "Computation": passive forces, actuation model).
+    a larger `free`, `turns` of one that is no angle, and wrong shapes. Source: in minimal coordinates the spring,
+    damper and motor of MuJoCo's joints (its documentation, "Computation": passive forces, actuation model).
     """
 
     joint: AbstractJoint
@@ -228,8 +221,7 @@ class Coupled(AbstractClosedFormConstraint):
             total = (total + self.coefficients[i]) * x
         missing = first(_seen(ends[0], ends[1], *self.first)) - total
         if self.coordinates[0].periodic:
-            turn = 2.0 * jnp.pi / self.teeth
-            missing -= turn * jnp.round(missing / turn)
+            missing = but_for_turns(missing, turn=2.0 * jnp.pi / self.teeth)
         return missing[None]
 
     def jacobian(self, a, b, t, *others):

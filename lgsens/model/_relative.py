@@ -124,6 +124,11 @@ def relative_motion(coordinates: tuple[Coordinate, ...], frames, references, mot
     return jax.vmap(at_time)(motions)
 
 
+def but_for_turns(s: Float[Array, ""], near: Any = 0.0, turn: float = 2.0 * jnp.pi) -> Float[Array, ""]:
+    """Of s and whole turns, of 2π or another angle, that which is nearest to another angle; no derivative by that."""
+    return s - turn * jnp.round((s - near) / turn)
+
+
 def continued(values: Float[Array, " n"], rates: Float[Array, " n"], t: Float[Array, " n"]) -> Float[Array, " n"]:
     """Angles between −π and π as an angle that grows on, the first one as it is.
 

@@ -12,7 +12,7 @@ from lgsens.model._constraints import AbstractConstraint, AbstractVelocityConstr
 from lgsens.model._elements import body_fixed
 from lgsens.model._frames import ROTATION, Frame, normals
 from lgsens.model._joints import AbstractJoint, _coincidence
-from lgsens.model._relative import ROTATION_VECTOR, frames_at
+from lgsens.model._relative import ROTATION_VECTOR, but_for_turns, frames_at
 from lgsens.model._signals import Prescribed, at_time, prepared, prescribed_field, require_ratio
 
 
@@ -52,8 +52,7 @@ class Gearing(AbstractConstraint):
 
     def value(self, a, b, t):
         of_a, of_b = self.angles(a, b)
-        angle, turn = of_b - at_time(self.ratio, t) * of_a, 2.0 * jnp.pi / self.teeth
-        return (angle - turn * jnp.round(angle / turn))[None]
+        return but_for_turns(of_b - at_time(self.ratio, t) * of_a, turn=2.0 * jnp.pi / self.teeth)[None]
 
 
 class FrictionGearing(AbstractVelocityConstraint):

@@ -16,6 +16,7 @@ from lgsens.model._constraints import total
 from lgsens.model._elements import body_fixed
 from lgsens.model._frames import BODY_B, ROTATION, ROTATION_A, ROTATION_B, TRANSLATION_B, TURNING_A, TURNING_B, embedded
 from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, BushingLoad, LoadTangents
+from lgsens.model._relative import but_for_turns
 from lgsens.model._signals import AbstractSignal, Prescribed, at_time, constant_of
 from lgsens.model._stack import load_tangents
 from lgsens.model._turns import acting, branch_of, force_along
@@ -99,11 +100,9 @@ class TorsionLoad(AbstractLoad):
         beta = turn(relative, self.first_b)
         x, y = jnp.sum(beta * self.first_a), jnp.sum(beta * self.second_a)
         g = (x * self.second_a - y * self.first_a) / (x * x + y * y)
-        sine, cosine = jnp.sin(self.free_angle), jnp.cos(self.free_angle)
-        twist = jnp.arctan2(y * cosine - x * sine, x * cosine + y * sine)
         zero = jnp.zeros_like(g)
         row = jnp.concatenate([zero, cross(g, beta), zero, cross(self.first_b, turn_back(relative, g))])
-        return self.free_angle + twist, row
+        return but_for_turns(jnp.arctan2(y, x), self.free_angle), row
 
     def along(self, s, rate, t) -> HingeMoment:
         moment = -self.preload - self.stiffness * (s - self.free_angle) - self.damping * rate

@@ -18,8 +18,7 @@ from jaxtyping import Array, Float
 from lgsens._validate import require
 from lgsens.model._frames import Frame
 from lgsens.model._loads import AbstractDynamicLoad
-
-_TURN = 2.0 * jnp.pi
+from lgsens.model._relative import but_for_turns
 
 
 class AlongCoordinate(Protocol):
@@ -42,7 +41,7 @@ def acting(load: AlongCoordinate, a: Frame, b: Frame, va, vb, t, z=None) -> tupl
     s, row = load.value(a, b)
     rate = jnp.sum(row * jnp.concatenate([va, vb]))
     if z is not None:
-        s = within_half_a_turn(s, z)
+        s = but_for_turns(s, z)
     return load.along(s, rate, t), row
 
 
@@ -55,11 +54,6 @@ def force_along(load: AlongCoordinate, a: Frame, b: Frame, va, vb, t, z=None) ->
 def branch_of(load: AlongCoordinate, a: Frame, b: Frame) -> Float[Array, ""]:
     """The angle of a load that jumps with it (`AbstractElement.branch`); 0 where none does, without a spring."""
     return jnp.where(load.stiffness == 0.0, 0.0, load.value(a, b)[0])
-
-
-def within_half_a_turn(s: Float[Array, ""], of: Float[Array, ""]) -> Float[Array, ""]:
-    """An angle, or that and whole turns, within half a turn of another one."""
-    return s - _TURN * jnp.round((s - of) / _TURN)
 
 
 def require_half_a_turn(what: str, name: str, free: Float[Array, ""]) -> None:
@@ -100,4 +94,4 @@ class CountedTurns(AbstractDynamicLoad):
 
     def initial(self, a, b, va, vb, t):
         s, _ = self.of.value(a, b)
-        return within_half_a_turn(s, jnp.zeros_like(s))[None]
+        return but_for_turns(s)[None]
