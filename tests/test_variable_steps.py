@@ -28,9 +28,9 @@ def observed(trajectory):
     return lg.time_integral(trajectory.t, integrand) + states.v[-1, 1] + 0.01 * states.lam[-1, 0]
 
 
-def value(p, t0, t1, fractions):
-    integrator = lg.GivenSteps(fractions, SCHEME)
-    return observed(lg.simulate(make(p), t0=t0, t1=t1, num_steps=fractions.shape[0], integrator=integrator))
+def value(p, t0, t1, fractions, scheme=SCHEME, **settings):
+    settings |= {"num_steps": fractions.shape[0], "integrator": lg.GivenSteps(fractions, scheme)}
+    return observed(lg.simulate(make(p), t0=t0, t1=t1, **settings))
 
 
 def uneven(n):
@@ -92,8 +92,9 @@ def test_multipliers_where_sizes_jump():
 
 @pytest.mark.slow  # on the grid that error control has found: below
 def test_derivatives_on_a_given_grid():
-    """By parameters, times and sizes, with empty steps in the middle and at the end: both modes, differences."""
-    sizes = uneven(24)
+    """By parameters, times and sizes, with empty steps in the middle and at the end, each second one as long as the one
+    before: both modes, differences, and JAX through the loop of the steps."""
+    sizes = np.repeat(uneven(12), 2)
     sizes[[9, 10, 22, 23]] = 0.0
     point = (jnp.array(P), jnp.asarray(0.1), jnp.asarray(1.1), jnp.asarray(sizes))
     rng = np.random.default_rng(0)
@@ -101,6 +102,11 @@ def test_derivatives_on_a_given_grid():
     both = jax.jit(jax.value_and_grad(value, argnums=(0, 1, 2, 3)))
     for one, other in zip(both(*point)[1], forward, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-12)  # other order of round-off
+    tight = lg.GeneralizedAlpha(rho_inf=0.8, tolerance=1e-14)
+    of = partial(value, scheme=tight, sensitivity=lg.Autodiff())
+    through = jax.jit(jax.jacfwd(of, argnums=(0, 3)))(*point)
+    for one, other in zip(through, (forward[0], forward[3]), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-10)  # round-off of λ and v̇, 1e-14/(βh²), h = 1/24
     for i, leaf in enumerate(point):
         direction = jnp.asarray(rng.normal(size=leaf.shape)) * leaf  # an empty step stays empty
         shifted = lambda s, i=i, d=direction: both(*(x + s * d if j == i else x for j, x in enumerate(point)))[0]

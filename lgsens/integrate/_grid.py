@@ -9,13 +9,15 @@ algorithmic acceleration of generalized-α stands for the acceleration at t_n + 
 
     y_n* = `scheme.resized`(y_n) at r_n = h_n/h_{n−1}
 
-in place of y_n. A step of size 0 leaves everything as it is: a grid that needs fewer steps than its arrays have places
-ends with such. For its equations it has the size before it, which can be divided by.
+in place of y_n. Sizes that differ by round-off are the same, r = 1. A step of size 0 leaves everything as it is: a grid
+that needs fewer steps than its arrays have places ends with such. For its equations it has the size before it, which
+can be divided by.
 """
 
 import abc
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import equinox as eqx
@@ -24,9 +26,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from lgsens._xla import alike
 from lgsens.dynamics import AbstractSystem, State
-from lgsens.integrate._lanes import most_of_lanes
+from lgsens.integrate._lanes import in_any_lane, most_of_lanes
 from lgsens.integrate._linearized import Node
+
+Tree = TypeVar("Tree")
+_SAME = 1e4  # round-offs: what sums of sizes leave of them
 
 
 class Start(NamedTuple):
@@ -80,6 +86,14 @@ class AbstractGrid(eqx.Module):
     def begun(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State, factors: Any = None) -> State:
         """What the step at a place begins with; `factors`: those below, if they are known."""
         return state
+
+    def begun_in_turn(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State) -> State:
+        """`begun`, by `where_resized`."""
+        return state
+
+    def where_resized(self, place: Any, change: Callable[[Tree], Tree], same: Tree) -> Tree:
+        """`change(same)` where the step has another size than the one before; elsewhere it takes no time."""
+        return same
 
     def factors(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State) -> Any:
         """What `begun` is found with; they have no derivative of their own."""
@@ -182,6 +196,23 @@ class Place(NamedTuple):
     ratio: Float[Array, ""]
 
 
+def without_round_off(ratio):
+    """Of two sizes: 1 where round-off of sums of them is all that they differ by, of which it is made free."""
+    same = jnp.abs(ratio - 1.0) < _SAME * jnp.finfo(ratio.dtype).eps
+    return ratio + jax.lax.stop_gradient(jnp.where(same, 1.0 - ratio, 0.0))
+
+
+@jax.custom_jvp
+def _begun_in_turn(scheme: Resizes, system: AbstractSystem, grid: "UnevenGrid", place: Place, state: State) -> State:
+    return grid.where_resized(place, lambda state: grid.begun(scheme, system, place, state), state)
+
+
+@_begun_in_turn.defjvp
+def _derivative_of_begun(primals, tangents):
+    """That by r is not zero where r is 1."""
+    return jax.jvp(lambda scheme, system, grid, *at: grid.begun(scheme, system, *at), primals, tangents)
+
+
 class UnevenGrid(AbstractGrid):
     """Steps of sizes h from t0 on."""
 
@@ -216,7 +247,7 @@ class UnevenGrid(AbstractGrid):
         h = self.h
         last = jax.lax.cummax(jnp.where(h != 0.0, jnp.arange(1, h.shape[0] + 1), 0))
         size = jnp.concatenate([self.before[None], h])[last]
-        ratio = size / jnp.concatenate([self.before[None], size[:-1]])
+        ratio = without_round_off(size / jnp.concatenate([self.before[None], size[:-1]]))
         return Place(self.t0 + jnp.cumsum(h) - h, h, size, ratio)
 
     def node(self, place):
@@ -224,6 +255,14 @@ class UnevenGrid(AbstractGrid):
 
     def begun(self, scheme, system, place, state, factors=None):
         return scheme.resized(system, state, place.begin, factors).at(system, place.ratio)
+
+    def begun_in_turn(self, scheme, system, place, state):
+        return _begun_in_turn(scheme, system, self, place, state)
+
+    def where_resized(self, place, change, same):
+        shapes = jax.eval_shape(change, same)
+        resized = in_any_lane(jax.lax.stop_gradient(place.ratio) != 1.0)
+        return jax.lax.cond(resized, lambda same: alike(change(same), shapes), lambda same: alike(same, shapes), same)
 
     def factors(self, scheme, system, place, state):
         return scheme.resizing_factors(system, state, place.begin)
@@ -239,9 +278,6 @@ class UnevenGrid(AbstractGrid):
         sizes = jnp.concatenate([self.before[None], self.places().h])
         begins = length * np.arange(count)
         return UnevenGrid(self.times()[begins], h, sizes[begins])
-
-
-Tree = TypeVar("Tree")
 
 
 def later(states: Tree) -> Tree:

@@ -44,7 +44,7 @@ class Walk(eqx.Module):
     def on(self, grid: AbstractGrid, progress: "Progress", place: Any) -> tuple["Progress", Stats]:
         """The step at a place of a grid; an empty one repeats the state."""
         node, empty = grid.node(place), grid.empty(place)
-        begun = grid.begun(self.scheme, self.system, place, progress.state)
+        begun = grid.begun_in_turn(self.scheme, self.system, place, progress.state)
         if empty is None:
             return self.take(progress, begun, node, progress.running)
         active = progress.running & ~empty

@@ -8,6 +8,7 @@ made once.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -75,10 +76,8 @@ class LinearizedSteps(NamedTuple):
         return Loads(jax.jvp(loads, (system, node), (d.system, d_node))[1], begun)
 
     def _begun(self, linear: LinearStep, previous: Variation) -> Variation:
-        """δ_n* at given parameters."""
+        """δ_n* at given parameters, of a step of another size than the one before."""
         (system, grid), step = self.parameters, linear.step
-        if not grid.resizes:
-            return previous
         at = lambda state: grid.begun(self.scheme, system, step.place, state, linear.factors)
         d_begun = jax.jvp(at, (step.before,), (to_ambient(system.group, step.before, previous),))[1]
         return to_algebra(system.group, linear.begun, d_begun)
@@ -86,7 +85,7 @@ class LinearizedSteps(NamedTuple):
     def forward(self, linear: LinearStep, previous: Variation, loads: Loads, row: Variation) -> Variation:
         """δ_{n+1}."""
         grid, place = self.parameters.grid, linear.step.place
-        begun = self._begun(linear, previous)
+        begun = grid.where_resized(place, partial(self._begun, linear), previous)
         if loads.begun is not None:
             begun = jax.tree.map(jnp.add, begun, loads.begun)
         current = linear.equations.forward(self.shared, grid.node(place), begun, loads.equations, row)
@@ -96,11 +95,9 @@ class LinearizedSteps(NamedTuple):
         """The transpose of `forward`; `loads`: in shape."""
         grid, place = self.parameters.grid, linear.step.place
         begun, of_equations, mu = linear.equations.backward(self.shared, grid.node(place), c, loads.equations)
-        previous, own = begun, None
-        if grid.resizes:
-            (previous,) = jax.vjp(lambda delta: self._begun(linear, delta), Variation.none(linear.begun))[1](begun)
-            own = begun
-        found = Loads(of_equations, own)
+        pulled = lambda begun: jax.vjp(partial(self._begun, linear), Variation.none(linear.begun))[1](begun)[0]
+        previous = grid.where_resized(place, pulled, begun)
+        found = Loads(of_equations, begun if grid.resizes else None)
         found = grid.unless_empty(place, found, jax.tree.map(jnp.zeros_like, found))
         return Backward(grid.unless_empty(place, previous, c), grid.unless_empty(place, mu, c), found)
 
