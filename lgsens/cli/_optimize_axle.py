@@ -121,6 +121,8 @@ def _si(name: str, bound: float | tuple[float, float]) -> float | tuple[float, f
     """A width, or two bounds, from the unit shown; where that has another sign the bounds change places."""
     factor, _ = _shown(name)
     if not isinstance(bound, tuple):
+        if not bound > 0:
+            raise ValueError(f"--keep {name}={bound:g} must be a positive width, or two bounds LOWER:UPPER")
         return bound / abs(factor)
     low, high = sorted(end / factor for end in bound) if bound[0] < bound[1] else bound
     return low, high

@@ -218,11 +218,9 @@ def initial_state(system: AbstractSystem, t) -> Initial:
     v = system.settled(q, consistent_velocity(system, q, v_ref, t, factors), t)
     vdot, lam = accelerations(system, q, v, t, factors)
     state = State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
-    dtype = v.dtype
     redundant = softness(system) is None and is_redundant(system, constraint_jacobian(system, q, t))
-    length = jnp.max(system.coordinate_scale())
     largest = jnp.max(jnp.abs(violation), initial=0.0)
-    assembled = largest <= 1e3 * jnp.finfo(dtype).eps * jnp.maximum(length, 1.0)  # NaN is not assembled
+    assembled = largest <= system.constraint_round_off()  # NaN is not assembled
     result = jnp.where(finite(state), RESULTS.successful, RESULTS.invalid_numbers)
     result = jnp.where(redundant, RESULTS.redundant_constraints, result)
     result = jnp.where(assembled | (jnp.isnan(largest) & redundant), result, RESULTS.assembly_failed)

@@ -134,8 +134,7 @@ def positions(drive: AbstractDrive, values: Float[Array, "n d"], t: Float[Array,
     found."""
     q, size = _configurations(drive, values, t)
     violation = jax.vmap(lambda q, s, t: drive.at(s).constraint(q, t))(q, values, t)
-    length = jnp.maximum(jnp.max(drive.system.coordinate_scale()), 1.0)
-    satisfied = jnp.max(jnp.abs(violation), axis=1) <= 1e3 * jnp.finfo(size.dtype).eps * length  # NaN is not
+    satisfied = jnp.max(jnp.abs(violation), axis=1) <= drive.system.constraint_round_off()  # NaN is not
     found = _small(size) & satisfied
     poison = lambda leaf: jnp.where(found.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.nan)
     return Positions(jax.tree.map(poison, q), found, violation)

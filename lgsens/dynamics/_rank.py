@@ -112,7 +112,7 @@ def _moved(system: AbstractSystem, place: _Place, t, direction, distance: float,
     if size < 1e-6:  # no freedom
         return None, x
     q = _retracted(system, q, distance * scale * x / size)
-    tolerance = 1e3 * np.finfo(scale.dtype).eps * max(scale.max(), 1.0)
+    tolerance = float(system.constraint_round_off())
     for _ in range(_ITERATIONS):
         violation, jacobian = _evaluated(system, q, t)
         own = np.flatnonzero(held[: len(violation)])

@@ -129,7 +129,8 @@ def axle_members(root: Reader, kilogram: float, links: Mapping[str, Link]) -> di
     if "anti_roll_bar" in root:
         found["bar"] = _bar(root, root.table("anti_roll_bar"), kilogram, links)
     if "twist_beam" in root:
-        found["twist_beam"] = _twist_beam(root.table("twist_beam"), links)
+        side = np.sign(root.table("wheel").point("centre")[1])
+        found["twist_beam"] = _twist_beam(root.table("twist_beam"), links, side)
     return found
 
 
@@ -161,14 +162,18 @@ def _arm(table: Reader, links: Collection[str]) -> dict[str, Any]:
     return ends
 
 
-def _twist_beam(table: Reader, links: Mapping[str, Link]) -> TwistBeam:
+def _twist_beam(table: Reader, links: Mapping[str, Link], side) -> TwistBeam:
     ends = _arm(table, links)
     ((arm, end),) = ends.items()
     if arm in links and links[arm].beam is not None:
         raise table.fail(arm, "is a link that bends, and a twist beam is fixed to a rigid arm; leave out its `beam`.")
     if not end[1]:
         raise table.fail(arm, "is in the plane y = 0, and the beam goes from there to its mirror image; move it.")
-    centre = table.numbers("shear_centre", 2) if "shear_centre" in table else None
+    if np.sign(end[1]) != side:
+        raise table.fail(
+            arm, f"is at y = {float(end[1]):g} m, on the other side of the car than the wheel; turn the sign of its y."
+        )
+    centre = table.within("shear_centre", table.numbers("shear_centre", 2), 1.0) if "shear_centre" in table else None
     member = TwistBeam(ends, read_beam(table, ()), centre)
     try:
         member.bent()

@@ -81,6 +81,21 @@ class Reader:
             self._get(key, lambda value: value > 0, "positive")
         return as_float(value * scale, (), key)
 
+    def metres(self, key: str, most: float, positive: bool = True) -> Array:
+        """A length in metres, which the unit of the file's points is not for; at most so much."""
+        return self.within(key, self.number(key, positive=positive), most)
+
+    def within(self, key: str, lengths: Array, most: float) -> Array:
+        """Lengths [m], no one of which is beyond any car's."""
+        largest = float(np.max(np.abs(lengths)))
+        if largest > most:
+            raise self.fail(
+                key,
+                f"is in metres ('units.length' is of points alone), and {largest:g} m are more than the {most:g} m that "
+                f"are possible; did you mean {largest / 1e3:g}?",
+            )
+        return lengths
+
     def count(self, key: str) -> int:
         holds = lambda value: isinstance(value, int) and not isinstance(value, bool) and value >= 1
         return self._get(key, holds, "a whole number of at least 1")

@@ -49,7 +49,7 @@ class DesignLimits(eqx.Module):
         """
         document, name = read(path)
         table = Reader(document, name).table("design")
-        shortest, longest = table.number("minimum_spring_length"), table.number("maximum_spring_length")
+        shortest, longest = (table.metres(f"{which}_spring_length", 3.0) for which in ("minimum", "maximum"))
         if not shortest < longest:
             raise ValueError(
                 f"Hardpoint file {name!r}, key 'design.maximum_spring_length': must exceed "
@@ -61,7 +61,7 @@ class DesignLimits(eqx.Module):
             longest,
             table.interval("stiffness"),
             table.interval("damping"),
-            table.number("hardpoint_box"),
+            table.metres("hardpoint_box", 1.0),
         )
 
 

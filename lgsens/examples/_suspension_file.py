@@ -140,7 +140,7 @@ def members(document: dict, path: str) -> dict[str, Any]:
         **struts,
         "tyre_stiffness": root.table("tyre").number("stiffness"),
         "link_radius": root.table("link_section").number("radius") if bars else None,
-        "bump_height": bump.number("height", positive=False),
+        "bump_height": bump.metres("height", 1.0, positive=False),
         "bump_duration": bump.number("duration"),
         "mounts": mounts(root, links, joints, carriers),
         "stops": stops,

@@ -297,7 +297,11 @@ class AppliedForce(AbstractForce):
         frame = bodies[self.body].frame
         kind, force = (FollowingForce, frame.local_axis(self.force)) if self.follows else (PointForce, self.force)
         at = bodies[self.body].position if self.at is None else self.at
-        load = kind(frame.local_point(at), force, self.moment, prepared(self.signal))
-        if self.fixed_moment is not None:
-            load = LoadSum((load, FixedMoment(self.fixed_moment, load.signal)))
+        signal = prepared(self.signal)
+        if self.fixed_moment is None:
+            load = kind(frame.local_point(at), force, self.moment, signal)
+        else:
+            once = _one()
+            parts = kind(frame.local_point(at), force, self.moment, once), FixedMoment(self.fixed_moment, once)
+            load = LoadSum(parts, signal)
         return (Attached(load, None, self.body),)

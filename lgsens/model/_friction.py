@@ -18,6 +18,7 @@ and of both sweeps. Motion and derivatives stay exact; the start is the solution
 """
 
 import abc
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -33,6 +34,8 @@ from lgsens.model._frames import BODY_DIM, ROTATION, ROTATION_B, TRANSLATION_B, 
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._loads import AbstractDynamicLoad
 from lgsens.model._stack import constraint_force
+
+_ROUNDING = 9.81e-3  # m/s²
 
 
 class SlidingFriction(NamedTuple):
@@ -188,7 +191,7 @@ class _AbstractJointFriction(AbstractForce):
     radius: eqx.AbstractVar[Float[Array, ""] | None]
     arm: eqx.AbstractVar[Float[Array, ""] | None]
     preload: eqx.AbstractVar[Float[Array, ""]]
-    load_rounding: eqx.AbstractVar[Float[Array, ""]]
+    load_rounding: eqx.AbstractVar[Float[Array, ""] | None]
     own_forces: eqx.AbstractVar[bool]
 
     @abc.abstractmethod
@@ -245,10 +248,15 @@ class _InJoint(AbstractForce):
             radius=of.radius,
             arm=of.arm,
             preload=of.preload,
-            load_rounding=of.load_rounding,
+            load_rounding=self._rounding(bodies) if of.load_rounding is None else of.load_rounding,
             slips=joint.slips,
         )
         return (Attached(of._load(surface), *self.bodies),)
+
+    def _rounding(self, bodies) -> Float[Array, ""]:
+        """What is small beside the loads of this joint [N]: an absolute number is none in light mechanisms."""
+        masses = [bodies[name].mass for name in self.bodies if name is not None]
+        return _ROUNDING * functools.reduce(jnp.minimum, masses)
 
 
 class JointFriction(_AbstractJointFriction):
@@ -269,7 +277,8 @@ class JointFriction(_AbstractJointFriction):
         arm: ℓ [m], shape (), > 0, half the distance of the two ends of a bearing; None: moments do not load it.
         viscous: c [N s/m], shape ().
         preload: N₀ [N], shape (), of a press fit, say.
-        load_rounding: ε [N], shape (), > 0: N is 1 % less than L at L = 7 ε.
+        load_rounding: ε [N], shape (), > 0: N is 1 % less than L at L = 7 ε, and 0.03 L at L = ε/30. None: a thousandth
+            of the weight of the lighter of both bodies, 9.81 m/s² × 1e-3 times its mass.
         own_forces: whether N depends on L. N = N₀ goes with every integrator and method, L with GeneralizedAlpha, its
             exact derivatives and Richardson.
 
@@ -287,7 +296,7 @@ class JointFriction(_AbstractJointFriction):
     arm: Float[Array, ""] | None = number_field("arm", default=None)
     viscous: Float[Array, ""] = number_field("viscous", default=0.0)
     preload: Float[Array, ""] = number_field("preload", default=0.0)
-    load_rounding: Float[Array, ""] = number_field("load_rounding", default=1.0)
+    load_rounding: Float[Array, ""] | None = number_field("load_rounding", default=None)
     own_forces: bool = eqx.field(static=True, default=True, kw_only=True)
 
     def __check_init__(self):
@@ -331,7 +340,7 @@ class LuGreFriction(_AbstractJointFriction):
     arm: Float[Array, ""] | None = number_field("arm", default=None)
     viscous: Float[Array, ""] = number_field("viscous", default=0.0)
     preload: Float[Array, ""] = number_field("preload", default=0.0)
-    load_rounding: Float[Array, ""] = number_field("load_rounding", default=1.0)
+    load_rounding: Float[Array, ""] | None = number_field("load_rounding", default=None)
     own_forces: bool = eqx.field(static=True, default=True, kw_only=True)
 
     def __check_init__(self):

@@ -215,9 +215,11 @@ class BallLoad(AbstractLoad):
 
 
 class LoadSum(AbstractClosedFormLoad):
-    """Several loads at one place, as one; what is fixed to bodies and drawn is of the first."""
+    """Several loads at one place, as one, times a signal s(t) if there is one; what is fixed to bodies and drawn is of
+    the first."""
 
     parts: tuple[AbstractLoad, ...]
+    signal: AbstractSignal | None = None
 
     @property
     def balanced(self):
@@ -227,16 +229,23 @@ class LoadSum(AbstractClosedFormLoad):
     def drawn(self):
         return self.parts[0].drawn
 
+    @property
+    def driven(self):
+        return None if self.signal is None else constant_of(self.signal)
+
     def fixed(self, kind, bodies="ab"):
         return self.parts[0].fixed(kind, bodies)
 
     def force(self, a, b, va, vb, t):
-        return total(part.force(a, b, va, vb, t) for part in self.parts)
+        return self._times(total(part.force(a, b, va, vb, t) for part in self.parts), t)
 
     def tangents(self, a, b, va, vb, t):
         every = zip(*(load_tangents(part, a, b, va, vb, t) for part in self.parts))
         given = ([part for part in parts if part is not None] for parts in every)
-        return LoadTangents(*(total(parts) if parts else None for parts in given))
+        return LoadTangents(*(self._times(total(parts), t) if parts else None for parts in given))
+
+    def _times(self, value, t):
+        return value if self.signal is None else self.signal(t) * value
 
 
 class FollowingForce(AbstractClosedFormLoad):

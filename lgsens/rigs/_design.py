@@ -65,7 +65,8 @@ class AxleDesign(eqx.Module):
             axle: the axle at the start, both sides alike.
             vary: which numbers are free and how far, by patterns of their names (`AxleNumbers.select`).
             keep: by name of a curve, "toe" or "camber" over parallel travel [rad], or of a characteristic
-                (`CHARACTERISTICS`, SI units): how far it may be off its value at the start, or its bounds, a pair.
+                (`CHARACTERISTICS`, SI units): how far it may be off its value at the start, or its bounds, a pair. Empty:
+                the numbers have their bounds alone, and no rig is asked.
             travel: how far the wheels travel up and down on the rig [m], shape ().
             points: of each sweep, odd.
             t1: end of the run over the bump [s], shape ().
@@ -82,7 +83,7 @@ class AxleDesign(eqx.Module):
         used = {CURVES[name][0] if name in CURVES else CHARACTERISTICS[name].sweep for name in keep}
         sweeps = tuple((name, every[name]) for name in every if name in used)
         t1, num_steps = as_float(t1, (), "`t1`"), as_count(num_steps, "num_steps", " (it is static)")
-        now = _outputs(kc(axle.model(links="rods"), axle.wheel_centres, dict(sweeps), points=points), keep)
+        now = _outputs(_test(axle, sweeps, points), keep) if keep else {}
         for name, bound in keep.items():
             ends = [as_float(end, (), f"`keep[{name!r}]`") for end in (bound if np.ndim(bound) else (bound,))]
             band = Band.around(now[name], ends[0]) if len(ends) == 1 else Band(*(0.0 * now[name] + end for end in ends))
@@ -107,8 +108,7 @@ class AxleDesign(eqx.Module):
 
     def test(self, x: Design, *, throw: bool = True) -> KC:
         """The sweeps of the rig that the bands ask for."""
-        axle = self.with_design(x)
-        return kc(axle.model(links="rods"), axle.wheel_centres, dict(self.sweeps), points=self.points, throw=throw)
+        return _test(self.with_design(x), self.sweeps, self.points, throw=throw)
 
     def scene(self, x: Design) -> Model:
         """The left half, which runs over the bump."""
@@ -120,7 +120,7 @@ class AxleDesign(eqx.Module):
 
     def outputs(self, x: Design) -> dict[str, Float[Array, " n"]]:
         """What is kept in bands, SI units; NaN where the rig finds no equilibrium."""
-        return _outputs(self.test(x, throw=False), self.bands)
+        return _outputs(self.test(x, throw=False), self.bands) if self.bands else {}
 
     def objective(self, trajectory: Trajectory) -> Float[Array, ""]:
         """∫ z̈² dt of the chassis."""
@@ -130,6 +130,10 @@ class AxleDesign(eqx.Module):
         found = self.outputs(x)
         rows = [band.constraints(found[name]) for name, band in self.bands.items()]
         return self.objective(self.bump(x, throw=False)), jnp.concatenate([jnp.zeros(0, self.t1.dtype), *rows])
+
+
+def _test(axle: Axle, sweeps: tuple[tuple[str, Sweep], ...], points: int, *, throw: bool = True) -> KC:
+    return kc(axle.model(links="rods"), axle.wheel_centres, dict(sweeps), points=points, throw=throw)
 
 
 def _outputs(test: KC, names: Iterable[str]) -> dict[str, Float[Array, " n"]]:
