@@ -89,8 +89,8 @@ class AbstractSystem(eqx.Module):
         """The size of a large change of each coordinate: 1 rad, or the length of the scene [m]."""
 
     def constraint_round_off(self) -> Float[Array, ""]:
-        """What round-off may leave of Φ: a thousand of those of the largest number in q, or of a large change of it; far
-        from the origin those are of the distance."""
+        """What round-off may leave of Φ: a thousand of those of the largest number in q, or of a large change of it;
+        far from the origin those are of the distance."""
         scale = self.coordinate_scale()
         numbers = [jnp.max(jnp.abs(leaf), initial=1.0) for leaf in (scale, *jax.tree.leaves(self.reference()[0]))]
         return lax.stop_gradient(1e3 * jnp.finfo(scale.dtype).eps * jnp.max(jnp.stack(numbers)))

@@ -153,8 +153,8 @@ def _bounds(pattern: str, bound: Any, value: float, is_point: bool) -> tuple[flo
         raise ValueError(f"`vary`, {pattern!r}: must be a positive number or a pair (lower, upper), got {bound!r}.")
     if is_point and float(bound) > 1.0:
         raise ValueError(
-            f"`vary`, {pattern!r}: is in metres, whatever the unit of the file, and no point moves {bound:g} m either way; "
-            f"did you mean {float(bound) / 1e3:g}?"
+            f"`vary`, {pattern!r}: is in metres, whatever the unit of the file, and no point moves {bound:g} m "
+            f"either way; did you mean {float(bound) / 1e3:g}?"
         )
     width = float(bound) * (1.0 if is_point else value)
     return value - width, value + width

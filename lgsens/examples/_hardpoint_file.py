@@ -91,8 +91,8 @@ class Reader:
         if largest > most:
             raise self.fail(
                 key,
-                f"is in metres ('units.length' is of points alone), and {largest:g} m are more than the {most:g} m that "
-                f"are possible; did you mean {largest / 1e3:g}?",
+                f"is in metres ('units.length' is of points alone), and {largest:g} m are more than the {most:g} m "
+                f"that are possible; did you mean {largest / 1e3:g}?",
             )
         return lengths
 

@@ -255,8 +255,7 @@ class _InJoint(AbstractForce):
 
     def _rounding(self, bodies) -> Float[Array, ""]:
         """What is small beside the loads of this joint [N]: an absolute number is none in light mechanisms."""
-        masses = [bodies[name].mass for name in self.bodies if name is not None]
-        return _ROUNDING * functools.reduce(jnp.minimum, masses)
+        return _ROUNDING * functools.reduce(jnp.minimum, (bodies[name].mass for name in self.bodies if name))
 
 
 class JointFriction(_AbstractJointFriction):
@@ -277,8 +276,7 @@ class JointFriction(_AbstractJointFriction):
         arm: ℓ [m], shape (), > 0, half the distance of the two ends of a bearing; None: moments do not load it.
         viscous: c [N s/m], shape ().
         preload: N₀ [N], shape (), of a press fit, say.
-        load_rounding: ε [N], shape (), > 0: N is 1 % less than L at L = 7 ε, and 0.03 L at L = ε/30. None: a thousandth
-            of the weight of the lighter of both bodies, 9.81 m/s² × 1e-3 times its mass.
+        load_rounding: ε [N], shape (), > 0: N is 1 % less than L at L = 7 ε. None: 9.81e-3 m/s² × the lighter mass.
         own_forces: whether N depends on L. N = N₀ goes with every integrator and method, L with GeneralizedAlpha, its
             exact derivatives and Richardson.
 

@@ -65,8 +65,8 @@ class AxleDesign(eqx.Module):
             axle: the axle at the start, both sides alike.
             vary: which numbers are free and how far, by patterns of their names (`AxleNumbers.select`).
             keep: by name of a curve, "toe" or "camber" over parallel travel [rad], or of a characteristic
-                (`CHARACTERISTICS`, SI units): how far it may be off its value at the start, or its bounds, a pair. Empty:
-                the numbers have their bounds alone, and no rig is asked.
+                (`CHARACTERISTICS`, SI units): how far it may be off its value at the start, or its bounds, a pair.
+                Empty: the numbers have their bounds alone, and no rig is asked.
             travel: how far the wheels travel up and down on the rig [m], shape ().
             points: of each sweep, odd.
             t1: end of the run over the bump [s], shape ().

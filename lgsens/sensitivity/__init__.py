@@ -1,6 +1,7 @@
 """Derivatives of the trajectory, derived by hand (paper, §6–7)."""
 
 from lgsens.sensitivity._criterion_terms import Functional as Functional
+from lgsens.sensitivity._failed import Sound as Sound
 from lgsens.sensitivity._linearization import (
     Parameters as Parameters,
     configuration_cotangent as configuration_cotangent,

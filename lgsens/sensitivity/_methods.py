@@ -20,6 +20,7 @@ from lgsens.linear import LinearEquations, linear_solve
 from lgsens.sensitivity._continuous_adjoint import Cotangents, continuous_adjoint_sweep
 from lgsens.sensitivity._continuous_direct import continuous_direct_sweep
 from lgsens.sensitivity._criterion_terms import Functional, OfState, derivative_terms, plain_terms, points
+from lgsens.sensitivity._failed import Sound
 from lgsens.sensitivity._first_order_adjoint import first_order_adjoint_sweep
 from lgsens.sensitivity._linearization import (
     Parameters,
@@ -282,10 +283,10 @@ def _direct_rule(equations, primals, tangents):
     scheme, state0, parameters, _ = primals
     _, d_state0, d_parameters, _ = tangents
     states, stats = _direct_trajectory(equations, *primals)
-    group = parameters.system.group
+    group, sound = parameters.system.group, Sound.of(states)
     b = with_first(to_algebra(group, state0, d_state0), earlier(Variation.none(states)))
-    delta = linearized_trajectory(scheme, states, parameters, b, d_parameters, equations)
-    d_states = jax.vmap(partial(to_ambient, group))(states, delta)
+    delta = linearized_trajectory(scheme, sound.states, parameters, b, d_parameters, equations)
+    d_states = sound.lost(jax.vmap(partial(to_ambient, group))(sound.states, delta))
     return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
 
 
@@ -326,9 +327,10 @@ def _adjoint_forward(scheme, state0, parameters, found):
 
 
 def _adjoint_backward(kept, cotangents):
-    scheme, states, parameters = kept
-    group = parameters.system.group
-    c = jax.vmap(partial(cotangent_to_algebra, group))(states, cotangents[0])
+    scheme, found, parameters = kept
+    group, sound = parameters.system.group, Sound.of(found)
+    states = sound.states
+    c = jax.vmap(partial(cotangent_to_algebra, group))(states, sound.asked(cotangents[0]))
     mu, bar = adjoint_sweep(scheme, states, parameters, c, jax.tree.map(jnp.zeros_like, parameters))
     state0 = jax.tree.map(lambda leaf: leaf[0], states)
     first = jax.tree.map(lambda leaf: leaf[0], mu)

@@ -17,6 +17,7 @@ from jax import lax
 from lgsens.dynamics import State
 from lgsens.integrate import AbstractScheme, Stats, march
 from lgsens.linear import LinearEquations, linear_solve
+from lgsens.sensitivity._failed import Sound
 from lgsens.sensitivity._linearization import Parameters
 from lgsens.sensitivity._methods import AbstractSensitivity, AdjointVariable, DirectDifferentiation, decoded, encoded
 from lgsens.sensitivity._segments import (
@@ -78,8 +79,10 @@ def _from_states(
     method: AbstractSensitivity, output: Output, scheme, numbers: Any, state0, parameters: Parameters
 ) -> SavedRun:
     states, stats = method.trajectory(scheme, state0, parameters)
+    sound = Sound.of(states)
     at = lambda state, t: output(parameters.system, state, t, numbers)
-    outputs = jax.vmap(at)(states, parameters.grid.times())
+    asked, others = eqx.partition(jax.vmap(at)(sound.states, parameters.grid.times()), eqx.is_inexact_array)
+    outputs = eqx.combine(sound.lost(asked), others)
     return SavedRun(outputs, jax.tree.map(lambda leaf: leaf[-1], states), stats)
 
 

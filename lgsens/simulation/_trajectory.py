@@ -17,6 +17,7 @@ from lgsens._validate import as_float, is_concrete, suggestion
 from lgsens.dynamics import RESULTS, AbstractSystem, State
 from lgsens.integrate import Stages
 from lgsens.model import AbstractJoint, Frame, MultibodySystem, SE3System, joint_wrenches, measured, motion_at, scene_of
+from lgsens.sensitivity import Sound
 from lgsens.simulation._body_motion import BodyMotion, PointMotion
 from lgsens.simulation._joint_motion import JointMotion, joint_motion
 from lgsens.simulation._reached import Reached
@@ -60,7 +61,14 @@ def _of_each(question: Callable) -> Callable:
     def asked(motion: "AbstractMotion", *about, **more):
         if jnp.ndim(motion._kinematics()[1]) > motion._axes_of_time:
             return jax.vmap(lambda one: asked(one, *about, **more))(motion)
-        return question(motion, *about, **more)
+        if not motion._axes_of_time or is_concrete(motion.states.v):
+            return question(motion, *about, **more)
+        # of rows before a step that failed there are derivatives, backwards too
+        sound = Sound.of(motion.states)
+        found = question(eqx.tree_at(lambda motion: motion.states, motion, sound.states), *about, **more)
+        over_time = lambda leaf: eqx.is_inexact_array(leaf) and leaf.shape[:1] == motion.t.shape
+        rows, others = eqx.partition(found, over_time)
+        return eqx.combine(sound.lost(rows), others)
 
     return asked
 

@@ -316,3 +316,19 @@ def test_bad_input():
         twice.system()
     with pytest.raises(ValueError, match=says("needs forces that do not depend on multipliers")):
         lg.simulate(bar, t1=0.1, num_steps=2, integrator=lg.IndexReducedODE())
+
+
+@pytest.mark.parametrize("mass", [0.01, pytest.param(100.0, marks=pytest.mark.slow)])
+def test_it_holds_bodies_of_any_mass(mass):
+    """A block slides down a slope by g (sin α − μ cos α) t²/2, however light: ε is relative to its weight."""
+    axis, speed, mu, t1 = np.array([np.cos(0.5), 0.0, -np.sin(0.5)]), 1e-3, 0.3, 0.2
+    block = lg.RigidBody(mass, (0.1 * mass,) * 3)
+    slope = lg.PrismaticJoint(None, "block", at=(0.0, 0.0, 0.0), axis=axis)
+    forces = {
+        "weight": lg.Gravity((0.0, 0.0, -9.81)),
+        "rubs": lg.JointFriction("slope", coefficient=mu, slip_speed=speed),
+    }
+    run = lg.simulate(lg.Model({"block": block}, {"slope": slope}, forces), t1=t1, num_steps=400)
+    way = 0.5 * 9.81 * (np.sin(0.5) - mu * np.cos(0.5)) * t1**2
+    # until it slips at 10 w₀, in 5 ms, it is held by less: that much more speed at most, 10 w₀ t₁, of which 1/4 is seen
+    np.testing.assert_allclose(run.body("block").position[-1] @ axis, way, atol=3.0 * speed * t1)

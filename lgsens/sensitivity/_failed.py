@@ -1,0 +1,65 @@
+"""What a run that fails leaves of its derivative.
+
+Its states are those of the numerical trajectory up to the step that failed, and NaN from there on. The derivative of
+the first ones is theirs whatever follows. But back substitution meets the rows of the others first, and 0 × NaN is NaN:
+one lane of a batch that failed, masked or not, would make NaN of a gradient by what all lanes share. So rules linearize
+the last state before instead, at each later time, and what they find there is
+
+    forwards:     δ_n → NaN,
+    backwards:    c_n = 0 → 0,  else NaN:
+
+who asks for nothing of the states that there are not has a derivative, and who asks for them has none.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool
+
+from lgsens.dynamics import State
+from lgsens.linear import LinearEquations, linear_solve
+
+
+class Sound(NamedTuple):
+    """The states of a run, the last one before it failed in place of those after it; and which those are."""
+
+    states: State
+    failed: Bool[Array, " n+1"]
+
+    @classmethod
+    def of(cls, states: State) -> "Sound":
+        known = jnp.all(jnp.isfinite(states.v), axis=1) & jnp.all(jnp.isfinite(states.a), axis=1)
+        first = jnp.where(jnp.all(known), known.size, jnp.argmin(known))
+        failed, last = jnp.arange(known.size) >= first, jnp.maximum(first - 1, 0)
+
+        def filled(leaf):
+            one = lax.dynamic_index_in_dim(leaf, last, keepdims=True)
+            return jnp.where(_along(failed, leaf), one, leaf)
+
+        return cls(jax.tree.map(filled, states), failed)
+
+    def lost(self, rows: Any) -> Any:
+        """Rows of floats, NaN where the run has failed."""
+        return linear_solve(_LOST, self.failed, rows)
+
+    def asked(self, rows: Any) -> Any:
+        """The transpose: cotangents, NaN where the run has failed and they are not zero."""
+        return _asked(self.failed, rows)
+
+
+def _along(failed, leaf):
+    return jnp.expand_dims(failed, range(1, leaf.ndim))
+
+
+def _lost(failed, rows):
+    return jax.tree.map(lambda leaf: jnp.where(_along(failed, leaf), jnp.nan, leaf), rows)
+
+
+def _asked(failed, rows):
+    none = lambda leaf: jnp.where(leaf == 0.0, 0.0, jnp.nan).astype(leaf.dtype)
+    return jax.tree.map(lambda leaf: jnp.where(_along(failed, leaf), none(leaf), leaf), rows)
+
+
+_LOST = LinearEquations(lambda failed, x: x, _lost, _asked)
