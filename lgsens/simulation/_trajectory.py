@@ -61,12 +61,16 @@ def _of_each(question: Callable) -> Callable:
     def asked(motion: "AbstractMotion", *about, **more):
         if jnp.ndim(motion._kinematics()[1]) > motion._axes_of_time:
             return jax.vmap(lambda one: asked(one, *about, **more))(motion)
-        if not motion._axes_of_time or is_concrete(motion.states.v):
+        states, t = motion._kinematics()
+        if not motion._axes_of_time or is_concrete(states.v):
             return question(motion, *about, **more)
         # of rows before a step that failed there are derivatives, backwards too
-        sound = Sound.of(motion.states)
-        found = question(eqx.tree_at(lambda motion: motion.states, motion, sound.states), *about, **more)
-        over_time = lambda leaf: eqx.is_inexact_array(leaf) and leaf.shape[:1] == motion.t.shape
+        sound, where = Sound.of(states), lambda motion: motion.states
+        found = question(eqx.tree_at(where, motion, sound.states), *about, **more)
+        is_dict = lambda node: isinstance(node, dict)
+        if any(map(is_dict, jax.tree.leaves(found, is_leaf=is_dict))):  # whose order trees do not keep
+            return question(motion, *about, **more)
+        over_time = lambda leaf: eqx.is_inexact_array(leaf) and leaf.shape[:1] == t.shape
         rows, others = eqx.partition(found, over_time)
         return eqx.combine(sound.lost(rows), others)
 
