@@ -62,6 +62,7 @@ def test_chosen_numbers_are_replaced_on_both_sides_and_no_others():
         ({"links.tie_rods": 0.01}, {}, r"`vary`: 'links.tie_rods' matches no number of the axle; there are"),
         ({"spring.stiffness": -0.3}, {}, r"`vary`, 'spring.stiffness': must be a positive number or a pair"),
         ({"spring.stiffness": 1.5}, {}, "rates stay positive"),
+        ({"links.tie_rod": 10.0}, {}, "'links.tie_rod': is in metres, .* no point moves 10 m either way"),
         ({"spring.stiffness": 0.3}, {"tow": 0.1}, "`keep`: .*'tow'"),
     ],
 )

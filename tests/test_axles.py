@@ -486,6 +486,21 @@ MISTAKES = {
         ("key 'twist_beam.knuckle'", "is in the plane y = 0", "its mirror image", "move it"),
     ),
     "twist beam without a section": ("twist_beam", {"twist_beam.beam": None}, ("key 'twist_beam.beam'", "is missing")),
+    "shear centre in mm": (
+        "twist_beam",
+        {"twist_beam.shear_centre": [0.0, 35.4]},
+        ("key 'twist_beam.shear_centre'", "is in metres", "35.4 m are more than the 1 m", "did you mean 0.0354"),
+    ),
+    "twist beam on the other side": (
+        "twist_beam",
+        {"twist_beam.knuckle": [0.27, -0.5, 0.015]},
+        ("key 'twist_beam.knuckle'", "is at y = -0.5 m", "on the other side of the car", "turn the sign"),
+    ),
+    "bump in mm": (
+        "twist_beam",
+        {"bump.height": 50.0},
+        ("key 'bump.height'", "is in metres", "50 m are more than the 1 m", "did you mean 0.05"),
+    ),
     "shear centre of three": (
         "twist_beam",
         {"twist_beam.shear_centre": [0.0, 0.0, 0.03]},

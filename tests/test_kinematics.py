@@ -347,3 +347,22 @@ def test_redundant_hinges_are_refused_unless_asked_for():
         ValueError, match=says("18 coordinates and 21 equations", "free='x y rz'", "redundant='remove'")
     ):
         lg.kinematics(refusing, {"motor": [0.1]})
+
+
+@pytest.mark.parametrize("offset", [1e4, pytest.param(1e5, marks=pytest.mark.slow)])
+def test_far_from_the_origin(offset):
+    """A quick return whose bodies turn about fixed points: the rate of its lever in closed form."""
+    crank, distance, rate = 0.1, 0.05, 3.0
+    o = offset * np.array([1.0, 1.0, 0.0])
+    bodies = {
+        "crank": lg.RigidBody(1.0, (0.01,) * 3, free="rz", pivot=o + np.array([distance, 0.0, 0.0])),
+        "lever": lg.RigidBody(1.0, (0.02,) * 3, free="rz", pivot=o),
+    }
+    pin = lg.PointOnLineJoint("lever", "crank", at=o + np.array([distance + crank, 0.0, 0.0]), axis=(1.0, 0.0, 0.0))
+    joints = {"pin": pin, "motor": lg.RotationDriver(None, "crank", axis=(0.0, 0.0, 1.0))}
+    angles = np.linspace(0.0, 2.0 * np.pi, 13)
+    found = lg.kinematics(lg.Model(bodies, joints), {"motor": angles}, rates={"motor": rate})
+    square = crank**2 + distance**2 + 2.0 * crank * distance * np.cos(angles)
+    expected = rate * crank * (crank + distance * np.cos(angles)) / square
+    # hardpoints are rounded, 1e-16 of the distance, which is so much of the arm of 0.05 m
+    np.testing.assert_allclose(found.body("lever").angular_velocity[:, 2], expected, rtol=20 * 2e-16 * offset / 0.05)

@@ -174,3 +174,24 @@ def test_bad_input(arguments, message):
     model = settings.pop("model", None) or lever()
     with pytest.raises(ValueError, match=message):
         lg.statics(model, **settings)
+
+
+def test_a_fixed_moment_is_a_load():
+    """About the axis of a hinge it turns the bar as the moment that turns with it does, and both add to a force."""
+    spring = lg.TorsionSpringDamper(None, "bar", axis=(0.0, 1.0, 0.0), stiffness=100.0)
+
+    def turned(**load):
+        model = lg.Model(
+            {"bar": lg.RigidBody(2.0, (0.1, 0.1, 0.1), position=(0.5, 0.0, 0.0))},
+            {"hinge": lg.RevoluteJoint(None, "bar", at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))},
+            {"spring": spring, "load": lg.AppliedForce("bar", **load)},
+        )
+        found = lg.statics(model, loads={"load": np.array([0.0, 10.0])})
+        return found.joint("hinge").angle, found.along().joint("hinge").rate
+
+    up = {"at": (0.5, 0.0, 0.0), "force": (0.0, 0.0, 1.0), "follows": True}  # −0.5 N m about y, however it turns
+    for load, moment in (({"fixed_moment": (0.0, 1.0, 0.0)}, 1.0), (up | {"fixed_moment": (0.0, 1.0, 0.0)}, 0.5)):
+        angles, rates = turned(**load)
+        # round-off of angles of 0.1 rad in rotations and their logarithm, a few
+        np.testing.assert_allclose(angles, [0.0, 0.1 * moment], atol=1e-13)
+        np.testing.assert_allclose(rates, [0.01 * moment] * 2, rtol=1e-11)
