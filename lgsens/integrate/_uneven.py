@@ -255,8 +255,7 @@ def _controlled_steps(
         progress, size, proposed, before, elapsed = carry
         active = progress.running & (elapsed < total)
         remaining = jnp.where(active, total - elapsed, h)
-        keeps = (proposed > _KEPT[0] * size) & (proposed < _KEPT[1] * size)
-        wanted = fitted(jnp.where(keeps, size, proposed), remaining)
+        wanted = fitted(proposed, remaining)
         resize = lambda: scheme.resized(system, progress.state, t0 + elapsed)
         shapes = jax.eval_shape(resize)
         none_yet = alike(jax.tree.map(jnp.zeros_like, shapes), shapes)
@@ -308,10 +307,12 @@ def _controlled_steps(
         error = jnp.maximum(trial.error, _LEAST)
         rho = (_AIM / error * _AIM / before) ** (1.0 / (4 * power)) * (size / trial.h) ** 0.25
         grown = trial.h * (1.0 + _LIMIT * jnp.arctan((rho - 1.0) / _LIMIT))
-        grown = jnp.minimum(grown, 0.8 * _TURN / unsteady_rate(system, progress.state.v, progress.state.vdot))
+        keeps = (grown > _KEPT[0] * trial.h) & (grown < _KEPT[1] * trial.h)
+        longest = 0.8 * _TURN / unsteady_rate(system, progress.state.v, progress.state.vdot)
+        proposed = jnp.minimum(jnp.where(keeps, trial.h, grown), longest)
         elapsed = jnp.where(active, jnp.where(trial.h >= remaining, total, elapsed + trial.h), elapsed)
         h_taken = jnp.where(active | ~progress.running, trial.h, 0.0)
-        carry = (progress, jnp.where(active, trial.h, size), grown, error, elapsed)
+        carry = (progress, jnp.where(active, trial.h, size), proposed, error, elapsed)
         return carry, (h_taken, progress.state, trial.stats, trial.error * tolerance, trial.rejected)
 
     q, v = first.state.q, first.state.v
