@@ -209,8 +209,9 @@ def test_derivatives_of_what_came_before_a_failure():
     """Backwards as forwards and as differences, in a batch of which a lane failed too; NaN if asked for the rest."""
 
     def early(push, row=3):
-        motion = fail(push, throw=False).body("bob")
-        return motion.position[row, 0] + jnp.sum(motion.orientation[row] @ motion.angular_velocity[row])
+        run = fail(push, throw=False)
+        motion, turned = run.body("bob"), run.joint("pivot").coordinates["rotation_y"]
+        return turned[row] + motion.position[row, 0] + jnp.sum(motion.orientation[row] @ motion.angular_velocity[row])
 
     backwards = jax.jit(jax.grad(early))(30.0)
     np.testing.assert_allclose(backwards, jax.jit(jax.jacfwd(early))(30.0), rtol=1e-10)  # other order of round-off

@@ -11,6 +11,7 @@ the last state before instead, at each later time, and what they find there is
 who asks for nothing of the states that there are not has a derivative, and who asks for them has none.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -41,25 +42,25 @@ class Sound(NamedTuple):
         return cls(jax.tree.map(filled, states), failed)
 
     def lost(self, rows: Any) -> Any:
-        """Rows of floats, NaN where the run has failed."""
-        return linear_solve(_LOST, self.failed, rows)
+        """Rows of floats, NaN where the run has failed: one by one, so that what nobody asks for has no derivative."""
+        return jax.tree.map(lambda leaf: linear_solve(_LOST, self.failed, leaf), rows)
 
     def asked(self, rows: Any) -> Any:
         """The transpose: cotangents, NaN where the run has failed and they are not zero."""
-        return _asked(self.failed, rows)
+        return jax.tree.map(partial(_asked, self.failed), rows)
 
 
 def _along(failed, leaf):
     return jnp.expand_dims(failed, range(1, leaf.ndim))
 
 
-def _lost(failed, rows):
-    return jax.tree.map(lambda leaf: jnp.where(_along(failed, leaf), jnp.nan, leaf), rows)
+def _lost(failed, leaf):
+    return jnp.where(_along(failed, leaf), jnp.nan, leaf)
 
 
-def _asked(failed, rows):
-    none = lambda leaf: jnp.where(leaf == 0.0, 0.0, jnp.nan).astype(leaf.dtype)
-    return jax.tree.map(lambda leaf: jnp.where(_along(failed, leaf), none(leaf), leaf), rows)
+def _asked(failed, leaf):
+    none = jnp.where(leaf == 0.0, 0.0, jnp.nan).astype(leaf.dtype)
+    return jnp.where(_along(failed, leaf), none, leaf)
 
 
 _LOST = LinearEquations(lambda failed, x: x, _lost, _asked)

@@ -67,12 +67,11 @@ def _of_each(question: Callable) -> Callable:
         # of rows before a step that failed there are derivatives, backwards too
         sound, where = Sound.of(states), lambda motion: motion.states
         found = question(eqx.tree_at(where, motion, sound.states), *about, **more)
-        is_dict = lambda node: isinstance(node, dict)
-        if any(map(is_dict, jax.tree.leaves(found, is_leaf=is_dict))):  # whose order trees do not keep
-            return question(motion, *about, **more)
         over_time = lambda leaf: eqx.is_inexact_array(leaf) and leaf.shape[:1] == t.shape
         rows, others = eqx.partition(found, over_time)
-        return eqx.combine(sound.lost(rows), others)
+        answer, is_dict = eqx.combine(sound.lost(rows), others), lambda node: isinstance(node, dict)
+        in_order = lambda own, new: {name: new[name] for name in own} if is_dict(own) else new  # which trees forget
+        return jax.tree.map(in_order, found, answer, is_leaf=is_dict)
 
     return asked
 
