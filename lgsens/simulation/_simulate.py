@@ -115,7 +115,8 @@ def simulate(
             to see the shortest event (the bump of a road). Derivatives go through the last run.
         throw: raise if the simulation fails; inside `jit` and `vmap`, where nothing can be raised, all data are NaN and
             `Trajectory.result` says why (`raise_if_failed`). With False it says so, and the data are finite up to the
-            step that failed and NaN from there on; of `AdaptiveSteps` that ran out of steps they end before t1.
+            step that failed and NaN from there on, and so are derivatives in both modes (with `checkpoints` those in
+            reverse mode are NaN); of `AdaptiveSteps` that ran out of steps they end before t1.
 
     The derivative of the trajectory with respect to every number of the model, the initial state and the
     times is that of the numerical solution, to round-off.
