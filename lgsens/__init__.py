@@ -34,12 +34,14 @@ from lgsens.criteria import (
     FiniteDifferences as FiniteDifferences,
     IndexReduced as IndexReduced,
     Kink as Kink,
+    PlacedSteps as PlacedSteps,
     Sensitivities as Sensitivities,
     certify as certify,
     differentiate as differentiate,
     direct_or_adjoint as direct_or_adjoint,
     measure_costs as measure_costs,
     soft_maximum as soft_maximum,
+    steps_for as steps_for,
     time_integral as time_integral,
 )
 from lgsens.dynamics import RESULTS as RESULTS, AbstractSystem as AbstractSystem, State as State

@@ -18,4 +18,5 @@ from lgsens.criteria._differentiate import (
 from lgsens.criteria._error_estimate import corrected as corrected, error_estimate as error_estimate
 from lgsens.criteria._kinks import Kink as Kink, kinks as kinks, roughness as roughness
 from lgsens.criteria._reference_methods import FiniteDifferences as FiniteDifferences, IndexReduced as IndexReduced
+from lgsens.criteria._steps_for import PlacedSteps as PlacedSteps, steps_for as steps_for
 from lgsens.criteria._to_accuracy import differentiate_to as differentiate_to

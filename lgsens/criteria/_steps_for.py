@@ -1,0 +1,170 @@
+"""`steps_for`: steps placed where they serve a criterion and its gradient."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from lgsens._brief import brief
+from lgsens._validate import as_count, as_float, is_concrete
+from lgsens.criteria._criterion import Criterion
+from lgsens.criteria._defect_density import defect_densities
+from lgsens.criteria._placed_steps import LONGEST, Placed, placed_steps
+from lgsens.dynamics import State
+from lgsens.integrate import AbstractScheme, GeneralizedAlpha, GivenSteps
+from lgsens.simulation import interval, raise_if_failed
+
+_LEAST_STEPS = 8
+_UNRESOLVED = 0.5  # relative error of a pilot run whose estimates are worth nothing
+_UNCANCELLED = 0.03  # of what adds up regardless of signs: these are known to leading order, of the pilot's motion
+_MOST = 100_000
+
+
+class PlacedSteps(NamedTuple):
+    """Steps for criteria, and the errors that are expected with them.
+
+    Attributes:
+        integrator: the steps, `GivenSteps`.
+        value_error: the expected error of each Ψ relative to it, a pytree as the criteria, leaves of shape ().
+        gradient_error: that of each dΨ/dp by its norm, relative to it, as `value_error`.
+    """
+
+    integrator: GivenSteps
+    value_error: PyTree
+    gradient_error: PyTree
+
+    @property
+    def num_steps(self) -> int:
+        return self.integrator.num_steps
+
+    __repr__ = brief
+
+
+def steps_for(
+    criteria: PyTree,
+    build: Callable[[Any], Any],
+    p: PyTree,
+    *,
+    t0=0.0,
+    t1,
+    pilot: int,
+    tolerance: float | None = None,
+    num_steps: int | None = None,
+    integrator: AbstractScheme = GeneralizedAlpha(),
+    state0: Callable[[Any], State] | None = None,
+) -> PlacedSteps:
+    """Steps for a criterion: as few as give Ψ **and** dΨ/dp a tolerance, or so many where they serve both best.
+
+    ```python
+    steps = lg.steps_for(criterion, build, p, t1=2.0, pilot=250, tolerance=1e-3)
+    lg.differentiate(criterion, build, p, t1=2.0, num_steps=steps.num_steps, integrator=steps.integrator)
+    ```
+
+    Arguments:
+        criteria: a `Criterion`, or a pytree of them: the steps serve all.
+        build, p, t0, t1, state0: as in `differentiate`.
+        pilot: the number of equal steps of a run that tells where errors come from: such that the motion is resolved,
+            and the shortest event (the bump of a road) seen.
+        tolerance: the relative error that is wanted of each value, and of each gradient by its norm.
+        num_steps: how many steps there are to be; then `tolerance` is left out.
+        integrator: the scheme, `GeneralizedAlpha` of index 3, without forces that depend on multipliers.
+
+    From the pilot run, its adjoint variables and eight derivatives of what they say of its defects; no other run. The
+    steps are those for the numbers p: they serve designs nearby, as smoothly as equal ones, and derivatives on them are
+    exact. None is longer than about three of the pilot's, where no criterion looks. `AdaptiveSteps` has steps for the motion. The errors are estimates to leading order,
+    with 3 % of what adds up regardless of signs on top.
+
+    With `num_steps` it may be inside of `jit` and `vmap`, which gives each design its own steps; those are constants
+    for derivatives. If the pilot fails there, the steps are equal ones.
+
+    Raises `ValueError` for criteria that are no `Criterion`, both or none of `tolerance` and `num_steps`, a pilot of
+    fewer than eight steps or one that does not resolve what is asked for, another scheme, and a tolerance that takes
+    more than 100000 steps; `SimulationError` if the pilot fails. Source: Becker & Rannacher, Acta Numerica 10 (2001).
+    """
+    leaves, structure = jax.tree.flatten(criteria, is_leaf=lambda leaf: isinstance(leaf, Criterion))
+    if not leaves or not all(isinstance(leaf, Criterion) for leaf in leaves):
+        raise ValueError(f"`criteria` must be a Criterion or a pytree of them, got {criteria!r}.")
+    if not callable(build):
+        raise ValueError(f"`build` must be a function of the parameters that returns a Model, got {build!r}.")
+    pilot = as_count(pilot, "pilot", " (it is static)")
+    if pilot < _LEAST_STEPS:
+        raise ValueError(f"`pilot` must be at least {_LEAST_STEPS} steps, got {pilot}.")
+    if (tolerance is None) == (num_steps is None):
+        raise ValueError(
+            "Give either `tolerance`, the relative error of values and gradients that is wanted, or `num_steps`, how "
+            f"many steps there are to be; got tolerance={tolerance!r}, num_steps={num_steps!r}."
+        )
+    if num_steps is not None and as_count(num_steps, "num_steps", " (it is static)") < _fewest(pilot):
+        raise ValueError(
+            f"`num_steps` = {num_steps} is too few beside a pilot of {pilot} steps: none may be longer than {LONGEST} of "
+            f"those; give at least {_fewest(pilot)}, or a pilot of fewer steps if that resolves the motion."
+        )
+    if tolerance is not None and not (isinstance(tolerance, float | int) and 0.0 < tolerance < 1.0):
+        raise ValueError(f"`tolerance` must be a number between 0 and 1, got {tolerance!r}.")
+    if not (isinstance(integrator, GeneralizedAlpha) and not integrator.stabilized):
+        raise ValueError(
+            f"`integrator` must be a GeneralizedAlpha of index 3, whose defects are known, got {integrator!r}; "
+            "AdaptiveSteps has steps for the motion by any scheme."
+        )
+    t0, t1 = interval(t0, t1)
+    p = jax.tree_util.tree_map_with_path(lambda path, leaf: as_float(leaf, None, f"`p`{jax.tree_util.keystr(path)}"), p)
+    if not sum(leaf.size for leaf in jax.tree.leaves(p)):
+        raise ValueError(f"`p` must hold at least one number, got {p!r}.")
+    rows, trajectory = jax.lax.stop_gradient(
+        defect_densities(tuple(leaves), build, state0, p, t0, t1, pilot, integrator)
+    )
+    if is_concrete(rows, trajectory.result):
+        raise_if_failed(trajectory)
+        _check_resolved(rows, pilot)
+    elif tolerance is not None:
+        raise ValueError("`tolerance`: inside of `jit` and `vmap` the number of steps must be known; give `num_steps`.")
+    flat = rows.reshape(-1, pilot)
+    if num_steps is None:
+        num_steps = _enough(flat, rows.shape[0], float(tolerance), pilot)
+    placed = placed_steps(flat, num_steps)
+    of_values, of_gradients = (structure.unflatten(list(part)) for part in _expected(placed, len(leaves)))
+    return PlacedSteps(GivenSteps(jax.lax.stop_gradient(placed.fractions), integrator), of_values, of_gradients)
+
+
+def _expected(placed: Placed, count: int) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+    """The relative errors of values and of gradients."""
+    errors = (jnp.abs(placed.errors) + _UNCANCELLED * placed.bounds).reshape(count, -1)
+    return errors[:, 0], jnp.linalg.norm(errors[:, 1:], axis=1)
+
+
+def _check_resolved(rows, pilot: int) -> None:
+    totals = np.sum(np.asarray(rows), axis=2)
+    found = max(np.abs(totals[:, 0]).max(), np.linalg.norm(totals[:, 1:], axis=1).max())
+    if not found <= _UNRESOLVED:  # NaN is not
+        raise ValueError(
+            f"`pilot` = {pilot} equal steps do not resolve the criteria: their errors are estimated as {found:.1g} of "
+            "the values and gradients, which says nothing of where they come from. Take more steps for the pilot run; a "
+            "value or gradient that is zero has no relative error."
+        )
+
+
+def _enough(rows, count: int, tolerance: float, pilot: int) -> int:
+    """A number of steps whose expected errors have the tolerance, and not one that is 5 % less, by bisection."""
+
+    def reached(num_steps: int) -> bool:
+        return max(float(jnp.max(part)) for part in _expected(placed_steps(rows, num_steps), count)) <= tolerance
+
+    fewest = most = _fewest(pilot)
+    while not reached(most):
+        fewest, most = most, 2 * most
+        if most > _MOST:
+            raise ValueError(
+                f"`tolerance` = {tolerance:g} would take more than {_MOST} steps by the estimate; ask for less, or for "
+                "`accuracy` in `differentiate`, which extrapolates."
+            )
+    while most - fewest > max(0.05 * fewest, 1.0):
+        between = round(np.sqrt(fewest * most))
+        fewest, most = (fewest, between) if reached(between) else (between, most)
+    return most
+
+
+def _fewest(pilot: int) -> int:
+    return max(-(-pilot // LONGEST), _LEAST_STEPS)
