@@ -45,6 +45,7 @@ takes 83 instead of 66 ms. (`lgsens.sweep` takes its factorizations apart by its
 import contextlib
 import gc
 import os
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -102,6 +103,30 @@ def set_options() -> None:
         )
 
 
+class _SeldomCollected:
+    """A threshold of Python's collector, one for all threads: the first to enter raises it, the last restores it."""
+
+    def __init__(self):
+        self._lock, self._entered, self._before = threading.Lock(), 0, (0, 0, 0)
+
+    def __enter__(self):
+        with self._lock:
+            if self._entered == 0:
+                self._before = gc.get_threshold()
+                if 0 < self._before[0] < _COLLECTED:
+                    gc.set_threshold(_COLLECTED, *self._before[1:])
+            self._entered += 1
+
+    def __exit__(self, *_):
+        with self._lock:
+            self._entered -= 1
+            if self._entered == 0:
+                gc.set_threshold(*self._before)
+
+
+_seldom_collected = _SeldomCollected()
+
+
 @contextlib.contextmanager
 def tracing() -> Iterator[None]:
     """While a simulation and its derivatives are traced, of which it takes a half: 3.5 s instead of 6.3 s for the
@@ -111,14 +136,8 @@ def tracing() -> Iterator[None]:
     custom rule: named as it is, it is the same in both, and nothing is traced for each of them. And a trace is millions
     of small objects that live until it ends: Python looks through them a hundred times as seldom.
     """
-    before = gc.get_threshold()
-    if 0 < before[0] < _COLLECTED:
-        gc.set_threshold(_COLLECTED, *before[1:])
-    try:
-        with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
-            yield
-    finally:
-        gc.set_threshold(*before)
+    with _seldom_collected, jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
+        yield
 
 
 # Inside of `shard_map` numbers of a design differ from device to device ("vary"), constants do not, and JAX refuses

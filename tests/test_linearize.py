@@ -543,3 +543,13 @@ def test_what_is_refused(car):
     unstable = dataclasses.replace(car, eigenvalues=-car.eigenvalues)
     with pytest.raises(ValueError, match=says("`linear` must settle")):
         lg.random_road(unstable, roughness=1e-6, speed=1.0)
+
+
+def test_a_stiff_beam_is_steady_at_its_own_equilibrium():
+    """Its lumps turn at 1e5 rad/s and more: round-off of the configuration accelerates them by 1e-4 1/s²."""
+    section = lg.BeamSection.rectangle(0.02, 0.004, young=2.1e11, poisson=0.3, density=7850.0)
+    beam = lg.Beam("beam", section, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], elements=4)
+    clamp = {"clamp": lg.FixedJoint(None, "beam.0", at=(0.0, 0.0, 0.0))}
+    model = lg.Model(beam.bodies, clamp, beam.forces | {"g": lg.Gravity((0.0, 0.0, -9.81))}, merge_fixed=True)
+    here, there = (lg.linearize(model, *state).frequencies[0] for state in ((), (lg.equilibrium(model),)))
+    np.testing.assert_allclose(there, here, rtol=1e-8)  # √ε of the configuration that either iteration leaves

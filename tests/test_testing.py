@@ -418,3 +418,21 @@ def test_bad_arguments():
         check_sensitivities(jnp.log, -1.0)
     with pytest.raises(ValueError, match=says("`at` has no arrays")):
         check_sensitivities(lambda x: 1.0, {})
+
+
+class Vibrating(AbstractConstraint):
+    """A point that a support holds, which moves by A (sin(ωt + φ) − sin φ): by nothing in A at t = 0."""
+
+    point: jax.Array
+    amplitude: jax.Array
+    rate: jax.Array
+    num_rows = 3
+
+    def value(self, a, b, t):
+        way = self.amplitude * jnp.sin(self.rate * t + 0.3) - self.amplitude * jnp.sin(0.3)
+        return b.point(self.point) - jnp.stack([way, 0.0 * way, 0.0 * way])
+
+
+@pytest.mark.parametrize("amplitude", [0.3, pytest.param(0.7, marks=pytest.mark.slow)])
+def test_a_derivative_that_vanishes_by_cancellation_passes(amplitude):
+    check_joint(Vibrating(jnp.asarray(POINT), jnp.asarray(amplitude), jnp.asarray(4.0))).raise_if_failed()

@@ -1,5 +1,6 @@
 """What lgsens asks of XLA when it is imported."""
 
+import contextlib
 import gc
 import os
 import subprocess
@@ -9,7 +10,7 @@ import pytest
 from helpers import some_quick
 from jaxlib.version import __version_info__ as VERSION
 
-from lgsens._xla import tracing
+from lgsens._xla import _seldom_collected, tracing
 
 OPTION = "--xla_cpu_experimental_ynn_fusion_type"
 EXTRA = "--xla_backend_extra_options"
@@ -106,3 +107,14 @@ def test_few_cores_get_one_thread_unless_the_user_says_otherwise(cores, own, thr
     code = f"import os; os.sched_getaffinity = lambda _: range({cores}); import lgsens; print(os.getenv('PJRT_NPROC'))"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=given, check=True)
     assert found.stdout.split() == [threads]
+
+
+def test_threads_leave_the_collector_as_it_was():
+    """One enters before the other leaves, and leaves before that."""
+    before = gc.get_threshold()
+    with contextlib.ExitStack() as first, contextlib.ExitStack() as second:
+        first.enter_context(tracing())
+        second.enter_context(_seldom_collected)
+        first.close()
+        assert gc.get_threshold()[0] > before[0] or before[0] >= 100_000
+    assert gc.get_threshold() == before

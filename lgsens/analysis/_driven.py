@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from lgsens._validate import as_float, suggestion
-from lgsens.dynamics import AbstractDrive
+from lgsens.dynamics import AbstractDrive, jumped
 from lgsens.model import AbstractJoint, AbstractSignal, Model, MultibodySystem
 
 
@@ -45,6 +45,14 @@ def with_numbers(model: Model, t, names: Iterable[str] | None = None) -> Model:
 
     joints = {name: numbers(joint) if names is None or name in names else joint for name, joint in model.joints.items()}
     return eqx.tree_at(lambda model: model.joints, model, joints)
+
+
+def jumps(system: MultibodySystem, q: Any) -> tuple[jax.Array, jax.Array]:
+    """Whether an angle that poses tell within half a turn jumps from one of these configurations to the next, the first
+    from the reference, and before which of them."""
+    home = system.branches(system.reference()[0])
+    found = jumped(jax.lax.stop_gradient(jnp.concatenate([home[None], jax.vmap(system.branches)(q)])))
+    return jnp.any(found), jnp.argmax(found)
 
 
 def drivers(system: MultibodySystem, kind: str = "constraints") -> dict[str, tuple[str, int, int]]:

@@ -10,7 +10,17 @@ from jaxtyping import Array, Float, Int
 
 from lgsens._validate import as_float
 from lgsens._xla import alike
-from lgsens.analysis._driven import Drive, columns, drivers, of_one_length, refuse_history, speeds, table, with_numbers
+from lgsens.analysis._driven import (
+    Drive,
+    columns,
+    drivers,
+    jumps,
+    of_one_length,
+    refuse_history,
+    speeds,
+    table,
+    with_numbers,
+)
 from lgsens.dynamics import RESULTS, State, forces_of_motion, positions
 from lgsens.model import AbstractJoint, Model, MultibodySystem
 from lgsens.simulation import AbstractRun, throw_if_failed
@@ -69,7 +79,8 @@ def kinematics(
         t: times [s], shape (n,): signals run, and velocities and accelerations are the derivatives of the motion by
             time. None: signals are held at t0.
         t0: the time at which signals and time-dependent forces are taken where `t` is None [s], shape ().
-        throw: raise if there is no such position. With False `result` says so, and its numbers are NaN.
+        throw: raise if there is no such position, or an angle of a spring, a gear or a coupling passes half a turn,
+            which positions do not tell. With False `result` says so; numbers of a position that is none are NaN.
 
     Differentiable by every number of the model and by the driven values, by the implicit function theorem: one
     factorization per position for all of them. Raises `ValueError` for names that are not drivers, values of different
@@ -119,7 +130,11 @@ def _kinematics_jit(drive: Drive, driven, rates):
     found = positions(drive, *driven)
     states = jax.vmap(lambda *args: forces_of_motion(drive, *args))(found.q, driven, rates)
     first = jnp.argmin(found.found)  # the first that was not found, 0 if all were
-    result = jnp.where(jnp.all(found.found), RESULTS.successful, RESULTS.position_failed).astype(jnp.int32)
+    result = jnp.where(jnp.all(found.found), RESULTS.successful, RESULTS.position_failed)
+    an_angle, place = jumps(drive.system, found.q)
+    an_angle &= result == RESULTS.successful
+    first = jnp.where(an_angle, place, first)
+    result = jnp.where(an_angle, RESULTS.angle_jumped, result).astype(jnp.int32)
     details = {"violation": found.violation[first], "values": driven[0][first], "time": driven[1][first]}
     details["position"] = first
     return (states, result), jax.lax.stop_gradient(details)

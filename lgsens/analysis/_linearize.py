@@ -246,7 +246,8 @@ def _linearize_jit(model, given: State | None, t0, rotation, names: tuple[str, .
         initial = equilibrium(system, t0)
         state, result, details = initial.state, initial.result, {"violation": initial.violation}
         basis = null_space(system, full_jacobian(system, state.q, t0))
-        space, steady = at(state, None, basis), accelerates_steadily(system, state, None)
+        space = at(state, None, basis)
+        steady = accelerates_steadily(system, state, None, space.A)
     else:
         turning = turning_axes(system, given, rotation)
         q, v, turn = later(system, given, rotation, turning)
@@ -257,7 +258,7 @@ def _linearize_jit(model, given: State | None, t0, rotation, names: tuple[str, .
         spaces = jax.vmap(lambda state, basis: at(state, turning, basis))(states, twice(basis, turn @ basis))
         (state, space), (_, again) = (jax.tree.map(lambda leaf, i=i: leaf[i], (states, spaces)) for i in (0, 1))
         result = jnp.where(system.is_valid() & finite(state), RESULTS.successful, RESULTS.invalid_numbers)
-        steady = accelerates_steadily(system, state, turning) & _alike(space, again)
+        steady = accelerates_steadily(system, state, turning, space.A) & _alike(space, again)
     jacobian = full_jacobian(system, state.q, t0)
     redundant = is_redundant(system, constraint_jacobian(system, state.q, t0))
     result = jnp.where((result == RESULTS.successful) & ~steady, RESULTS.not_steady, result)

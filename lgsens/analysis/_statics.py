@@ -12,7 +12,17 @@ from jaxtyping import Array, Float, Int
 
 from lgsens._validate import as_float
 from lgsens._xla import alike
-from lgsens.analysis._driven import Drive, columns, drivers, of_one_length, refuse_history, speeds, table, with_numbers
+from lgsens.analysis._driven import (
+    Drive,
+    columns,
+    drivers,
+    jumps,
+    of_one_length,
+    refuse_history,
+    speeds,
+    table,
+    with_numbers,
+)
 from lgsens.dynamics import RESULTS, State, require_independent, static_path
 from lgsens.model import AbstractJoint, Model, MultibodySystem
 from lgsens.simulation import AbstractRun, throw_if_failed
@@ -141,6 +151,10 @@ def _statics_jit(drive: Drive, values, rates, t, starts: tuple[int, ...]):
     free = found.pivot[first] < 1e3 * jnp.finfo(values.dtype).eps
     failed = jnp.where(free, RESULTS.not_held, RESULTS.statics_failed)
     result = jnp.where(jnp.all(found.found), RESULTS.successful, failed)
+    an_angle, place = jumps(drive.system, found.q) if not starts else (jnp.zeros((), bool), first)
+    an_angle &= result == RESULTS.successful
+    first = jnp.where(an_angle, place, first)
+    result = jnp.where(an_angle, RESULTS.angle_jumped, result)
     result = jnp.where(drive.system.is_valid(), result, RESULTS.invalid_numbers).astype(jnp.int32)
     before = jax.tree.map(lambda leaf: leaf[jnp.maximum(first - 1, 0)], (found.q, found.lam))
     details = {"values": values[first], "time": t, "position": first, "before": before}

@@ -83,11 +83,16 @@ def later(
     return system.group.retract(q, way), turn @ state.v, turn
 
 
-def accelerates_steadily(system: AbstractSystem, state: State, turning: Float[Array, "k k"] | None) -> Bool[Array, ""]:
-    """v̇ = Γ v; at rest v = 0 but for the states of elements, and v̇ = 0."""
+def accelerates_steadily(
+    system: AbstractSystem, state: State, turning: Float[Array, "k k"] | None, matrix: Float[Array, "s s"]
+) -> Bool[Array, ""]:
+    """v̇ = Γ v; at rest v = 0 but for the states of elements, and v̇ = 0: to round-off of q times the stiffness over the
+    inertia, which are in the `matrix` of the linearized motion."""
     scale, moving = system.coordinate_scale(), system.group.dim - system.num_states
+    eps = jnp.finfo(scale.dtype).eps
     speed = jnp.max(jnp.abs(state.v / scale)[:moving])
     left = state.vdot if turning is None else state.vdot - turning @ state.v
-    enough = jnp.finfo(scale.dtype).eps ** 0.375  # 1e-6 in double precision: of 1/s² and of the square of the speed
-    steady = jnp.max(jnp.abs(left) / scale) <= enough * (1.0 + speed**2)
+    enough = eps**0.375  # 1e-6 in double precision: of 1/s² and of the square of the speed
+    round_off = 1e2 * eps * jnp.max(jnp.abs(matrix), initial=0.0)
+    steady = jnp.max(jnp.abs(left) / scale) <= enough * (1.0 + speed**2) + round_off
     return steady & (speed <= enough) if turning is None else steady

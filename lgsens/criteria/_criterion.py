@@ -58,7 +58,15 @@ class Criterion(eqx.Module):
         return _scalar("terminal", self.terminal, system, state, t, p)
 
     def __call__(self, trajectory: Trajectory, p: PyTree = None) -> Float[Array, ""]:
-        """Ψ of a trajectory, shape (); `p`: the design parameters, if F or G use them."""
+        """Ψ of a trajectory, shape (), or of each of a batch; `p`: the design parameters, if F or G use them."""
+        if trajectory.t.ndim > 1:
+            if p is not None:
+                raise ValueError(
+                    "Criterion: this is a batch of trajectories, of shape "
+                    f"{trajectory.t.shape[:-1]}; say whose `p` is whose: jax.vmap(criterion)(trajectories, p), with "
+                    "in_axes=(0, None) where all have one."
+                )
+            return jax.vmap(self)(trajectory)
         t, states, system = trajectory.t, trajectory.states, trajectory.system
         value = self.final(system, trajectory.state(-1), t[-1], p)
         if self.integrand is None:

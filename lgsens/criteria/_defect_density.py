@@ -11,8 +11,8 @@ with a few random directions d_k tell enough: for D = √P Q, Q of orthonormal c
 average, and exactly that if there are as many directions as parameters. A product is one derivative of η in forward
 mode, by the rules for second derivatives of a trajectory.
 
-Source: Becker & Rannacher, Acta Numerica 10 (2001), doi:10.1017/S0962492901000010 (dual weighted residuals); Hutchinson,
-Communications in Statistics 19 (1990) 433 (norms from random directions).
+Source: Becker & Rannacher, Acta Numerica 10 (2001), doi:10.1017/S0962492901000010 (dual weighted residuals);
+Hutchinson, Communications in Statistics 19 (1990) 433 (norms from random directions).
 """
 
 from collections.abc import Callable
@@ -59,6 +59,11 @@ def defect_densities(
         grid = EqualGrid(t0, (t1 - t0) / num_steps, num_steps)
         parameters = Parameters(system, grid)
         b = scheme.defects(system, grid, states)
+        if b is None:
+            raise ValueError(
+                f"What {scheme!r} misses in its steps is not known of this scene, of which forces depend on the "
+                "multipliers (friction in joints): take AdaptiveSteps, which has steps for the motion."
+            )
 
         def better(b):
             e = linearized_trajectory(scheme, states, parameters, b, jax.tree.map(jnp.zeros_like, parameters))
@@ -67,7 +72,7 @@ def defect_densities(
 
         z = jax.jacrev(better)(b)
         products = jax.tree.map(lambda z, b: jnp.sum(z * b[None], axis=2), z, b)
-        of_motion = sum(jax.tree.leaves(products))
+        of_motion = jnp.sum(jnp.stack(jax.tree.leaves(products)), axis=0)
         of_motion = of_motion[:, 1:].at[:, 0].add(of_motion[:, 0])  # what the start misses goes with the first step
         of_rule = jnp.stack([_missed_by_rule(criterion, trajectory, p) for criterion in criteria])
         values = jnp.stack([criterion(trajectory, p) for criterion in criteria])

@@ -54,6 +54,8 @@ def error_estimate(trajectory: Trajectory, integrator: AbstractIntegrator = Gene
     """
     if trajectory.error is not None:
         return trajectory.error
+    if trajectory.t.ndim != 1:
+        raise ValueError("`error_estimate`: this is a batch of trajectories; jax.vmap it.")
     num_steps = trajectory.t.shape[0] - 1
     if not isinstance(integrator, AbstractIntegrator):
         raise ValueError(f"`integrator` must be a GeneralizedAlpha or another integrator, got {integrator!r}.")

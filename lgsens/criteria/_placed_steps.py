@@ -6,8 +6,8 @@ of a scheme of order two being h³ times functions of time,
     E_k(h) = ∫ c_k(t) h(t)² dt,     c_k = (what the pilot's step adds)/H³,     in ∫ dt/h steps.
 
 **Regardless of signs** the largest bound, ∫ |c| h² dt with |c|² = Σ_k c_k², is least for a given number of steps where
-h ∝ |c|^{−1/3}: every step adds as much. |c| is taken as its largest value nearby, and no step is longer than about three
-of the pilot's, which resolves the motion also where no criterion looks.
+h ∝ |c|^{−1/3}: every step adds as much. |c| is taken as its largest value nearby, and no step is longer than about
+three of the pilot's, which resolves the motion also where no criterion looks.
 
 **With signs.** Defects oscillate with the motion, and four fifths of them and more cancel, in steps whose sizes follow
 |c| by chance. The steps are laid in up to 32 plateaus of equal ones (a change of size costs a factorization), and the

@@ -74,8 +74,8 @@ def steps_for(
 
     From the pilot run, its adjoint variables and eight derivatives of what they say of its defects; no other run. The
     steps are those for the numbers p: they serve designs nearby, as smoothly as equal ones, and derivatives on them are
-    exact. None is longer than about three of the pilot's, where no criterion looks. `AdaptiveSteps` has steps for the motion. The errors are estimates to leading order,
-    with 3 % of what adds up regardless of signs on top.
+    exact. None is longer than about three of the pilot's, where no criterion looks. The errors are estimates to leading
+    order, with 3 % of what adds up regardless of signs on top. `AdaptiveSteps` has steps for the motion.
 
     With `num_steps` it may be inside of `jit` and `vmap`, which gives each design its own steps; those are constants
     for derivatives. If the pilot fails there, the steps are equal ones.
@@ -99,8 +99,8 @@ def steps_for(
         )
     if num_steps is not None and as_count(num_steps, "num_steps", " (it is static)") < _fewest(pilot):
         raise ValueError(
-            f"`num_steps` = {num_steps} is too few beside a pilot of {pilot} steps: none may be longer than {LONGEST} of "
-            f"those; give at least {_fewest(pilot)}, or a pilot of fewer steps if that resolves the motion."
+            f"`num_steps` = {num_steps} is too few beside a pilot of {pilot} steps: none may be longer than {LONGEST} "
+            f"of those; give at least {_fewest(pilot)}, or a pilot of fewer steps if that resolves the motion."
         )
     if tolerance is not None and not (isinstance(tolerance, float | int) and 0.0 < tolerance < 1.0):
         raise ValueError(f"`tolerance` must be a number between 0 and 1, got {tolerance!r}.")
@@ -122,9 +122,9 @@ def steps_for(
     elif tolerance is not None:
         raise ValueError("`tolerance`: inside of `jit` and `vmap` the number of steps must be known; give `num_steps`.")
     flat = rows.reshape(-1, pilot)
-    if num_steps is None:
+    if tolerance is not None:
         num_steps = _enough(flat, rows.shape[0], float(tolerance), pilot)
-    placed = placed_steps(flat, num_steps)
+    placed = placed_steps(flat, as_count(num_steps, "num_steps"))
     of_values, of_gradients = (structure.unflatten(list(part)) for part in _expected(placed, len(leaves)))
     return PlacedSteps(GivenSteps(jax.lax.stop_gradient(placed.fractions), integrator), of_values, of_gradients)
 
@@ -141,8 +141,8 @@ def _check_resolved(rows, pilot: int) -> None:
     if not found <= _UNRESOLVED:  # NaN is not
         raise ValueError(
             f"`pilot` = {pilot} equal steps do not resolve the criteria: their errors are estimated as {found:.1g} of "
-            "the values and gradients, which says nothing of where they come from. Take more steps for the pilot run; a "
-            "value or gradient that is zero has no relative error."
+            "the values and gradients, which says nothing of where they come from. Take more steps for the pilot "
+            "run; a value or gradient that is zero has no relative error."
         )
 
 

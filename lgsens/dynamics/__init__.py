@@ -69,4 +69,9 @@ from lgsens.dynamics._system import (
     autodiff_tangents as autodiff_tangents,
     finite as finite,
 )
-from lgsens.dynamics._turning import Turning as Turning, Turns as Turns, unsteady_rate as unsteady_rate
+from lgsens.dynamics._turning import (
+    Turning as Turning,
+    Turns as Turns,
+    jumped as jumped,
+    unsteady_rate as unsteady_rate,
+)

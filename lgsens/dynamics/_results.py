@@ -67,8 +67,10 @@ _MESSAGES = {
         "do not see, and the motion may be quite another one. Take steps of 0.3 rad or less (more `num_steps`)."
     ),
     RESULTS.angle_jumped: (
-        "The angle of a spring passes half a turn from where it is free, which poses do not tell from the other half: "
-        "its moment jumped. Let it count whole turns (`TorsionSpringDamper` or `CoordinateForce` with turns=True)."
+        "An angle passes half a turn, which poses do not tell from the other half, and what depends on it jumped. Let "
+        "a spring count whole turns (`TorsionSpringDamper` or `CoordinateForce` with turns=True), divide a beam into "
+        "more elements; give gears and couplings `teeth` of which the ratio makes an integer, or None where there are "
+        "none (`GearJoint`); couple an angle to a displacement, not that to the angle (`CoordinateCoupling`)."
     ),
     RESULTS.position_failed: (
         "No position satisfies the joints for these values of the driven ones: they are out of reach, or the mechanism "

@@ -34,6 +34,11 @@ def unsteady_rate(system: AbstractSystem, v: Float[Array, "*n k"], vdot: Float[A
     return jnp.sqrt(jnp.max(jnp.where(unsteady, square, 0.0), axis=-1, initial=0.0))
 
 
+def jumped(branches: Float[Array, "n+1 w"]) -> Bool[Array, " n"]:
+    """Whether one of the `AbstractSystem.branches` at successive instants jumps."""
+    return jnp.any(jnp.abs(jnp.diff(branches, axis=0)) > jnp.pi, axis=1)
+
+
 class Turning(NamedTuple):
     """What tells turns, at some instants: `unsteady_rate` [rad/s], and `AbstractSystem.branches` [rad]."""
 
@@ -52,12 +57,16 @@ class Turning(NamedTuple):
 
 
 class Turns(NamedTuple):
-    """Of each step: how far an unsteady body turns in it [rad], and whether an angle jumps."""
+    """Of each step: how far an unsteady body turns in it [rad], whether an angle jumps, and whether one comes to half a
+    turn, at the rate of the step before: where Φ jumps, Newton fails or makes something up."""
 
     of_bodies: Float[Array, " n"]
     jumped: Bool[Array, " n"]
+    jumping: Bool[Array, " n"]
 
     @classmethod
     def between(cls, t: Float[Array, " n+1"], turning: Turning) -> "Turns":
-        h, change = jnp.diff(t), jnp.diff(turning.branches, axis=0)
-        return cls(h * turning.rates[1:], jnp.any(jnp.abs(change) > jnp.pi, axis=1) & (h > 0.0))
+        h, angles = jnp.diff(t), turning.branches
+        before = jnp.concatenate([angles[:1], angles[:-2]])
+        ahead = jnp.any((jnp.abs(angles[:-1]) <= jnp.pi) & (jnp.abs(2.0 * angles[:-1] - before) > jnp.pi), axis=1)
+        return cls(h * turning.rates[1:], jumped(angles) & (h > 0.0), ahead)

@@ -32,7 +32,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens.liegroups import SE3, Pose, cross, skew, turn, turn_back
+from lgsens.liegroups import SE3, SO3, Pose, cross, skew, turn, turn_back
 from lgsens.model._beam_outlines import AbstractOutline
 from lgsens.model._beam_sections import BeamSection
 from lgsens.model._elements import body_fixed
@@ -104,6 +104,10 @@ class BeamLoad(AbstractClosedFormLoad):
             for frame, point, triad in ((a, self.point_a, self.triad_a), (b, self.point_b, self.triad_b))
         )
         return _GROUP.log(_GROUP.compose(_GROUP.inverse(of), to))
+
+    def branch(self, a, b):
+        """The rotation between the sections."""
+        return SO3().log((a.orientation @ self.triad_a).T @ b.orientation @ self.triad_b)
 
     def _motion(self, a, b, va, vb) -> _Motion:
         arm, b_in_a = a.local_point(b.point(self.point_b)), a.orientation.T @ b.orientation

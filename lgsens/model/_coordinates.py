@@ -21,7 +21,7 @@ from lgsens.model._loads import AbstractClosedFormLoad, LoadTangents
 from lgsens.model._relative import Coordinate, but_for_turns
 from lgsens.model._signals import Prescribed, at_time, prepared, prescribed_field
 from lgsens.model._turning_loads import BallLoad
-from lgsens.model._turns import CountedTurns, acting, branch_of, force_along, require_half_a_turn
+from lgsens.model._turns import CountedTurns, acting, branch_of, force_along, require_half_a_turn, unless_whole
 
 
 def _seen(a: Frame, b: Frame, on_a: Frame, on_b: Frame) -> Frame:
@@ -212,14 +212,26 @@ class Coupled(AbstractClosedFormConstraint):
     def num_rows(self):
         return 1
 
-    def value(self, a, b, t, *others):
-        ends = [(a, b, *others)[role] for role in self.roles]
+    def _coordinates(self, frames):
+        """s₁ and s₂, angles but for whole turns."""
+        ends = [frames[role] for role in self.roles]
         first, second = (of.of for of in self.coordinates)
-        x = second(_seen(ends[2], ends[3], *self.second))
+        return first(_seen(ends[0], ends[1], *self.first)), second(_seen(ends[2], ends[3], *self.second))
+
+    def branch(self, a, b, *others):
+        first, second = self.coordinates
+        if not second.periodic:
+            return None
+        angle = self._coordinates((a, b, *others))[1]
+        linear = first.periodic and self.coefficients.shape[0] == 1
+        return unless_whole(self.coefficients[0], self.teeth, angle) if linear else angle
+
+    def value(self, a, b, t, *others):
+        s, x = self._coordinates((a, b, *others))
         total = jnp.zeros_like(x)
         for i in reversed(range(self.coefficients.shape[0])):  # Horner's scheme
             total = (total + self.coefficients[i]) * x
-        missing = first(_seen(ends[0], ends[1], *self.first)) - total
+        missing = s - total
         if self.coordinates[0].periodic:
             missing = but_for_turns(missing, turn=2.0 * jnp.pi / self.teeth)
         return missing[None]

@@ -44,8 +44,8 @@ class AbstractElement(eqx.Module):
         multiplied by it; None: there is none."""
         return None
 
-    def branch(self, a: Frame, b: Frame) -> Float[Array, ""] | None:
-        """An angle that poses tell within half a turn, and with which its force jumps there; None: there is none."""
+    def branch(self, a: Frame, b: Frame, *others: Frame) -> Float[Array, "*w"] | None:
+        """Angles that poses tell within half a turn, and with which its force or Φ jumps there; None: of none."""
         return None
 
     def fixed(self, kind: str, bodies: str = "ab") -> list[Array]:

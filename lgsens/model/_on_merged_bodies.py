@@ -100,6 +100,9 @@ class _CarriedConstraint(AbstractConstraint):
     def driven(self):
         return self.element.driven
 
+    def branch(self, a, b, *others):
+        return self.element.branch(_frame(a, self.a), _frame(b, self.b), *map(_frame, others, self.others))
+
     def value(self, a, b, t, *others):
         return self.element.value(_frame(a, self.a), _frame(b, self.b), t, *map(_frame, others, self.others))
 

@@ -13,7 +13,8 @@ from lgsens.model._elements import body_fixed
 from lgsens.model._frames import ROTATION, Frame, normals
 from lgsens.model._joints import AbstractJoint, _coincidence
 from lgsens.model._relative import ROTATION_VECTOR, but_for_turns, frames_at
-from lgsens.model._signals import Prescribed, at_time, prepared, prescribed_field, require_ratio
+from lgsens.model._signals import AbstractSignal, Prescribed, at_time, prepared, prescribed_field, require_ratio
+from lgsens.model._turns import unless_whole
 
 
 class Gearing(AbstractConstraint):
@@ -49,6 +50,10 @@ class Gearing(AbstractConstraint):
         d = b.point(self.point_b) - a.point(self.point_a) if self.line is None else self.line
         turned = lambda frame, x, y: -jnp.arctan2(jnp.sum(frame.axis(y) * d), jnp.sum(frame.axis(x) * d))
         return turned(a, self.first_a, self.second_a), turned(b, self.first_b, self.second_b)
+
+    def branch(self, a, b):
+        of_a, _ = self.angles(a, b)
+        return of_a if isinstance(self.ratio, AbstractSignal) else unless_whole(self.ratio, self.teeth, of_a)
 
     def value(self, a, b, t):
         of_a, of_b = self.angles(a, b)

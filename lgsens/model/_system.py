@@ -176,9 +176,10 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         return coordinate_scale(self)
 
     def branches(self, q):
-        ends = at_ends(self.loads, self._placed(q))
-        found = [stack.map(lambda load, *frames: load.branch(*frames), at) for stack, at in zip(self.loads, ends)]
-        return jnp.concatenate([super().branches(q), *(angles for angles in found if angles is not None)])
+        stacks = (*self.constraints, *self.loads)
+        ends = at_ends(stacks, self._placed(q))
+        found = [stack.map(lambda element, *frames: element.branch(*frames), at) for stack, at in zip(stacks, ends)]
+        return jnp.concatenate([super().branches(q), *(angles.ravel() for angles in found if angles is not None)])
 
     @property
     def num_states(self):

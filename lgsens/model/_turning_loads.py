@@ -157,6 +157,11 @@ class RotationLoad(AbstractClosedFormLoad):
         spin = turn_back(self.triad_b, vb[ROTATION]) - spin_a
         return to_b, phi, spin_a, spin, group.tangent_inv_mv(phi, spin)
 
+    def branch(self, a, b):
+        """φ where there are springs: from π about n it goes to −π, by 3.6 rad and more in one component."""
+        phi = SO3().log((a.orientation @ self.triad_a).T @ b.orientation @ self.triad_b)
+        return phi if self.springs is not None else jnp.where(self.stiffness == 0.0, 0.0, phi)
+
     def _moment(self, phi, rate):
         """m, and K and C with the slopes of the curves."""
         push, stiffness = osculating(self.springs, phi)
@@ -206,6 +211,10 @@ class BallLoad(AbstractLoad):
     def acts_on(self):
         return TURNING_A + TURNING_B
 
+    def branch(self, a, b):
+        phi = SO3().log((a.orientation @ self.triad_a).T @ b.orientation @ self.triad_b)
+        return jnp.where(self.stiffness == 0.0, 0.0, phi)
+
     def force(self, a, b, va, vb, t):
         axes_a, axes_b = a.orientation @ self.triad_a, b.orientation @ self.triad_b
         phi = axes_a @ SO3().log(axes_a.T @ axes_b)
@@ -235,6 +244,11 @@ class LoadSum(AbstractClosedFormLoad):
 
     def fixed(self, kind, bodies="ab"):
         return self.parts[0].fixed(kind, bodies)
+
+    def branch(self, a, b):
+        found = [part.branch(a, b) for part in self.parts]
+        angles = [jnp.atleast_1d(angle) for angle in found if angle is not None]
+        return jnp.concatenate(angles) if angles else None
 
     def force(self, a, b, va, vb, t):
         return self._times(total(part.force(a, b, va, vb, t) for part in self.parts), t)

@@ -51,6 +51,13 @@ def force_along(load: AlongCoordinate, a: Frame, b: Frame, va, vb, t, z=None) ->
     return found[-1] * row
 
 
+def unless_whole(ratio: Array, teeth: int, angle: Array) -> Array:
+    """The angle of a part of which another one has `ratio` times it but for turns divided by `teeth`: 0 where that
+    holds over any number of turns (`AbstractElement.branch`)."""
+    turns = ratio * teeth
+    return jnp.where(jnp.abs(turns - jnp.round(turns)) < 1e-6, 0.0, angle)
+
+
 def branch_of(load: AlongCoordinate, a: Frame, b: Frame) -> Float[Array, ""]:
     """The angle of a load that jumps with it (`AbstractElement.branch`); 0 where none does, without a spring."""
     return jnp.where(load.stiffness == 0.0, 0.0, load.value(a, b)[0])

@@ -70,6 +70,10 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
                 f"It turns by {turn:.3g} rad in {place}, {time}: try num_steps = "
                 f"{np.ceil(num_steps * turn / 0.3):.0f}. `throw=False` returns the data."
             )
+        case RESULTS.angle_jumped if "position" in details:
+            driven = np.array2string(details["values"], precision=6)
+            more = f"It did so before position {int(details['position'])}, driven values {driven}. It is told from the "
+            more += "position before: let them be less than half a turn apart. `throw=False` returns the data."
         case RESULTS.angle_jumped:
             more = f"It did so in {place}, {time}. `throw=False` returns the data."
         case RESULTS.position_failed:

@@ -232,6 +232,7 @@ def outcome(scheme: AbstractScheme, begun: Begin, stats: Stats, turns: Turns, t,
         found = jnp.any(steps) & (newton != scheme.failure)  # which may look singular later
         newton = jnp.where(found, code, newton)
         failed = jnp.where(found, jnp.argmax(steps), failed)
+    newton = jnp.where((newton != RESULTS.successful) & turns.jumping[failed], RESULTS.angle_jumped, newton)
     result = jnp.where(begun.result == RESULTS.successful, newton, begun.result).astype(jnp.int32)
     time = t[failed + 1]
     if laid.reached is not None:

@@ -50,7 +50,9 @@ def test_steps_are_where_the_criterion_looks(early):
     assert np.mean(np.abs(t - CENTRE) < 0.1) > 0.4
     longest = float(early.integrator.fractions.max()) * PILOT
     assert longest < 3.5  # three steps of the pilot, and what plateaus are moved by
-    assert int(np.sum(np.abs(np.diff(np.asarray(early.integrator.fractions))) > 1e-12)) < 32  # sizes change between plateaus only
+    assert (
+        int(np.sum(np.abs(np.diff(np.asarray(early.integrator.fractions))) > 1e-12)) < 32
+    )  # sizes change between plateaus only
 
 
 def test_expected_errors_are_the_true_ones_and_far_below_those_of_equal_steps(early):

@@ -263,3 +263,63 @@ def test_gears_without_teeth_as_seen_from_a_carrier():
     arm, planet = (varied.body(name).angular_velocity[:, 2] for name in ("arm", "planet"))
     # as seen from the line of centres, which turns with the arm: φ̇_planet − ω_arm = ρ (0 − ω_arm)
     np.testing.assert_allclose(planet - arm, -jax.vmap(RATIO)(varied.t) * arm, rtol=1e-10)
+
+
+def winch(coupling):
+    drum = lg.RigidBody(3.0, (0.03, 0.03, 0.05))
+    load = lg.RigidBody(2.0, (0.1, 0.1, 0.1), position=(0.1, 0.0, -1.0))
+    hinge = lg.RevoluteJoint(None, "drum", at=ORIGIN, axis=Y)
+    slide = lg.PrismaticJoint(None, "load", at=(0.1, 0.0, -1.0), axis=Y)
+    drive = lg.RotationDriver(None, "drum", axis=Y, value=lg.Polynomial((0.0, 5.0)))
+    joints = {"hinge": hinge, "slide": slide, "rope": coupling(hinge, slide), "drive": drive}
+    return lg.Model({"drum": drum, "load": load}, joints)
+
+
+def gear_pair(teeth, ratio=-2.0 / 3.0):
+    body = lambda at: lg.RigidBody(1.0, (0.1, 0.1, 0.1), position=at)
+    other = (0.1, 0.0, 0.0)
+    mesh = lg.GearJoint("a", "b", at_a=ORIGIN, at_b=other, axis_a=Y, axis_b=Y, ratio=ratio, teeth=teeth)
+    joints = {
+        "hinge": lg.RevoluteJoint(None, "a", at=ORIGIN, axis=Y),
+        "other": lg.RevoluteJoint(None, "b", at=other, axis=Y),
+        "mesh": mesh,
+        "drive": lg.RotationDriver(None, "a", axis=Y, value=lg.Polynomial((0.0, 5.0))),
+    }
+    return lg.Model({"a": body(ORIGIN), "b": body(other)}, joints)
+
+
+TIMES = np.linspace(0.0, 2.0, 41)
+TURNING = {  # the model, the joint, what it does per rad of the drive
+    "an angle by a displacement": (lambda: winch(lambda h, s: lg.CoordinateCoupling(h, s, (10.0,))), "slide", 0.1),
+    "gears with teeth": (lambda: gear_pair(3), "other", -2.0 / 3.0),
+}
+JUMPING = {
+    "a displacement by an angle": lambda: winch(lambda h, s: lg.CoordinateCoupling(s, h, (0.1,))),
+    "gears whose teeth nobody counted": lambda: gear_pair(1),
+    "gears by time": lambda: gear_pair(1, lg.Harmonic(amplitude=1e-3, frequency=0.3, offset=-2.0)),
+}
+
+
+@pytest.mark.parametrize("name", TURNING)
+def test_couplings_over_whole_turns(name):
+    build, joint, ratio = TURNING[name]
+    found = lg.kinematics(build(), t=TIMES).joint(joint)
+    moved = found.displacement if joint == "slide" else found.angle
+    close(moved, 5.0 * ratio * TIMES, 1e3, scale=10.0)
+
+
+@pytest.mark.parametrize("name", some_quick(JUMPING))
+def test_couplings_that_poses_do_not_tell_have_failed_at_half_a_turn(name):
+    """π/5 s, after position 12 of 0.05 s each: the load of a winch jumped by 2πr there."""
+    model = JUMPING[name]()
+    with pytest.raises(lg.SimulationError, match=says("passes half a turn", "`teeth`", "before position 13")):
+        lg.kinematics(model, t=TIMES)
+    assert lg.kinematics(model, t=TIMES[:13]).result == lg.RESULTS.successful
+
+
+@pytest.mark.slow  # small version: that of positions, above
+@pytest.mark.parametrize("name", JUMPING)
+@pytest.mark.parametrize("integrator", [lg.GeneralizedAlpha(), lg.RadauIIA()], ids=["alpha", "radau"])
+def test_motions_have_failed_there_too(name, integrator):
+    run = lg.simulate(JUMPING[name](), t1=2.0, num_steps=400, integrator=integrator, throw=False)
+    assert run.result == lg.RESULTS.angle_jumped

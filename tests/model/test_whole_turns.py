@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import says
+from helpers import says, some_quick
 
 import lgsens as lg
 
@@ -157,3 +157,54 @@ def test_on_a_part_of_a_merged_body():
 def test_what_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+SPRINGS = {
+    "bushing": lambda k: lg.Bushing(None, "rotor", at=(0.0, 0.0, 0.0), rotational_stiffness=(k, k, k)),
+    "rotational": lambda k: lg.RotationalSpringDamper(None, "rotor", stiffness=k),
+    "torsion": lambda k: lg.TorsionSpringDamper(None, "rotor", axis=Z, stiffness=k),
+    "coordinate": lambda k: lg.CoordinateForce(hinge(), stiffness=k),
+}
+
+AXES = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # the first along z
+SHAFT = lg.BeamElement(  # G I/l = 0.2949 N m/rad
+    None,
+    "rotor",
+    at_a=(0.0, 0.0, -1.0),
+    at_b=(0.0, 0.0, 0.0),
+    axes_a=AXES,
+    axes_b=AXES,
+    section=lg.BeamSection.round(0.0025, young=2e11, poisson=0.3, density=1.0),
+)
+
+
+@pytest.mark.parametrize("name", some_quick(SPRINGS))
+def test_positions_do_not_tell_more_than_half_a_turn(name):
+    """Up to 3 rad the moment of the drive is k φ; at 4 rad it would be that of 4 − 2π."""
+    body = lg.RigidBody(1.0, (0.03, 0.03, INERTIA))
+    joints = {"hinge": hinge(), "drive": lg.RotationDriver(None, "rotor", axis=Z)}
+    model = lg.Model({"rotor": body}, joints, {"spring": SPRINGS[name](STIFFNESS)})
+    angles = np.linspace(0.0, 3.0, 4)
+    found = lg.kinematics(model, {"drive": angles}, rates={"drive": 0.0})
+    np.testing.assert_allclose(-found.multiplier("drive")[:, 0], STIFFNESS * angles, atol=1e-12)  # round-off of 1
+    with pytest.raises(lg.SimulationError, match=says("passes half a turn", "before position 4", "[4.]")):
+        lg.kinematics(model, {"drive": np.linspace(0.0, 4.0, 5)})
+
+
+@pytest.mark.parametrize(
+    "name", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("bushing", "beam")), "rotational"]
+)
+def test_springs_against_all_rotations_fail_there_too(name):
+    """ω₀ √(J/k) = 4 rad, which none within half a turn can hold; without stiffness about the hinge it may turn."""
+    start = 4.0 * np.sqrt(STIFFNESS / INERTIA)
+    spring = SHAFT if name == "beam" else SPRINGS[name](STIFFNESS)
+    body = lg.RigidBody(1.0, (0.03, 0.03, INERTIA), angular_velocity=(0.0, 0.0, start))
+    run = lambda spring: lg.simulate(
+        lg.Model({"rotor": body}, {"hinge": hinge()}, {"spring": spring}), t1=0.5, num_steps=STEPS, throw=False
+    )
+    assert run(spring).result == lg.RESULTS.angle_jumped
+    if name == "bushing":
+        loose = lg.Bushing(None, "rotor", at=(0.0, 0.0, 0.0), rotational_stiffness=(STIFFNESS, STIFFNESS, 0.0))
+        free = run(loose)
+        assert free.result == lg.RESULTS.successful
+        np.testing.assert_allclose(free.joint("hinge").angle[-1], 0.5 * start, rtol=1e-12)

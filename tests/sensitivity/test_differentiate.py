@@ -264,3 +264,18 @@ def test_a_failed_simulation_raises_or_says_so():
         found = lg.differentiate(SIDE, fast, 15.0, method=method, throw=False, **long_steps)
         assert found.result == lg.RESULTS.newton_failed
         assert np.isnan(found.value) and np.isnan(found.gradient)
+
+
+def test_a_criterion_of_a_batch_is_one_of_each():
+    def run(tilt):
+        body = lg.RigidBody(1.0, (0.1, 0.1, 0.1), velocity=jnp.array([0.0, 0.0, 1.0]) * tilt, free="z")
+        return lg.simulate(lg.Model({"body": body}, {}), t1=0.1, num_steps=4, throw=False)
+
+    batch = jax.vmap(run)(jnp.asarray([1.0, 2.0, 3.0]))
+    speed = lg.Criterion(terminal=lambda s, p: jnp.sum(s.state.v**2) * (1.0 if p is None else p))
+    np.testing.assert_allclose(speed(batch), [1.0, 4.0, 9.0], rtol=1e-14)  # no force acts
+    np.testing.assert_allclose(jax.vmap(speed, in_axes=(0, None))(batch, 2.0), [2.0, 8.0, 18.0], rtol=1e-14)
+    with pytest.raises(ValueError, match=r"batch of trajectories, of shape \(3,\).*jax.vmap\(criterion\)"):
+        speed(batch, 2.0)
+    with pytest.raises(ValueError, match=r"batch of trajectories; jax\.vmap"):
+        lg.accuracy.error_estimate(batch)
