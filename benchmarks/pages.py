@@ -142,6 +142,7 @@ TABLES: dict[str, tuple[str, tuple[str, ...], Callable[..., str]]] = {
     ),
     "choice": ("choosing", ("methods",), choice),
     "variable steps": ("choosing", ("variable_steps",), variable_steps),
+    "steps for a criterion": ("choosing", ("steps_for",), of("steps_for", "table")),
     "reference problems": ("verification", ("references",), references),
     "published": ("verification", ("references",), published),
     "extremes": ("verification", ("extremes",), extremes),

@@ -9,14 +9,13 @@ of a scheme of order two being h³ times functions of time,
 h ∝ |c|^{−1/3}: every step adds as much. |c| is taken as its largest value nearby, and no step is longer than about
 three of the pilot's, which resolves the motion also where no criterion looks.
 
-**With signs.** Defects oscillate with the motion, and four fifths of them and more cancel, in steps whose sizes follow
-|c| by chance. The steps are laid in up to 32 plateaus of equal ones (a change of size costs a factorization), and the
-logarithms x of the sizes of the plateaus are moved, by a tenth or so, to where
+**With signs.** Defects oscillate with the motion, and most of them cancel, in steps whose sizes follow |c| by chance.
+The steps are laid in up to 32 plateaus of equal ones (a change of size costs a factorization), and the logarithms x of
+the sizes of the plateaus are moved, by a tenth or so, to where
 
     |E(x)|² + μ |x|²,     μ = 0.1 (∫ |c| h² dt)²/(number of plateaus)
 
-is least, by the method of Levenberg and Marquardt: what cancels then does so for the design nearby too. (On the
-quarter-car's bump this takes the error of the gradient to a fifth: `benchmarks/steps_for.py`.)
+is least, by the method of Levenberg and Marquardt: what cancels then does so for designs nearby too.
 
 Source: Becker & Rannacher, Acta Numerica 10 (2001), doi:10.1017/S0962492901000010, §3 and §5 (meshes that equilibrate
 weighted residuals).
