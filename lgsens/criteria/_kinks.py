@@ -21,6 +21,7 @@ from lgsens.simulation import Trajectory
 _SPIKE = 8.0  # differences beside a smooth change differ by less
 _INSIDE = 0.1
 _VISIBLE = 1e-4  # of the largest value of a run: smaller kinks move a result by less than the scheme does
+_ROUND_OFF = 1e5  # of a configuration of some turns, over h²
 _AS_LARGE = 0.5  # of the largest acceleration of a run: second differences that are not resolved
 
 
@@ -67,7 +68,9 @@ def roughness(trajectory: Trajectory) -> Roughness:
     else:
         a, forces = (trajectory.states.vdot / scale[None])[:, :, None], []
     size = jnp.max(jnp.abs(a), axis=(0, 2))
-    turns = jnp.any(jnp.max(jnp.abs(jnp.diff(a, 2, axis=0)), axis=2) > _AS_LARGE * size[None], axis=1)
+    h = (trajectory.t[-1] - trajectory.t[0]) / (trajectory.t.shape[0] - 1)
+    seen = jnp.maximum(size, _ROUND_OFF * jnp.finfo(size.dtype).eps / h**2)  # a uniform motion has none but that
+    turns = jnp.any(jnp.max(jnp.abs(jnp.diff(a, 2, axis=0)), axis=2) > _AS_LARGE * seen[None], axis=1)
     none = jnp.zeros((2, a.shape[0], 0), bool)
     return Roughness(_rough(a, size), jnp.concatenate([none, *forces], axis=2), jnp.mean(turns))
 

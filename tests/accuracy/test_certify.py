@@ -257,3 +257,17 @@ def test_differentiate_refuses_it_before_it_computes():
         lg.differentiate(HEIGHT, build, P, t1=1.0, num_steps=100, integrator=lg.AdaptiveSteps(), certificate=True)
     with pytest.raises(ValueError, match=says("outside of `jit`")):
         jax.jit(lambda p: lg.differentiate(HEIGHT, build, p, t1=1.0, num_steps=100, certificate=True).value)(P)
+
+
+def test_round_off_of_a_uniform_motion_is_resolved():
+    """A rotor that is driven at constant speed: its angular acceleration is round-off, and changes as much as that."""
+    rotor = lg.RigidBody(1.0, (0.1, 0.1, 0.2))
+    axis = {"axis": (0.0, 0.0, 1.0)}
+    joints = {
+        "hinge": lg.RevoluteJoint(None, "rotor", at=(0.0, 0.0, 0.0), **axis),
+        "drive": lg.RotationDriver(None, "rotor", value=lg.Polynomial((0.0, 5.0)), **axis),
+    }
+    run = lg.simulate(lg.Model({"rotor": rotor}, joints), t1=0.2, num_steps=100)
+    turning = run.body("rotor").angular_acceleration
+    assert 0.0 < float(jnp.abs(turning).max()) < 1e-6
+    assert roughness(run).unresolved == 0.0

@@ -64,6 +64,7 @@ def test_expected_errors_are_the_true_ones_and_far_below_those_of_equal_steps(ea
     assert true[1] < equal[1]  # in twice as many steps
 
 
+@pytest.mark.slow  # a certificate besides; the errors of the criterion itself are in the quick run
 def test_densities_add_up_to_the_errors_of_a_certificate():
     """Signed: η_n by adjoint variables, and by the corrected run as a whole."""
     numbers = jax.tree.map(jnp.asarray, P)
