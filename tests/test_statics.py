@@ -195,3 +195,19 @@ def test_a_fixed_moment_is_a_load():
         # round-off of angles of 0.1 rad in rotations and their logarithm, a few
         np.testing.assert_allclose(angles, [0.0, 0.1 * moment], atol=1e-13)
         np.testing.assert_allclose(rates, [0.01 * moment] * 2, rtol=1e-11)
+
+
+def test_points_that_start_anew_are_told_from_the_first():
+    """Upwards to 3 rad and then downwards to −3 rad, 6 rad apart: the moment is that of the spring all the way."""
+    axis = {"axis": (0.0, 0.0, 1.0)}
+    joints = {
+        "hinge": lg.RevoluteJoint(None, "rotor", at=(0.0, 0.0, 0.0), **axis),
+        "drive": lg.RotationDriver(None, "rotor", **axis),
+    }
+    spring = {"spring": lg.TorsionSpringDamper(None, "rotor", stiffness=2.0, **axis)}
+    model = lg.Model({"rotor": lg.RigidBody(1.0, (0.1, 0.1, 0.2))}, joints, spring)
+    angles = np.array([0.0, 1.5, 3.0, -1.5, -3.0])
+    found = lg.statics(model, driven={"drive": angles}, starts=(3,))
+    np.testing.assert_allclose(-found.multiplier("drive")[:, 0], 2.0 * angles, atol=1e-11)  # round-off of Newton
+    with pytest.raises(lg.SimulationError, match=says("passes half a turn", "before position 3")):
+        lg.statics(model, driven={"drive": angles})

@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from lgsens._validate import as_float, suggestion
 from lgsens.dynamics import AbstractDrive, jumped
@@ -47,11 +48,13 @@ def with_numbers(model: Model, t, names: Iterable[str] | None = None) -> Model:
     return eqx.tree_at(lambda model: model.joints, model, joints)
 
 
-def jumps(system: MultibodySystem, q: Any) -> tuple[jax.Array, jax.Array]:
+def jumps(system: MultibodySystem, q: Any, starts: Sequence[int] = ()) -> tuple[jax.Array, jax.Array]:
     """Whether an angle that poses tell within half a turn jumps from one of these configurations to the next, the first
-    from the reference, and before which of them."""
-    home = system.branches(system.reference()[0])
-    found = jumped(jax.lax.stop_gradient(jnp.concatenate([home[None], jax.vmap(system.branches)(q)])))
+    from the reference, those at `starts` from the first; and before which of them."""
+    home, after = jax.lax.stop_gradient((system.branches(system.reference()[0]), jax.vmap(system.branches)(q)))
+    before = np.arange(after.shape[0])  # among the reference and all of them
+    before[[at for at in starts if at > 0]] = 1
+    found = jumped(jnp.concatenate([home[None], after])[before], after)
     return jnp.any(found), jnp.argmax(found)
 
 

@@ -88,7 +88,8 @@ def statics(
         starts: indices of points that are found from the first point and not from the one before: where another
             branch begins, as from the design position upwards and then downwards.
         t0: the time at which signals and time-dependent forces are taken, shape ().
-        throw: raise if there is no such equilibrium. With False `result` says so, and its numbers are NaN.
+        throw: raise if there is no such equilibrium, or an angle of a spring, a gear or a coupling passes half a turn.
+            With False `result` says so; numbers of a point that is none are NaN.
 
     The first point is found from the reference configuration. Differentiable by every number of the model, by driven
     values, factors and rates, by the implicit function theorem: one factorization per point for all of them, responses
@@ -151,7 +152,7 @@ def _statics_jit(drive: Drive, values, rates, t, starts: tuple[int, ...]):
     free = found.pivot[first] < 1e3 * jnp.finfo(values.dtype).eps
     failed = jnp.where(free, RESULTS.not_held, RESULTS.statics_failed)
     result = jnp.where(jnp.all(found.found), RESULTS.successful, failed)
-    an_angle, place = jumps(drive.system, found.q) if not starts else (jnp.zeros((), bool), first)
+    an_angle, place = jumps(drive.system, found.q, starts)
     an_angle &= result == RESULTS.successful
     first = jnp.where(an_angle, place, first)
     result = jnp.where(an_angle, RESULTS.angle_jumped, result)

@@ -34,9 +34,9 @@ def unsteady_rate(system: AbstractSystem, v: Float[Array, "*n k"], vdot: Float[A
     return jnp.sqrt(jnp.max(jnp.where(unsteady, square, 0.0), axis=-1, initial=0.0))
 
 
-def jumped(branches: Float[Array, "n+1 w"]) -> Bool[Array, " n"]:
-    """Whether one of the `AbstractSystem.branches` at successive instants jumps."""
-    return jnp.any(jnp.abs(jnp.diff(branches, axis=0)) > jnp.pi, axis=1)
+def jumped(before: Float[Array, "n w"], after: Float[Array, "n w"]) -> Bool[Array, " n"]:
+    """Whether one of the `AbstractSystem.branches` jumps from one instant to another."""
+    return jnp.any(jnp.abs(after - before) > jnp.pi, axis=1)
 
 
 class Turning(NamedTuple):
@@ -69,4 +69,4 @@ class Turns(NamedTuple):
         h, angles = jnp.diff(t), turning.branches
         before = jnp.concatenate([angles[:1], angles[:-2]])
         ahead = jnp.any((jnp.abs(angles[:-1]) <= jnp.pi) & (jnp.abs(2.0 * angles[:-1] - before) > jnp.pi), axis=1)
-        return cls(h * turning.rates[1:], jumped(angles) & (h > 0.0), ahead)
+        return cls(h * turning.rates[1:], jumped(angles[:-1], angles[1:]) & (h > 0.0), ahead)

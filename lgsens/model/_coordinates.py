@@ -267,8 +267,8 @@ class CoordinateCoupling(AbstractJoint):
         coefficients: c₁, c₂, …, shape (n,), n ≥ 1. Both coordinates vanish together: in the reference configuration.
         names: the names of the coordinates of both, static; None: the only one.
         teeth: a count for which c₁ · teeth is an integer: those of the first of two gears, as in `GearJoint`. Where c₁
-            is the only coefficient angles then turn any number of times; else, and for the derivative by c₁, `second`
-            stays within half a turn.
+            is the only coefficient angles then turn any number of times; else `second`, if it is an angle, stays within
+            half a turn, where a run has failed otherwise, and so it does for the derivative by c₁.
 
     The multiplier is the generalized force that the coupling takes from s₁ [N or N m]. Raises `ValueError` for joints
     without the coordinate, coefficients of a wrong shape, a count below 1, or fewer than two bodies. Source: of gears

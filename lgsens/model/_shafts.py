@@ -95,10 +95,11 @@ class GearJoint(AbstractJoint):
             parallel axes −n_a/n_b for n_a and n_b teeth. Or a signal of time: the angles, not their rates, have its
             ratio at every instant, as a drive of variable ratio has it that is shifted with `a` near the reference.
         teeth: n_b or another count for which ratio · teeth is an integer: gears then turn any number of times. With
-            another ratio, and **for the derivative by the ratio**, `a` is within half a turn of the reference: poses do
-            not tell turns, by which that derivative grows. None: no teeth but friction, a belt, a variable drive. Not
-            angles but rates are then in the ratio, φ̇_b = ρ φ̇_a, at every instant, over any number of turns, and the
-            derivative by it is right. (An equation of velocities, solved by dense matrices, as `Rolling`.)
+            another ratio `a` is within half a turn of the reference, where a run has failed otherwise, and so it is
+            **for the derivative by the ratio**: poses do not tell turns, by which that derivative grows. None: no teeth
+            but friction, a belt, a variable drive. Not angles but rates are then in the ratio, φ̇_b = ρ φ̇_a, at every
+            instant, over any number of turns, and the derivative by it is right. (An equation of velocities, solved by
+            dense matrices, as `Rolling`.)
         line: a direction, fixed in the inertial frame, shape (3,), from which the angles are seen instead: of gears on
             one axis, or any that a third part connects, in a housing that does not turn; None: that of the centres.
 
