@@ -146,3 +146,14 @@ def test_a_tolerance_inside_of_jit_is_refused():
     run = lambda k: lg.steps_for(EARLY, build, P | {"k": k}, tolerance=1e-3, **SCENE).value_error
     with pytest.raises(ValueError, match=says("`tolerance`", "`num_steps`")):
         eqx.filter_jit(run)(jnp.asarray(P["k"]))
+
+
+def test_forces_that_depend_on_multipliers_are_refused():
+    def rubbing(p):
+        body = lg.RigidBody(p["m"], (0.1, 0.1, 0.1), position=(0.0, 0.0, 1.0))
+        hinge = lg.RevoluteJoint(None, "mass", at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+        friction = lg.JointFriction("hinge", coefficient=0.1, slip_speed=1e-2, radius=0.01)
+        return lg.Model({"mass": body}, {"hinge": hinge}, {"friction": friction})
+
+    with pytest.raises(ValueError, match=says("friction in joints", "AdaptiveSteps")):
+        lg.steps_for(EARLY, rubbing, P, num_steps=60, **SCENE)
