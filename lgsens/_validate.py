@@ -43,6 +43,16 @@ def as_float(value: Any, shape: tuple[int, ...] | None, what: str) -> Array:
     return array
 
 
+def as_parameters(p: Any) -> Any:
+    """`p` with `as_float` of each leaf, of which one at least has a number."""
+    found = jax.tree_util.tree_map_with_path(
+        lambda path, leaf: as_float(leaf, None, f"`p`{jax.tree_util.keystr(path)}"), p
+    )
+    if not sum(leaf.size for leaf in jax.tree.leaves(found)):
+        raise ValueError(f"`p` must hold at least one number, got {found!r}.")
+    return found
+
+
 def _says_something_else(value: Any) -> bool:
     """Whether there are texts, truth values or complex numbers in it."""
     kind = lambda leaf: getattr(getattr(leaf, "dtype", None), "kind", "")

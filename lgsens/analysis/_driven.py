@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lgsens._validate import as_float, suggestion
-from lgsens.dynamics import AbstractDrive, jumped
+from lgsens.dynamics import RESULTS, AbstractDrive, jumped
 from lgsens.model import AbstractJoint, AbstractSignal, Model, MultibodySystem
 
 
@@ -48,14 +48,16 @@ def with_numbers(model: Model, t, names: Iterable[str] | None = None) -> Model:
     return eqx.tree_at(lambda model: model.joints, model, joints)
 
 
-def jumps(system: MultibodySystem, q: Any, starts: Sequence[int] = ()) -> tuple[jax.Array, jax.Array]:
-    """Whether an angle that poses tell within half a turn jumps from one of these configurations to the next, the first
-    from the reference, those at `starts` from the first; and before which of them."""
+def unless_jumped(system: MultibodySystem, q: Any, first, result, starts: Sequence[int] = ()):
+    """The first configuration that is wrong, and the result: of those that succeeded also where an angle that poses
+    tell within half a turn jumps, from one to the next, the first from the reference, those at `starts` from the first.
+    """
     home, after = jax.lax.stop_gradient((system.branches(system.reference()[0]), jax.vmap(system.branches)(q)))
     before = np.arange(after.shape[0])  # among the reference and all of them
     before[[at for at in starts if at > 0]] = 1
     found = jumped(jnp.concatenate([home[None], after])[before], after)
-    return jnp.any(found), jnp.argmax(found)
+    an_angle = jnp.any(found) & (result == RESULTS.successful)
+    return jnp.where(an_angle, jnp.argmax(found), first), jnp.where(an_angle, RESULTS.angle_jumped, result)
 
 
 def drivers(system: MultibodySystem, kind: str = "constraints") -> dict[str, tuple[str, int, int]]:

@@ -14,11 +14,11 @@ from lgsens.analysis._driven import (
     Drive,
     columns,
     drivers,
-    jumps,
     of_one_length,
     refuse_history,
     speeds,
     table,
+    unless_jumped,
     with_numbers,
 )
 from lgsens.dynamics import RESULTS, State, forces_of_motion, positions
@@ -131,10 +131,7 @@ def _kinematics_jit(drive: Drive, driven, rates):
     states = jax.vmap(lambda *args: forces_of_motion(drive, *args))(found.q, driven, rates)
     first = jnp.argmin(found.found)  # the first that was not found, 0 if all were
     result = jnp.where(jnp.all(found.found), RESULTS.successful, RESULTS.position_failed)
-    an_angle, place = jumps(drive.system, found.q)
-    an_angle &= result == RESULTS.successful
-    first = jnp.where(an_angle, place, first)
-    result = jnp.where(an_angle, RESULTS.angle_jumped, result).astype(jnp.int32)
+    first, result = unless_jumped(drive.system, found.q, first, result)
     details = {"violation": found.violation[first], "values": driven[0][first], "time": driven[1][first]}
     details["position"] = first
-    return (states, result), jax.lax.stop_gradient(details)
+    return (states, result.astype(jnp.int32)), jax.lax.stop_gradient(details)

@@ -16,11 +16,11 @@ from lgsens.analysis._driven import (
     Drive,
     columns,
     drivers,
-    jumps,
     of_one_length,
     refuse_history,
     speeds,
     table,
+    unless_jumped,
     with_numbers,
 )
 from lgsens.dynamics import RESULTS, State, require_independent, static_path
@@ -152,10 +152,7 @@ def _statics_jit(drive: Drive, values, rates, t, starts: tuple[int, ...]):
     free = found.pivot[first] < 1e3 * jnp.finfo(values.dtype).eps
     failed = jnp.where(free, RESULTS.not_held, RESULTS.statics_failed)
     result = jnp.where(jnp.all(found.found), RESULTS.successful, failed)
-    an_angle, place = jumps(drive.system, found.q, starts)
-    an_angle &= result == RESULTS.successful
-    first = jnp.where(an_angle, place, first)
-    result = jnp.where(an_angle, RESULTS.angle_jumped, result)
+    first, result = unless_jumped(drive.system, found.q, first, result, starts)
     result = jnp.where(drive.system.is_valid(), result, RESULTS.invalid_numbers).astype(jnp.int32)
     before = jax.tree.map(lambda leaf: leaf[jnp.maximum(first - 1, 0)], (found.q, found.lam))
     details = {"values": values[first], "time": t, "position": first, "before": before}

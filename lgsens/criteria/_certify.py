@@ -37,7 +37,7 @@ from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lgsens._validate import as_count, as_float
+from lgsens._validate import as_count, as_parameters
 from lgsens.criteria._certificate import Certificate
 from lgsens.criteria._error_estimate import corrected, error_estimate
 from lgsens.criteria._kinks import kinks, roughness
@@ -106,9 +106,7 @@ def certify(
     if not (isinstance(tolerance, float | int) and 0.0 < tolerance < 1.0):
         raise ValueError(f"`tolerance` must be a number between 0 and 1, got {tolerance!r}.")
     t0, t1 = interval(t0, t1)
-    p = jax.tree_util.tree_map_with_path(lambda path, leaf: as_float(leaf, None, f"`p`{jax.tree_util.keystr(path)}"), p)
-    if not sum(leaf.size for leaf in jax.tree.leaves(p)):
-        raise ValueError(f"`p` must hold at least one number, got {p!r}.")
+    p = as_parameters(p)
     found, shared, trajectory, rough = _certified(tuple(criteria), build, state0, p, t0, t1, num_steps, integrator)
     if throw:
         raise_if_failed(trajectory)

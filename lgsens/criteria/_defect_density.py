@@ -25,10 +25,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from lgsens.criteria._criterion import Criterion
-from lgsens.criteria._error_estimate import corrected
+from lgsens.criteria._error_estimate import corrected, error_by_defects
 from lgsens.integrate import AbstractScheme, EqualGrid
-from lgsens.sensitivity import Parameters, linearized_trajectory
-from lgsens.simulation import StateError, Trajectory, simulate
+from lgsens.sensitivity import Parameters
+from lgsens.simulation import Trajectory, simulate
 
 _DIRECTIONS = 8
 
@@ -66,8 +66,7 @@ def defect_densities(
             )
 
         def better(b):
-            e = linearized_trajectory(scheme, states, parameters, b, jax.tree.map(jnp.zeros_like, parameters))
-            run = corrected(trajectory, StateError(-e.w, -e.v, -e.vdot, -e.lam))
+            run = corrected(trajectory, error_by_defects(scheme, states, parameters, b))
             return jnp.stack([criterion(run, p) for criterion in criteria])
 
         z = jax.jacrev(better)(b)

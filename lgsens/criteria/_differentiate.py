@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
 from lgsens._brief import brief
-from lgsens._validate import as_count, as_float
+from lgsens._validate import as_count, as_parameters
 from lgsens._xla import tracing
 from lgsens.criteria._advice import direct_or_adjoint
 from lgsens.criteria._by_parts import Parts, reverse_by_parts, unique
@@ -148,10 +148,8 @@ def differentiate(
     if certificate:
         check_certifiable(integrator, num_steps, (p, t0, t1))
     t0, t1 = interval(t0, t1)
-    p = jax.tree_util.tree_map_with_path(lambda path, leaf: as_float(leaf, None, f"`p`{jax.tree_util.keystr(path)}"), p)
+    p = as_parameters(p)
     size = sum(leaf.size for leaf in jax.tree.leaves(p))
-    if size == 0:
-        raise ValueError(f"`p` must hold at least one number, got {p!r}.")
     if method is None:
         method = direct_or_adjoint(size, len(leaves)).method
     if isinstance(method, ContinuousAdjoint) and num_steps < ContinuousAdjoint.LEAST_STEPS:

@@ -18,8 +18,10 @@ from lgsens.criteria._refined_run import refined_error
 from lgsens.dynamics import State
 from lgsens.integrate import (
     AbstractIntegrator,
+    AbstractScheme,
     EqualGrid,
     GeneralizedAlpha,
+    Variation,
 )
 from lgsens.sensitivity import Parameters, linearized_trajectory
 from lgsens.simulation import StateError, Trajectory
@@ -103,7 +105,11 @@ def _estimated(integrator: AbstractIntegrator, trajectory: Trajectory) -> StateE
     defects = scheme.defects(system, grid, states) if integrator.equal_steps else None
     if defects is None:
         return refined_error(scheme, trajectory)
-    parameters = Parameters(system, grid)
+    return error_by_defects(scheme, states, Parameters(system, grid), defects)
+
+
+def error_by_defects(scheme: AbstractScheme, states: State, parameters: Parameters, defects: Variation) -> StateError:
+    """−e of L e = b, without a change of parameters."""
     e = linearized_trajectory(scheme, states, parameters, defects, jax.tree.map(jnp.zeros_like, parameters))
     return StateError(-e.w, -e.v, -e.vdot, -e.lam)
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from lgsens._brief import brief
-from lgsens._validate import as_count, as_float, is_concrete
+from lgsens._validate import as_count, as_parameters, is_concrete
 from lgsens.criteria._criterion import Criterion
 from lgsens.criteria._defect_density import defect_densities
 from lgsens.criteria._placed_steps import LONGEST, Placed, placed_steps
@@ -110,9 +110,7 @@ def steps_for(
             "AdaptiveSteps has steps for the motion by any scheme."
         )
     t0, t1 = interval(t0, t1)
-    p = jax.tree_util.tree_map_with_path(lambda path, leaf: as_float(leaf, None, f"`p`{jax.tree_util.keystr(path)}"), p)
-    if not sum(leaf.size for leaf in jax.tree.leaves(p)):
-        raise ValueError(f"`p` must hold at least one number, got {p!r}.")
+    p = as_parameters(p)
     rows, trajectory = jax.lax.stop_gradient(
         defect_densities(tuple(leaves), build, state0, p, t0, t1, pilot, integrator)
     )
@@ -126,7 +124,7 @@ def steps_for(
         num_steps = _enough(flat, rows.shape[0], float(tolerance), pilot)
     placed = placed_steps(flat, as_count(num_steps, "num_steps"))
     of_values, of_gradients = (structure.unflatten(list(part)) for part in _expected(placed, len(leaves)))
-    return PlacedSteps(GivenSteps(jax.lax.stop_gradient(placed.fractions), integrator), of_values, of_gradients)
+    return PlacedSteps(GivenSteps(placed.fractions, integrator), of_values, of_gradients)
 
 
 def _expected(placed: Placed, count: int) -> tuple[Float[Array, " c"], Float[Array, " c"]]:

@@ -32,12 +32,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens.liegroups import SE3, SO3, Pose, cross, skew, turn, turn_back
+from lgsens.liegroups import SE3, Pose, cross, skew, turn, turn_back
 from lgsens.model._beam_outlines import AbstractOutline
 from lgsens.model._beam_sections import BeamSection
 from lgsens.model._elements import body_fixed
 from lgsens.model._frames import ROTATION, ROTATION_A, ROTATION_B, Frame, embedded
 from lgsens.model._loads import AbstractClosedFormLoad, LoadTangents
+from lgsens.model._turns import rotation_between
 
 _GROUP = SE3()
 
@@ -107,7 +108,7 @@ class BeamLoad(AbstractClosedFormLoad):
 
     def branch(self, a, b):
         """The rotation between the sections."""
-        return SO3().log((a.orientation @ self.triad_a).T @ b.orientation @ self.triad_b)
+        return rotation_between(a, self.triad_a, b, self.triad_b)
 
     def _motion(self, a, b, va, vb) -> _Motion:
         arm, b_in_a = a.local_point(b.point(self.point_b)), a.orientation.T @ b.orientation

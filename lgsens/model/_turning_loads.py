@@ -19,7 +19,7 @@ from lgsens.model._loads import AbstractClosedFormLoad, AbstractLoad, BushingLoa
 from lgsens.model._relative import but_for_turns
 from lgsens.model._signals import AbstractSignal, Prescribed, at_time, constant_of
 from lgsens.model._stack import load_tangents
-from lgsens.model._turns import acting, branch_of, force_along
+from lgsens.model._turns import acting, branch_of, force_along, rotation_between
 
 
 class HingeMoment(NamedTuple):
@@ -158,8 +158,8 @@ class RotationLoad(AbstractClosedFormLoad):
         return to_b, phi, spin_a, spin, group.tangent_inv_mv(phi, spin)
 
     def branch(self, a, b):
-        """φ where there are springs: from π about n it goes to −π, by 3.6 rad and more in one component."""
-        phi = SO3().log((a.orientation @ self.triad_a).T @ b.orientation @ self.triad_b)
+        """φ where there are springs."""
+        phi = rotation_between(a, self.triad_a, b, self.triad_b)
         return phi if self.springs is not None else jnp.where(self.stiffness == 0.0, 0.0, phi)
 
     def _moment(self, phi, rate):
@@ -212,7 +212,7 @@ class BallLoad(AbstractLoad):
         return TURNING_A + TURNING_B
 
     def branch(self, a, b):
-        phi = SO3().log((a.orientation @ self.triad_a).T @ b.orientation @ self.triad_b)
+        phi = rotation_between(a, self.triad_a, b, self.triad_b)
         return jnp.where(self.stiffness == 0.0, 0.0, phi)
 
     def force(self, a, b, va, vb, t):

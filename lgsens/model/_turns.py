@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import require
+from lgsens.liegroups import SO3
 from lgsens.model._frames import Frame
 from lgsens.model._loads import AbstractDynamicLoad
 from lgsens.model._relative import but_for_turns
@@ -49,6 +50,12 @@ def force_along(load: AlongCoordinate, a: Frame, b: Frame, va, vb, t, z=None) ->
     """Q."""
     found, row = acting(load, a, b, va, vb, t, z)
     return found[-1] * row
+
+
+def rotation_between(a: Frame, triad_a: Float[Array, "3 3"], b: Frame, triad_b: Float[Array, "3 3"]) -> Array:
+    """The rotation vector from axes of a to those of b, |φ| ≤ π: as `AbstractElement.branch`, from π about n it goes to
+    −π, by 3.6 rad and more in one component."""
+    return SO3().log((a.orientation @ triad_a).T @ b.orientation @ triad_b)
 
 
 def unless_whole(ratio: Array, teeth: int, angle: Array) -> Array:

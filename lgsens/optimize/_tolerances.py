@@ -25,7 +25,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from lgsens._validate import as_count, as_float, require, suggestion
+from lgsens._validate import as_count, as_float, as_parameters, require, suggestion
 from lgsens.sweeps import SweepResult, sweep
 
 _DISTRIBUTIONS = ("normal", "uniform")
@@ -95,7 +95,7 @@ def _names(tree: PyTree) -> tuple[str, ...]:
 
 def _checked(p: PyTree, tolerances: PyTree) -> tuple[PyTree, PyTree]:
     """Both as arrays, tolerances in the shapes of p."""
-    p = jax.tree_util.tree_map_with_path(lambda path, leaf: as_float(leaf, None, f"`p`{jax.tree_util.keystr(path)}"), p)
+    p = as_parameters(p)
     if jax.tree.structure(tolerances) != jax.tree.structure(p):
         raise ValueError(
             f"`tolerances` must have the structure of `p`, {jax.tree.structure(p)}, got "
