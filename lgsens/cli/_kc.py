@@ -9,7 +9,6 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 
@@ -104,7 +103,7 @@ def _chosen(asked: str | None, sweeps: dict[str, rigs.Sweep], axle: Axle) -> lis
     for name in names:
         if name not in known:
             raise ValueError(f"argument --gradient: {suggestion(name, known)}, or all of them: all")
-    if names and not axle.left.hardpoint_names:
+    if names and not axle.hardpoint_names:
         raise ValueError("argument --gradient: no link or joint of this axle holds on to the chassis")
     return names
 
@@ -114,14 +113,14 @@ def _gradients(axle: Axle, names: list[str], sweeps: dict[str, rigs.Sweep], vehi
     needed = {rigs.CHARACTERISTICS[name].sweep: sweeps[rigs.CHARACTERISTICS[name].sweep] for name in names}
 
     def of(points):
-        moved = eqx.tree_at(lambda axle: axle.left, axle, axle.left.with_values(hardpoints=points))
+        moved = axle.with_hardpoints(points)
         model = moved.model(links="rods", compliant=compliant)
         found = rigs.characteristics(
             rigs.kc(model, moved.wheel_centres, needed, points=3, vehicle=vehicle, throw=False)
         )
         return {name: value for name, value in found.items() if name in names}
 
-    return {name: np.asarray(found) for name, found in jax.jit(jax.jacfwd(of))(axle.left.hardpoints).items()}
+    return {name: np.asarray(found) for name, found in jax.jit(jax.jacfwd(of))(axle.hardpoints).items()}
 
 
 def _finite(values: Any) -> Any:
@@ -148,7 +147,7 @@ def _document(axle: Axle, test: rigs.KC, sweeps, numbers: dict[str, float], grad
             for name, value in numbers.items()
         },
         "gradients": {
-            name: dict(zip(axle.left.hardpoint_names, _finite(found.tolist()))) for name, found in gradients.items()
+            name: dict(zip(axle.hardpoint_names, _finite(found.tolist()))) for name, found in gradients.items()
         },
         "sweeps": {
             name: {"unit": sweep.unit, "shares": dict(sweep.shares)}
@@ -235,7 +234,7 @@ def _row(one: rigs.Characteristic, value: float) -> str:
 
 def _gradient_table(axle: Axle, gradients: dict[str, np.ndarray]) -> str:
     """The five largest of each characteristic, largest first."""
-    places = [f"{name} {axis}" for name in axle.left.hardpoint_names for axis in "xyz"]
+    places = [f"{name} {axis}" for name in axle.hardpoint_names for axis in "xyz"]
     lines = []
     for name, found in gradients.items():
         factor, unit = rigs.CHARACTERISTICS[name].shown

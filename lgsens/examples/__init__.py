@@ -34,6 +34,7 @@ from lgsens.examples._quarter_car_design import (
     SuspensionDesign as SuspensionDesign,
 )
 from lgsens.examples._road_limits import RoadLimits as RoadLimits
+from lgsens.examples._solid_axle import LIVE as LIVE, SolidAxle as SolidAxle
 from lgsens.examples._suspension_curves import (
     SuspensionCurves as SuspensionCurves,
     WheelPlane as WheelPlane,

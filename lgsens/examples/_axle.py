@@ -7,16 +7,19 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from lgsens._validate import as_float
 from lgsens.examples._axle_file import axle_members
 from lgsens.examples._axle_parts import Bar, Rack
 from lgsens.examples._bending import with_nodes
 from lgsens.examples._corner_scene import CornerScene, corner_scene
 from lgsens.examples._hardpoint_file import read
 from lgsens.examples._quarter_car import GRAVITY, QuarterCar, check_choice
+from lgsens.examples._solid_axle import SolidAxle
 from lgsens.examples._suspension_file import reader
-from lgsens.examples._suspension_parts import Part, reflected
+from lgsens.examples._suspension_parts import Part, numbered, reflected
 from lgsens.examples._twist_beam import TwistBeam
 from lgsens.model import (
     ALL_FREE,
@@ -46,6 +49,7 @@ class Axle(eqx.Module):
         rack: it slides and steers; None: the wheels are not steered.
         bar: the anti-roll bar, the same on both sides; None: there is none.
         twist_beam: the cross member of a twist-beam axle, the same on both sides; None: there is none.
+        solid_axle: what holds an axle whose knuckles are one body, beside the links of its corners; None: they are two.
     """
 
     left: QuarterCar
@@ -54,6 +58,7 @@ class Axle(eqx.Module):
     rack: Rack | None = None
     bar: Bar | None = None
     twist_beam: TwistBeam | None = None
+    solid_axle: SolidAxle | None = None
 
     @staticmethod
     def load(path: str | Path | None = None) -> "Axle":
@@ -67,9 +72,14 @@ class Axle(eqx.Module):
         with jax.ensure_compile_time_eval():
             corner = QuarterCar.load(path)
             root, kilogram = reader(*read(path))
-            between = axle_members(root, kilogram, corner.links)
-            axle = Axle(with_nodes(corner, between["bar"].ends) if "bar" in between else corner, **between)
-            return axle if corner.wheel.centre[1] > 0 else reflected(axle)
+            between = axle_members(root, kilogram, corner)
+            solid = between.get("solid_axle")
+            left = with_nodes(corner, between["bar"].ends) if "bar" in between else corner
+            axle = Axle(left if solid is None else solid.freed(left), **between)
+            if corner.wheel.centre[1] > 0:
+                return axle
+            # Links that there are once are where the file has them.
+            return dataclasses.replace(reflected(axle), solid_axle=solid)
 
     @property
     def name(self) -> str:
@@ -86,13 +96,47 @@ class Axle(eqx.Module):
         """By side the wheel centre at the design position [m], shape (3,)."""
         return {"left": self.left.wheel.centre, "right": self.right.wheel.centre}
 
+    def _own_chassis(self) -> dict[str, Array]:
+        """By link of a solid axle the points at which it holds on to the chassis."""
+        links = {} if self.solid_axle is None else self.solid_axle.links
+        return {name: link.chassis for name, link in sorted(links.items()) if "chassis" in link.ends}
+
+    @property
+    def hardpoints(self) -> Float[Array, "n 3"]:
+        """Where the links and joints of the left side, and of a solid axle, hold on to the chassis [m], (n, 3)."""
+        own = [jnp.atleast_2d(points) for points in self._own_chassis().values()]
+        return jnp.concatenate([self.left.hardpoints, *own] if self.left.hardpoint_names else own)
+
+    @property
+    def hardpoint_names(self) -> list[str]:
+        """Theirs, as of `QuarterCar.hardpoint_names`."""
+        return self.left.hardpoint_names + numbered(self._own_chassis())
+
+    def with_hardpoints(self, points: Float[Array, "n 3"]) -> "Axle":
+        """The axle with others, of the left side and their mirror image. Raises `ValueError` for a wrong shape."""
+        points = as_float(points, (len(self.hardpoint_names), 3), "`points`")
+        count = len(self.left.hardpoint_names)
+        left = self.left.with_values(hardpoints=points[:count]) if count else self.left
+        own, rest = self._own_chassis(), points[count:]
+        if not own:
+            return dataclasses.replace(self, left=left)
+        ends = np.cumsum([old.size // 3 for old in own.values()])
+        new = [rest[end - old.size // 3 : end].reshape(old.shape) for old, end in zip(own.values(), ends)]
+        where = lambda axle: [axle.left, *axle._own_chassis().values()]
+        return eqx.tree_at(where, self, [left, *new])
+
     @property
     def mass(self) -> Float[Array, ""]:
         """Of all bodies [kg]: of two quarters of a car, and what is between them."""
         between = [self.subframe, None if self.rack is None else self.rack.part]
         every = [part.mass for part in (self.left, self.right, *between) if part is not None]
-        every += [part.own_mass for part in (self.bar, self.twist_beam) if part is not None]
+        every += [part.own_mass for part in self._spanning]
         return jnp.sum(jnp.stack(every))
+
+    @property
+    def _spanning(self) -> list[Any]:
+        """What goes from one corner to the other."""
+        return [part for part in (self.bar, self.twist_beam, self.solid_axle) if part is not None]
 
     def two_sided(self) -> "Axle":
         """The same axle with numbers of its own on each side."""
@@ -110,7 +154,9 @@ class Axle(eqx.Module):
         `left_bump_stop`, `anti_roll_bar`, `left_tyre`. Of beams there are nodes and elements in their places,
         `left_LINK.0`, `anti_roll_bar.0`, …, the first on the left, and `left_anti_roll_bar_BODY`, what carries the bar.
         A twist beam has `twist_beam.0`, … and the joints `left_twist_beam_BODY`; or `left_twist_beam`, rigid, and the
-        joint and the force `twist_beam`.
+        joint and the force `twist_beam`. The knuckles of a solid axle are fixed to each other by the joint `live_axle`,
+        or `solid_axle` of one whose final drive is on the chassis; links that it has once are LINK, with joints
+        `LINK_BODY`.
 
         Arguments:
             chassis: "held", or "guided": it heaves, and rolls about its centre of mass.
@@ -142,7 +188,8 @@ class Axle(eqx.Module):
 
         A motion of both sides alike turns or moves nothing across the plane y = 0: half of the chassis heaves, half of
         the subframe moves in x and z and pitches, half of the rack is fixed to what carries it, the bar does not twist,
-        nor does it bend; of a twist beam the middle stays in that plane and upright to it.
+        nor does it bend; of a twist beam the middle stays in that plane and upright to it; a solid axle slides along
+        it, without links across (`SolidAxle`).
         Names, preloads and joints are those of `model(chassis="guided", tyres=True)` on the left.
 
         Arguments:
@@ -176,11 +223,15 @@ class Axle(eqx.Module):
         forces: dict[str, Any] = {"gravity": Gravity((0.0, 0.0, -GRAVITY))}
         bodies, ends, sought, given = {}, {}, [], {}
         cars = cars if compliant else {side: car.rigid() for side, car in cars.items()}
+        name, solid = f"Suspension {self.name!r}", self.solid_axle
         for side, car in cars.items():
             if side == "left" or self.other is not None:
-                car._check(f"Suspension {self.name!r}")
-        between = [part for part in (self.bar, self.twist_beam) if part is not None]
-        held = [part.link for part in between]
+                (car if solid is None else solid.corner(car))._check(name)
+        if solid is not None and len(cars) == 2:
+            solid.check(name, cars, compliant)
+        elif solid is not None:
+            cars = {side: solid.corner(car) for side, car in cars.items()}
+        held = [part.link for part in self._spanning]
         if self.twist_beam is not None and (compliant or len(cars) == 2):
             cars = {side: self.twist_beam.instead(car) for side, car in cars.items()}
         for side, car in cars.items():
@@ -192,10 +243,10 @@ class Axle(eqx.Module):
             tyre = {"at": car.wheel.centre, "stiffness": car.tyre_stiffness, "road": road}
             forces[f"{side}_tyre"] = TyreSpring(f"{side}_wheel", **tyre)
             sought, given = [*sought, f"{side}_tyre", *scene.sought], given | scene.given
-        for part in between:
+        for part in self._spanning:
             more = part.scene(cars, compliant)
             bodies, joints, forces = bodies | more.bodies, joints | more.joints, forces | more.forces
-            sought += more.sought
+            sought, given = [*sought, *more.sought], given | more.given
         return CornerScene(bodies, joints, forces, ends, sought, given)
 
     def _between(self, compliant: bool) -> tuple[dict[str, Part], dict[str, Any]]:

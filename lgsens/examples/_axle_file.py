@@ -14,29 +14,17 @@ from lgsens.examples._axle_parts import ALONG_Y, CURVED, CURVES, RATES, Bar, Mou
 from lgsens.examples._corner_scene import connections
 from lgsens.examples._hardpoint_file import Reader
 from lgsens.examples._link_beam import read_beam
+from lgsens.examples._link_file import CARRIERS, carried, read_link
+from lgsens.examples._solid_axle import BODY, SolidAxle
 from lgsens.examples._suspension_parts import LEVEL, Connection, Link, Part, Strut
 from lgsens.examples._twist_beam import TwistBeam
 
-CARRIERS = ("subframe", "rack")
-OF_AXLE = (*CARRIERS, "anti_roll_bar", "twist_beam", "bushings", "bump_stop", "rebound_stop")
+OF_AXLE = (*CARRIERS, "anti_roll_bar", "twist_beam", "solid_axle", "bushings", "bump_stop", "rebound_stop")
 OF_MOUNT = (*RATES, *CURVES, "axes", "preload", "rotational_preload")
 OF_PART = ("centre_of_mass", "mass", "inertia")
 SECTION = ("stiffness", "diameter", "length", "bore", "shear_modulus", "damping")
 OF_TWIST_BEAM = ("beam", "shear_centre")
 OF_STOP = ("gap", "stiffness", "rounding", "progression")
-
-
-def carried(table: Reader, key: str, ends: dict[str, Any], carriers: dict[str, str]) -> dict[str, Any]:
-    """The ends of an element with the chassis in place of subframe or rack, which `carriers` keeps."""
-    taken = [body for body in ends if body in CARRIERS]
-    if not taken:
-        return ends
-    if len(taken) > 1 or "chassis" in ends:
-        raise table.fail(
-            taken[-1], f"is with {sorted({*ends} - {taken[-1]})} one body to a corner; hold on to one of them."
-        )
-    carriers[key] = taken[0]
-    return {"chassis" if body in CARRIERS else body: points for body, points in ends.items()}
 
 
 def stop(table: Reader, key: str, bodies: tuple[str, ...], damper: Strut, carriers: dict[str, str]) -> Stop:
@@ -59,22 +47,34 @@ def stop(table: Reader, key: str, bodies: tuple[str, ...], damper: Strut, carrie
 
 
 def mounts(
-    root: Reader, links: Mapping[str, Link], joints: Mapping[str, Connection], carriers: Mapping[str, str]
+    root: Reader,
+    links: Mapping[str, Link],
+    joints: Mapping[str, Connection],
+    carriers: Mapping[str, str],
+    solid: SolidAxle | None,
 ) -> dict[str, Mount]:
-    """The bushings, by the joints that they replace, and the mounts of the subframe."""
-    known = connections(links, joints, carriers)
-    found = {}
-    for name, table in root.tables("bushings").items():
-        if name not in known:
-            raise root.table("bushings").fail(name, f"there is no such joint; those of the file are {sorted(known)}.")
-        if known[name].kind in ("cylindrical", "prismatic"):
-            raise table.fail("stiffness", f"joint {name!r} slides, and a bushing would hold it; leave it a joint.")
-        table.only(OF_MOUNT)
-        found[name] = _mount(table, len(np.atleast_2d(known[name].at)))
+    """The bushings of a corner, by the joints that they replace, and the mounts of the subframe."""
+    found = _bushings(root, connections(links, joints, carriers), () if solid is None else solid.connections())
     if "subframe" in root:
         for name, table in root.table("subframe").tables("mounts").items():
             table.only(("at", *OF_MOUNT))
             found[f"subframe_{name}"] = _mount(table, 1, table.point("at"))
+    return found
+
+
+def _bushings(root: Reader, known: Mapping[str, Connection], others: Collection[str]) -> dict[str, Mount]:
+    """Those of some joints; `others` has the names of those elsewhere."""
+    found = {}
+    for name, table in root.tables("bushings").items():
+        if name not in known and name in others:
+            continue
+        if name not in known:
+            every = sorted({*known, *others})
+            raise root.table("bushings").fail(name, f"there is no such joint; those of the file are {every}.")
+        if known[name].kind in ("cylindrical", "prismatic"):
+            raise table.fail("stiffness", f"joint {name!r} slides, and a bushing would hold it; leave it a joint.")
+        table.only(OF_MOUNT)
+        found[name] = _mount(table, len(np.atleast_2d(known[name].at)))
     return found
 
 
@@ -106,8 +106,9 @@ def _centred(table: Reader, key: str) -> Array:
     return as_float(curve, None, key)
 
 
-def axle_members(root: Reader, kilogram: float, links: Mapping[str, Link]) -> dict[str, Any]:
-    """The fields of an `Axle` beside its corners."""
+def axle_members(root: Reader, kilogram: float, corner: Any) -> dict[str, Any]:
+    """The fields of an `Axle` beside its corners, of which this is one, a `QuarterCar`."""
+    links = corner.links
     part = lambda table: Part(table.point("centre_of_mass"), table.number("mass", kilogram), table.moments("inertia"))
     found: dict[str, Any] = {}
     if "subframe" in root:
@@ -131,6 +132,8 @@ def axle_members(root: Reader, kilogram: float, links: Mapping[str, Link]) -> di
     if "twist_beam" in root:
         side = np.sign(root.table("wheel").point("centre")[1])
         found["twist_beam"] = _twist_beam(root.table("twist_beam"), links, side)
+    if BODY in root:
+        found[BODY] = solid_axle(root, kilogram, (), connections(links, corner.joints, dict(corner.carriers)))
     return found
 
 
@@ -180,6 +183,37 @@ def _twist_beam(table: Reader, links: Mapping[str, Link], side) -> TwistBeam:
     except ValueError as error:
         raise table.fail("beam", str(error)) from error
     return member
+
+
+def solid_axle(root: Reader, kilogram: float, taken: Collection[str], corner: Collection[str]) -> SolidAxle | None:
+    """What holds a solid axle beside its corners, which have the joints `corner`; None: it is none."""
+    if BODY not in root:
+        return None
+    if "twist_beam" in root:
+        raise root.fail(BODY, "its knuckles are one body, and a twist beam joins two; leave one of the tables out.")
+    table = root.table(BODY)
+    table.only(("final_drive", "links"))
+    live = "final_drive" not in table or table.choice("final_drive", ["axle", "chassis"]) == "axle"
+    tables = table.tables("links")
+    for name in sorted({*taken} & {*tables}):
+        raise table.table("links").fail(name, f"is the name of something else; those taken are {sorted(taken)}.")
+    bodies = ("chassis", BODY, *(["subframe"] if "subframe" in root else []), *tables)
+    carriers: dict[str, str] = {}
+    links = {name: read_link(name, of, bodies, kilogram, carriers) for name, of in tables.items()}
+    for name, link in links.items():
+        if link.beam is not None:
+            raise tables[name].fail("beam", "links of a solid axle are rigid; give it mass in place of this.")
+    bars = any(link.is_bar for link in links.values())
+    radius = root.table("link_section").number("radius") if bars else None
+    along = tuple(name for name, link in links.items() if {*link.ends} == {"chassis", BODY} and _along(link))
+    axle = SolidAxle(links, along, {}, radius, tuple(sorted(carriers.items())), live)
+    return dataclasses.replace(axle, mounts=_bushings(root, axle.connections(), corner))
+
+
+def _along(link: Link) -> bool:
+    """Whether it goes less across the car than along."""
+    x, y, z = np.abs(np.asarray(link.axis[1] - link.axis[0]))
+    return bool(y <= np.hypot(x, z))
 
 
 def _carrier(root: Reader, table: Reader) -> str:

@@ -33,11 +33,11 @@ class Place(NamedTuple):
 def places(axle: Axle) -> dict[str, list[Place]]:
     """The coordinates of hardpoints and the positive rates of an axle, in the order of its leaves."""
     found: dict[str, list[Place]] = {POINTS: [], RATES: []}
-    carriers = dict(axle.left.carriers)
+    carriers = dict(axle.left.carriers) | ({} if axle.solid_axle is None else dict(axle.solid_axle.carriers))
     for i, (path, leaf) in enumerate(jax.tree_util.tree_leaves_with_path(axle)):
         names = [str(getattr(entry, "name", getattr(entry, "key", ""))) for entry in path]
         names = names[1:] if names[0] == "left" else names
-        if names[0] not in ("links", "joints", "spring", "damper", "twist_beam", *_TABLES):
+        if names[0] not in ("links", "joints", "spring", "damper", "twist_beam", "solid_axle", *_TABLES):
             continue
         is_point = "ends" in names or names[-1] in _AT
         if is_point or (names[-1] in _POSITIVE and np.all(np.asarray(leaf) > 0)):
@@ -49,6 +49,9 @@ def places(axle: Axle) -> dict[str, list[Place]]:
 
 def _key(names: list[str], carriers: Mapping[str, str]) -> str:
     """That of the file: "links.tie_rod.subframe", "bushings.pivot.stiffness", "subframe.mounts.front.at"."""
+    if names[0] == "solid_axle":  # its links are in its table, their bushings with all others
+        own = _key(names[1:], carriers)
+        return own if names[1] == "mounts" else f"solid_axle.{own}"
     owner = ".".join(names[: 2 if names[0] in ("links", "joints") else 1]) if names[0] != "stops" else names[1]
     if names[-3:] == ["beam", "of", "stiffness"]:
         names = [*names[:-3], "beam.section", "stiffness"]

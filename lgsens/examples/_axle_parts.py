@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -76,6 +77,16 @@ class Mount(eqx.Module):
                 bushing = bushing.with_preload(jnp.concatenate(along))
             yield name if len(points) == 1 else f"{name}_{i + 1}", bushing
 
+    def halved(self, count: int) -> "Mount":
+        """Half of so many of it, on either side of the plane y = 0: of the two of a hinge one in the middle."""
+
+        def half(array):
+            return None if array is None else count / 2 * (array if array.ndim == 1 else jnp.mean(array, axis=0))
+
+        rates = {key: half(getattr(self, key)) for key in (*RATES, "preload", "rotational_preload")}
+        curves = {key: jnp.stack([curve[0], count / 2 * curve[1]]) for key, curve in self.curves.items()}
+        return dataclasses.replace(self, **rates, curves=curves)
+
 
 class Stop(eqx.Module):
     """A bump or rebound stop: `BumpStop` between the points of two bodies, `ends`."""
@@ -113,12 +124,18 @@ class Rack(eqx.Module):
 
 
 class Between(NamedTuple):
-    """What a part between the corners brings into a scene; `sought`: of its forces those with preloads."""
+    """What a part between the corners brings into a scene.
+
+    Attributes:
+        sought: of its forces those with preloads.
+        given: of these those that have their own.
+    """
 
     bodies: dict[str, RigidBody]
     joints: dict[str, AbstractJoint]
     forces: dict[str, AbstractForce]
     sought: tuple[str, ...]
+    given: Mapping[str, AbstractForce] = MappingProxyType({})
 
 
 class Bar(eqx.Module):

@@ -9,7 +9,7 @@ as many equations as unknowns where travel is the one freedom. A spring whose en
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from lgsens.examples._suspension_parts import Connection, Link, Strut
 
 RATIOS = (0.1, 3.0)  # motion ratios that cars have; racing cars' rockers reach some 0.4 to 1.5
 LEAST_ANGLE = math.radians(10.0)  # of a link to the plane of its universal joint's arms, where it would be singular
+SINGULAR = 1e8  # condition of the rows, at least
 
 
 def motion_ratios(
@@ -39,43 +40,28 @@ def motion_ratios(
     for key, connection in every:
         if connection.arms is not None:
             _check_arms(name, key, links[connection.between[1]], connection)
-    columns = {body: slice(6 * i, 6 * i + 6) for i, body in enumerate(("knuckle", *links))}
-
-    def relative(a: str, b: str, directions: np.ndarray, part: np.ndarray) -> np.ndarray:
-        rows = np.zeros((len(directions), 6 * len(columns)))
-        for body, sign in ((b, 1.0), (a, -1.0)):
-            if body in columns:
-                rows[:, columns[body]] += sign * directions @ part
-        return rows
-
-    moves = lambda p: np.hstack([np.eye(3), -np.cross(np.eye(3), np.asarray(p))])  # (v, w) ↦ v + w × p
-    turns = np.hstack([np.zeros((3, 3)), np.eye(3)])
-    rows = []
-    for _, connection in every:
-        at, turning, moving = connection.blocked()
-        turning = turning / np.linalg.norm(turning, axis=1, keepdims=True)
-        rows += [relative(*connection.between, turning, turns), relative(*connection.between, moving, moves(at))]
-    equations, unknowns = sum(map(len, rows)), 6 * len(columns)
-    if equations != unknowns - 1:
+    velocities = Velocities(("knuckle", *links))
+    rows = velocities.rows([connection for _, connection in every])
+    free = velocities.unknowns - len(rows)
+    if free != 1:
         raise ValueError(
-            f"{name}, key 'links': the wheel has {unknowns - equations} degrees of freedom to the chassis, and needs "
+            f"{name}, key 'links': the wheel has {free} degrees of freedom to the chassis, and needs "
             f"one, its travel, got the links {sorted(links)} and the joints {sorted(joints)}. A link with two ball "
             "joints takes one from the knuckle's six, one with a hinge on the chassis and a ball joint takes two."
         )
-    rows.append(relative("chassis", "knuckle", np.eye(3)[2:], moves(centre)))
-    matrix = np.concatenate(rows)
+    matrix = np.concatenate([rows, velocities.moving("chassis", "knuckle", np.eye(3)[2:], centre)])
     condition = np.linalg.cond(matrix)
-    if not condition < 1e8:
+    if not condition < SINGULAR:
         raise ValueError(
             f"{name}, key 'links': joints repeat each other, or leave the wheel no travel at the design position "
             f"(condition {condition:.0e}); move a hardpoint, or check the line of a hinge."
         )
-    twists = np.linalg.solve(matrix, np.append(np.zeros(unknowns - 1), 1.0))
+    twists = np.linalg.solve(matrix, np.append(np.zeros(len(rows)), 1.0))
     ratios = {}
     for key, strut in struts.items():
         a, b = strut.bodies
         line = np.asarray(strut.ends[b] - strut.ends[a])
-        speeds = [relative("chassis", end, line[None], moves(strut.ends[end])) @ twists for end in (a, b)]
+        speeds = [velocities.moving("chassis", end, line[None], strut.ends[end]) @ twists for end in (a, b)]
         ratios[key] = ratio = float((speeds[0] - speeds[1])[0] / np.linalg.norm(line))
         if not RATIOS[0] <= ratio <= RATIOS[1]:
             raise ValueError(
@@ -86,6 +72,42 @@ def motion_ratios(
                 f"{b!r}, and their hinges and arms."
             )
     return ratios
+
+
+class Velocities:
+    """Linear equations for the twists (v, w) of bodies, one after the other; those of others are zero."""
+
+    def __init__(self, bodies: Collection[str]):
+        self._columns = {body: slice(6 * i, 6 * i + 6) for i, body in enumerate(bodies)}
+
+    @property
+    def unknowns(self) -> int:
+        """How many components these twists have."""
+        return 6 * len(self._columns)
+
+    def _relative(self, a: str, b: str, parts: np.ndarray) -> np.ndarray:
+        rows = np.zeros((len(parts), self.unknowns))
+        for body, sign in ((b, 1.0), (a, -1.0)):
+            if body in self._columns:
+                rows[:, self._columns[body]] += sign * parts
+        return rows
+
+    def moving(self, a: str, b: str, directions: np.ndarray, at: Any) -> np.ndarray:
+        """The velocity of b in a at a point, along directions, shape (n, 3)."""
+        return self._relative(a, b, directions @ np.hstack([np.eye(3), -np.cross(np.eye(3), np.asarray(at))]))
+
+    def turning(self, a: str, b: str, directions: np.ndarray) -> np.ndarray:
+        """The angular velocity of b in a about them."""
+        return self._relative(a, b, np.hstack([np.zeros_like(directions), directions]))
+
+    def rows(self, joints: Iterable[Connection]) -> np.ndarray:
+        """What the joints say."""
+        found = []
+        for joint in joints:
+            at, turning, moving = joint.blocked()
+            turning = turning / np.linalg.norm(turning, axis=1, keepdims=True)
+            found += [self.turning(*joint.between, turning), self.moving(*joint.between, moving, at)]
+        return np.concatenate(found)
 
 
 def _check_arms(name: str, key: str, link: Link, connection: Connection) -> None:

@@ -20,7 +20,7 @@ from lgsens.examples._leverage import motion_ratios
 from lgsens.examples._link_beam import ELEMENTS, SectionShape
 from lgsens.examples._suspension_curves import SuspensionCurves, suspension_curves
 from lgsens.examples._suspension_file import members
-from lgsens.examples._suspension_parts import Connection, Link, Part, Strut, reflected
+from lgsens.examples._suspension_parts import PLANAR, Connection, Link, Part, Strut, numbered, reflected
 from lgsens.model import (
     ALL_FREE,
     BeamSection,
@@ -157,7 +157,8 @@ class QuarterCar(eqx.Module):
     def _on_chassis(self) -> dict[str, Array]:
         """By link or joint the points at which it holds on to the chassis, in order."""
         links = {name: link.chassis for name, link in sorted(self.links.items()) if "chassis" in link.ends}
-        return links | {name: c.at for name, c in sorted(self.joints.items()) if "chassis" in c.between}
+        joints = {name: c.at for name, c in sorted(self.joints.items()) if "chassis" in c.between}
+        return links | {name: at for name, at in joints.items() if self.joints[name].kind != PLANAR}
 
     @property
     def hardpoints(self) -> Float[Array, "n 3"]:
@@ -167,8 +168,7 @@ class QuarterCar(eqx.Module):
     @property
     def hardpoint_names(self) -> list[str]:
         """The links in sorted order, then the joints; of one with two points "NAME 1" and "NAME 2"."""
-        numbers = lambda points: [""] if points.ndim == 1 else [" 1", " 2"]
-        return [name + number for name, points in self._on_chassis().items() for number in numbers(points)]
+        return numbered(self._on_chassis())
 
     @property
     def mass(self) -> Float[Array, ""]:

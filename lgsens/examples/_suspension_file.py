@@ -45,6 +45,11 @@ Of an axle; points (of the side of the file) and masses are in `units` here as w
                    the chassis (joints.NAME, spherical); shear_centre: of the section from its axis, forward and up
                    [m] (left out: on it), see `TwistBeam`
     [twist_beam.beam]  as of a link, elements of either half
+    [solid_axle]   both knuckles, each one half of the axle with half its mass, are one body; final_drive = "axle" (left
+                   out: there) or "chassis" (De Dion), see `SolidAxle`
+    [solid_axle.links.NAME]  as links.NAME, those that the axle has once: a Panhard rod, an upper link in the middle,
+                   what a Watt's linkage is made of; their bodies are `chassis`, `subframe`, `solid_axle` and each
+                   other, and bushings may replace their joints NAME_BODY
     [anti_roll_bar.bushing]  the keys of a bushing: of the bearings of such a bar, left out: ball joints
     [bushings.NAME]  in place of the joint NAME, LINK_BODY of a link: stiffness, rotational_stiffness [N/m], [N m/rad],
                    damping, rotational_damping (left out: none), three numbers, or two times three of the two
@@ -58,7 +63,7 @@ Of an axle; points (of the side of the file) and masses are in `units` here as w
 
 A corner by itself has stops and links that bend, and of the rest what is rigid: the chassis takes the place of
 subframe and rack, joints that of bushings, and there is no anti-roll bar. What a twist beam guides is on a hinge
-along y, about which both sides turn alike.
+along y, about which both sides turn alike; half of a solid axle slides in a plane upright to y.
 """
 
 from pathlib import Path
@@ -70,20 +75,20 @@ import numpy as np
 from jaxtyping import Array
 
 from lgsens._validate import as_float
-from lgsens.examples._axle_file import CARRIERS, OF_AXLE, carried, levelled, mounts, stop
+from lgsens.examples._axle_file import OF_AXLE, levelled, mounts, solid_axle, stop
+from lgsens.examples._corner_scene import connections
 from lgsens.examples._hardpoint_file import Reader
-from lgsens.examples._link_beam import read_beam
-from lgsens.examples._suspension_parts import ALONG_A_LINE, AT_A_POINT, Connection, Link, Part, Strut
+from lgsens.examples._link_file import CARRIERS, OF_LINK, carried, read_link
+from lgsens.examples._suspension_parts import ALONG_A_LINE, AT_A_POINT, Connection, Part, Strut
 from lgsens.model import Sampled
 
 LEAST_RADIUS, LARGEST_RADIUS = 0.1, 2.0  # m, loaded radii of tyres
-PARTS = ("chassis", "knuckle", "wheel", *CARRIERS, "anti_roll_bar", "drop_link", "twist_beam")
+PARTS = ("chassis", "knuckle", "wheel", *CARRIERS, "anti_roll_bar", "drop_link", "twist_beam", "solid_axle")
 TABLES = ("name", "units", "road", "links", "joints", "chassis", "knuckle", "wheel", "spring", "damper", "tyre")
 TABLES += ("link_section", "bump", "design")
 RATES = {"spring": "stiffness", "damper": "damping"}
 STOPS = ("bump_stop", "rebound_stop")
 OF_MODEL = ("hub", "heave", "travel")  # joints that there are beside those of the file
-OF_LINK = ("mass", "centre_of_mass", "inertia", "arm", "link_arm", "beam")
 
 
 def reader(document: dict, path: str) -> tuple[Reader, float]:
@@ -103,8 +108,9 @@ def members(document: dict, path: str) -> dict[str, Any]:
         raise root.table("links").fail(name, f"is a name of its own; choose another than {[*PARTS, *OF_LINK]}.")
     bodies = ("chassis", "knuckle", *(body for body in CARRIERS if body in root), *tables)
     carriers: dict[str, str] = {}
-    links = {name: _link(name, table, bodies, kilogram, carriers) for name, table in tables.items()}
+    links = {name: read_link(name, table, bodies, kilogram, carriers) for name, table in tables.items()}
     joints = {name: _joint(name, table, bodies, carriers) for name, table in root.tables("joints").items()}
+    solid = solid_axle(root, kilogram, (*PARTS, *OF_LINK, *links, *joints), connections(links, joints, carriers))
     joints = levelled(root, links, joints)
     taken = {*OF_MODEL, *links, *(f"{name}_{body}" for name, link in links.items() for body in link.ends)}
     for name in sorted(taken & set(joints)):
@@ -124,15 +130,19 @@ def members(document: dict, path: str) -> dict[str, Any]:
             f"tyre has a loaded radius outside of {LEAST_RADIUS} to {LARGEST_RADIUS} m; set the key 'road.height' to "
             "the z of the road at the design position, or 'units.length' to what the file is written in (0.001: mm).",
         )
-    bars = [link for link in links.values() if link.inertia is None and link.beam is None]
+    every = links if solid is None else links | solid.links
+    bars = [link for link in every.values() if link.inertia is None and link.beam is None]
     bump = root.table("bump")
     struts = {key: _strut(key, root.table(key), bodies, rate, carriers) for key, rate in RATES.items()}
     root.only((*TABLES, *OF_AXLE))  # after what is missing: a table that is spelled wrong is both
     stops = {key: stop(root.table(key), key, bodies, struts["damper"], carriers) for key in STOPS if key in root}
+    held = {"links": links, "joints": joints, "mounts": mounts(root, links, joints, carriers, solid)}
+    if solid is not None:
+        held = solid.more(wheel.centre, **held)
+        carriers |= dict(solid.carriers)
     return {
         "name": str(document.get("name", Path(path).stem)),
-        "links": links,
-        "joints": joints,
+        **held,
         "knuckle": part("knuckle", "centre_of_mass"),
         "wheel": wheel,
         "chassis": part("chassis", "centre_of_mass"),
@@ -142,40 +152,9 @@ def members(document: dict, path: str) -> dict[str, Any]:
         "link_radius": root.table("link_section").number("radius") if bars else None,
         "bump_height": bump.metres("height", 1.0, positive=False),
         "bump_duration": bump.number("duration"),
-        "mounts": mounts(root, links, joints, carriers),
         "stops": stops,
         "carriers": tuple(sorted(carriers.items())),
     }
-
-
-def _link(name: str, table: Reader, bodies: tuple[str, ...], kilogram: float, carriers: dict[str, str]) -> Link:
-    ends = carried(table, f"links.{name}", table.ends([body for body in bodies if body != name], OF_LINK), carriers)
-    beam = read_beam(table, ("mass", "centre_of_mass", "inertia")) if "beam" in table else None
-    if beam is not None and len(ends) != 2:
-        raise table.fail("beam", f"goes between two ends, got {sorted(ends)}; leave it out, the link is rigid.")
-    own = "centre_of_mass" in table or "inertia" in table
-    if len(ends) < 2 and not own:  # one end makes no bar
-        table.point("chassis" if "chassis" not in ends else "knuckle")
-    if len(ends) > 2 and not own:
-        table.point("centre_of_mass")
-    link = Link(
-        ends,
-        table.number("mass", kilogram) if beam is None else None,
-        centre=table.point("centre_of_mass") if own else None,
-        inertia=table.moments("inertia") if own else None,
-        arm=table.direction("arm"),
-        link_arm=table.direction("link_arm"),
-        beam=beam,
-    )
-    if beam is not None:
-        try:
-            link.bent(name)
-        except ValueError as error:
-            raise table.fail("beam", str(error)) from error
-    if link.first is None and (link.arm, link.link_arm) != (None, None):
-        key = "link_arm" if link.arm is None else "arm"
-        raise table.fail(key, "the link has a hinge or three ends and no universal joint; leave it out.")
-    return link
 
 
 def _joint(name: str, table: Reader, bodies: tuple[str, ...], carriers: dict[str, str]) -> Connection:

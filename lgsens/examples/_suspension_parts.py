@@ -1,6 +1,6 @@
 """What a suspension is made of: parts, links, connections, spring and damper, and the elements that they become."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -18,6 +18,7 @@ from lgsens.model import (
     CurveSpringDamper,
     CylindricalJoint,
     FixedJoint,
+    PlanarJoint,
     PrismaticJoint,
     RevoluteJoint,
     RigidBody,
@@ -36,6 +37,7 @@ ALONG_A_LINE: dict[str, Any] = {
     "revolute": RevoluteJoint,
 }
 LEVEL = "level"  # a hinge through a point, along y: what symmetry makes of a ball joint
+PLANAR = "planar"  # sliding on a plane through a point, upright to y: what symmetry makes of no joint at all
 VECTORS = {"at", "arms", "axes", "ends", "centre", "arm", "link_arm", "bearing", "lever", "preload", "up"}
 AXIAL = "rotational_preload"
 # Curves of a bushing along its axes e₁, e₂, e₃ = e₁ × e₂: these become S e₁, S e₂, −S e₃, and turns change their sign.
@@ -67,6 +69,11 @@ def reflected(tree: Tree) -> Tree:
 def itself(body: str) -> str:
     """The body of this name is called so."""
     return body
+
+
+def numbered(points: Mapping[str, Array]) -> list[str]:
+    """The names of points, of two of one name "NAME 1" and "NAME 2"."""
+    return [name + end for name, at in points.items() for end in ([""] if at.ndim == 1 else [" 1", " 2"])]
 
 
 class Part(eqx.Module):
@@ -113,6 +120,8 @@ class Connection(eqx.Module):
         between = [named(body) for body in self.between]
         if self.kind == LEVEL:
             return RevoluteJoint(*between, at=self.at, axis=ALONG_Y)
+        if self.kind == PLANAR:
+            return PlanarJoint(*between, at=self.at, axis=ALONG_Y)
         if self.arms is not None:
             return UniversalJoint(*between, at=self.at, axis_a=self.arms[0], axis_b=self.arms[1])
         if self.kind in AT_A_POINT:
@@ -127,6 +136,8 @@ class Connection(eqx.Module):
             return at[0], np.cross(np.asarray(self.arms[0]), np.asarray(self.arms[1]))[None], every
         if self.kind == LEVEL:
             return at[0], every[::2], every
+        if self.kind == PLANAR:
+            return at[0], every[::2], every[1:2]
         if self.kind in AT_A_POINT:
             return at[0], every if self.kind == "fixed" else none, every
         across = np.linalg.svd((at[1] - at[0])[None])[2][1:]

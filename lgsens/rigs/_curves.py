@@ -11,7 +11,8 @@ distance of the contact centres:
     motion ratio  −ℓ′/z′             by the pad of this wheel
     wheel rate    F′/z′              by both pads
     roll rate     M′/φ′              by both pads against each other; M′ = −Σ P_y F′, φ′ = (z_R′ − z_L′)/b
-    roll centre   ½ Σ P_y P_y′/P_z′  each by the pad of its wheel: over the road, where the normals to the paths of the
+    roll centre   ½ Σ P_y S′/P_z′    each by the pad of its wheel, S the sum of P_y of both wheels: over the road; of
+                                     wheels that are independent, S′ = P_y′, where the normals to the paths of the
                                      contact centres in front view meet the middle of the car, in the mean of both sides
 
 Force-based roll centre. Under lateral forces at the contact centres, with the pads held, springs and body stay where
@@ -20,8 +21,8 @@ they are, and the links alone change the vertical forces by F′; their moment a
     h = −Σ P_y F′ / Σ F_y′     along "lateral", in phase:
 
 the definition of ISO 8855 (where a lateral force on the body does not roll it). Without compliance it is the kinematic
-one, as then F_y P_y′ + F′ P_z′ = 0 (virtual work), of wheels that are independent. A twist beam moves the other wheel,
-too: its roll centre is this one, and the paths of single contact centres tell half of it.
+one: one pad moved, forces F_y on both contact centres do the work F_y S′ + F′ P_z′ = 0 (virtual work), also where a
+solid axle or a twist beam moves the other wheel too.
 
 Anti-features. The same with longitudinal forces: the vertical force that links add per force, over what the car's
 inertia adds, h_c/l of all of it, of which this axle has a share p:
@@ -190,6 +191,7 @@ def axle_curves(found: Statics, centres: Float[Array, "2 3"], vehicle: Vehicle) 
     difference = lambda of: of[:, 1] - of[:, 0]
     apart, rise = -difference(y), difference(wheels.travel)
     rolling = difference(against.travel) / apart
+    sideways = jnp.stack([jnp.sum(by_pad.contact_y, axis=1) for by_pad in (left, right)], axis=1)
     contact_rise = jnp.stack([by[1, :, 0, -1], by[2, :, 1, -1]], axis=1)
     curves = AxleCurves(
         value=jnp.zeros_like(y[:, 0]),
@@ -204,7 +206,7 @@ def axle_curves(found: Statics, centres: Float[Array, "2 3"], vehicle: Vehicle) 
         damper_motion_ratio=None,
         wheel_rate=both.force / both.travel,
         roll_rate=-jnp.sum(y * against.force, axis=1) / rolling,
-        roll_centre_height=jnp.mean(y * own("contact_y") / contact_rise, axis=1),
+        roll_centre_height=jnp.mean(y * sideways / contact_rise, axis=1),
     )
     known = {owner for stack in found.system.loads for owner in stack.owners}
     lengths = {

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens._validate import number_field, point_field
-from lgsens.examples import wheel_plane
+from lgsens.examples import LIVE, wheel_plane
 from lgsens.liegroups import cross
 from lgsens.model import (
     AbstractConstraint,
@@ -30,7 +30,7 @@ from lgsens.model import (
 
 SIDES = ("left", "right")
 # By kind of load its force and moment in tyre axes, and whether it acts at the contact centre or the wheel centre: the
-# moment of a brake is taken up by the knuckle, that of a drive shaft by the chassis.
+# moment of a brake is taken up by the knuckle, that of a drive shaft by the chassis, but for that of a live axle.
 KINDS = {
     "lateral": ((0.0, 1.0, 0.0), (0.0, 0.0, 0.0), True),
     "braking": ((-1.0, 0.0, 0.0), (0.0, 0.0, 0.0), True),
@@ -163,9 +163,11 @@ def on_rig(model: Model, centres: Mapping[str, Float[Array, "3"]]) -> Model:
             z = 0; each wheel's spin axis is along y there.
 
     Lateral, braking and aligning loads act at the contact centre (the brake's moment on the knuckle), traction at the
-    wheel centre (that of a drive shaft on the chassis). Raises `ValueError` for a missing wheel, or names that the
-    model has already.
+    wheel centre (that of a drive shaft on the chassis), or at the contact centre where the model has the joint
+    `live_axle`: the final drive is in the axle, which takes up its moment. Raises `ValueError` for a missing wheel, or
+    names that the model has already.
     """
+    live = LIVE in model.joints
     joints, forces = {}, {}
     for side in SIDES:
         wheel, centre = f"{side}_wheel", centres[side]
@@ -173,7 +175,7 @@ def on_rig(model: Model, centres: Mapping[str, Float[Array, "3"]]) -> Model:
             raise ValueError(f"`model`: the rig needs the body {wheel!r}; the bodies are {sorted(model.bodies)}.")
         joints[f"{side}_pad"] = Pad(b=wheel, at=centre)
         for kind, (force, moment, contact) in KINDS.items():
-            radius = centre[2] if contact else jnp.zeros_like(centre[2])
+            radius = centre[2] if contact or live else jnp.zeros_like(centre[2])
             wrench: dict[str, Any] = {"force": force, "moment": moment, "radius": radius}
             forces[f"{side}_{kind}"] = TyreLoad(wheel, at=centre, **wrench)
     if taken := sorted(({*joints} & {*model.joints}) | ({*forces} & {*model.forces})):
