@@ -93,10 +93,12 @@ def test_bad_arguments_of_the_command(arguments, message, tmp_path, capsys):
 
 
 def test_units_of_the_command():
-    """As `lgsens kc` shows them: degrees, °/kN, and roll camber in % with the other sign: bounds change places."""
+    """As `lgsens kc` shows them: degrees, °/kN, %."""
     assert _si("toe", 0.1) == pytest.approx(np.radians(0.1), rel=1e-14)
     assert _si("lateral_steer", (-0.02, 0.01)) == pytest.approx(tuple(np.radians([-2e-5, 1e-5])), rel=1e-14)
-    assert _si("roll_camber", (80.0, 90.0)) == pytest.approx((-0.9, -0.8), rel=1e-14)
+    assert _si("roll_camber", (80.0, 90.0)) == pytest.approx((0.8, 0.9), rel=1e-14)
+    with pytest.raises(ValueError, match="must have its lower bound first"):
+        _si("wheel_rate", (2.0, 1.0))
 
 
 @pytest.mark.slow  # the programs of a whole axle
@@ -117,7 +119,9 @@ def test_the_command_designs_an_axle(tmp_path, capsys):
     x = {"rates": jnp.asarray([found["design"]["rates"]["after"][name] for name in design.numbers.names["rates"]])}
     objective, _ = jax.jit(lambda x: design(x))(x)
     assert float(objective) == pytest.approx(found["objective"]["after"], rel=1e-9)  # round-off of accelerations
-    assert {path.name for path in out.iterdir()} == {"convergence.png", "mechanism.png", "response.png", "result.json"}
+    assert {path.name for path in out.iterdir()} == {
+        *("convergence.png", "mechanism.png", "response.png", "result.json", "suspension.json")
+    }
 
 
 @pytest.mark.slow  # two large scenes

@@ -197,6 +197,22 @@ CONSTRUCTORS = {
         lambda: lg.Model(TWO, {"strut": ball("chasis", "wheel")}),
         ("Joint 'strut' refers to body 'chasis'", "the bodies are ['chassis', 'wheel']"),
     ),
+    "coordinate by the name of a joint": (
+        lambda: lg.CoordinateForce("hinge", stiffness=1.0),
+        ("CoordinateForce", "needs a joint itself", "got 'hinge'"),
+    ),
+    "names of a coupling in one string": (
+        lambda: lg.CoordinateCoupling(
+            *[lg.RevoluteJoint(None, name, at=X, axis=Z) for name in TWO], coefficients=(1.0,), names="angle"
+        ),
+        ("`names` must be two names", "got 'angle'"),
+    ),
+    "freedoms by their number": (lambda: body(free=3), ("must be names of degrees of freedom", "got 3")),
+    "body with a number for a name": (lambda: lg.Model({1: body()}), ("a name in `bodies`", "got 1; give '1'")),
+    "inputs in one string": (
+        lambda: lg.linearize(lg.Model({"wheel": body()}), inputs="zz"),
+        ("`inputs` must be a sequence of names", "('zz',)"),
+    ),
     "spring of an unknown body": (
         lambda: lg.Model(TWO, {}, {"coil": lg.SpringDamper("chassis", "weel", at_a=ORIGIN, at_b=X, stiffness=1.0)}),
         ("Force 'coil' refers to body 'weel'", "the bodies are ['chassis', 'wheel']"),

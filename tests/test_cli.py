@@ -75,6 +75,7 @@ def test_the_report_is_complete(optimized):
         "mechanism.png",
         "response.png",
         "result.json",
+        "suspension.json",
     ]
     for path in out.glob("*.png"):
         assert path.read_bytes().startswith(PNG) and path.stat().st_size > 20_000  # an empty canvas has some 3 kB

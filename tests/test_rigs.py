@@ -76,7 +76,7 @@ def test_compliances_in_closed_form():
     yaw, roll = 1 / (ARM["x"] * square), 1 / (ARM["z"] * square)
     expected = {
         "lateral_steer": -length * yaw,
-        "lateral_camber": -height * roll,  # shown with the other sign: inclination to the right
+        "lateral_camber": height * roll,  # inclination to the right
         "lateral_compliance": 1 / (2 * ARM["y"]) + length**2 * yaw + height**2 * roll,
         "aligning_steer": yaw,
         "force_roll_centre_height": 0.0,

@@ -49,6 +49,10 @@ def with_inputs(model: Model, names: Sequence[str], inputs: Float[Array, "p 3"],
 
 def check_inputs(model: Any, names: Sequence[str]) -> None:
     """Raise `ValueError` for names that no joint or force with a signal has."""
+    if isinstance(names, str):
+        raise ValueError(
+            f"`inputs` must be a sequence of names, ({names!r},) or [{names!r}], got the string {names!r}."
+        )
     if not isinstance(model, Model):
         if names:
             raise ValueError(f"`inputs` are joints and forces of a Model, and `model` is a {type(model).__name__}.")

@@ -204,8 +204,8 @@ def linearize(
     equilibrium is found; inside `jit` the numbers are NaN. Sources: `_second_order`, `_steady`.
     """
     system, t0 = as_system(model), as_float(t0, (), "`t0`")
-    inputs, outputs = tuple(inputs), dict(outputs or {})
     check_inputs(model, inputs)
+    inputs, outputs = tuple(inputs), dict(outputs or {})
     for name, function in outputs.items():
         if not callable(function):
             raise ValueError(f"`outputs[{name!r}]` must be a function of an instant, got {function!r}.")

@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
         if status := write_all("curves", files, out):
             return status
         if not quiet:
-            print(table(curves), written(out), sep="\n")
+            print(table(curves), written(out, files), sep="\n")
     return 0
 
 

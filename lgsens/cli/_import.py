@@ -26,7 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
         plotting.animate(trajectory, out / "motion.html", title=title)
         trajectory.to_csv(out / "motion.csv")
         if not arguments.quiet:
-            print(written(out))
+            print(written(out, ("motion.html", "motion.csv")))
     return 0
 
 

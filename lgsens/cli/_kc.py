@@ -30,7 +30,8 @@ NOTE = (
     "Chassis held, pads without friction under both wheels, springs and bushings in equilibrium at every point. Axes "
     "and signs of ISO 8855: x forward, y left, z up; toe-in, camber with the top outward, caster with the top rearward "
     "and forces of the tyre on the wheel in tyre axes are positive. Lateral, braking and aligning loads act at the "
-    "contact centre, traction at the wheel centre; rates and compliances are exact derivatives at the design position."
+    "contact centre, traction at the wheel centre, of a live axle at the contact centre too; rates and compliances are "
+    "exact derivatives at the design position."
 )
 
 
@@ -41,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
         axle = Axle.load(suspension_file(arguments))
         sweeps = _sweeps(arguments, axle)
         chosen = _chosen(arguments.gradient, sweeps, axle)
-        vehicle = _vehicle(arguments, axle)
+        vehicle = rigs.vehicle_of(axle, **vehicle_options(arguments))
         model = axle.model(links="rods", compliant=not arguments.rigid)
         # the options are those of `standard_sweeps`
         own = {"parallel": "travel", "single": "travel", "opposite": "roll", "steering": "rack"}
@@ -50,6 +51,11 @@ def run(arguments: argparse.Namespace) -> int:
             test = rigs.kc(model, axle.wheel_centres, sweeps, points=arguments.points, vehicle=vehicle)
         numbers = {name: float(value) for name, value in rigs.characteristics(test).items()}
         gradients = {}
+        if arguments.gradient == "all":
+            chosen = list(numbers)
+        for name in chosen:
+            if name not in numbers:
+                raise ValueError(f"argument --gradient: this axle has no {name!r}; it has {', '.join(numbers)}")
         if chosen:
             with compiling("their gradients by the hardpoints", not arguments.quiet):
                 gradients = _gradients(axle, chosen, sweeps, vehicle, compliant=not arguments.rigid)
@@ -64,18 +70,17 @@ def run(arguments: argparse.Namespace) -> int:
         if status := write_all("kc", files, out):
             return status
         if not arguments.quiet:
-            print(table(numbers), written(out), sep="\n")
+            print(table(numbers), written(out, files), sep="\n")
     return 0
 
 
 def _sweeps(arguments: argparse.Namespace, axle: Axle) -> dict[str, rigs.Sweep]:
     amplitudes = {name: getattr(arguments, name) for name in ("travel", "roll", "lateral", "braking", "traction")}
-    travel = None if axle.rack is None else axle.rack.travel
-    rack = arguments.rack or (0.06 if travel is None else float(travel))
+    rack = arguments.rack or rigs.rack_way(axle)
     known = rigs.standard_sweeps(**amplitudes, rack=rack, aligning=arguments.aligning)
     if axle.rack is None:
         del known["steering"]
-    names = arguments.sweeps.split(",") if arguments.sweeps else list(known)
+    names = _list(arguments.sweeps) if arguments.sweeps else list(known)
     for name in names:
         if name not in known:
             more = "; this axle has no rack" if name == "steering" else ""
@@ -85,21 +90,21 @@ def _sweeps(arguments: argparse.Namespace, axle: Axle) -> dict[str, rigs.Sweep]:
     return {name: known[name] for name in names}
 
 
-def _vehicle(arguments: argparse.Namespace, axle: Axle) -> rigs.Vehicle:
-    return rigs.Vehicle(
-        wheelbase=arguments.wheelbase,
-        centre_height=arguments.centre_height,
-        braking_share=arguments.braking_share,
-        traction_share=arguments.traction_share,
-        rack_ratio=None if axle.rack is None else axle.rack.ratio,
-        rear=arguments.axle == "rear",
-    )
+def _list(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",")]
+
+
+def vehicle_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Of the car those numbers that are given."""
+    names = ("wheelbase", "centre_height", "braking_share", "traction_share")
+    given = {name: value for name in names if (value := getattr(arguments, name)) is not None}
+    return given if arguments.axle is None else given | {"rear": arguments.axle == "rear"}
 
 
 def _chosen(asked: str | None, sweeps: dict[str, rigs.Sweep], axle: Axle) -> list[str]:
     """The characteristics whose gradients are asked for."""
     known = [name for name, one in rigs.CHARACTERISTICS.items() if one.sweep in sweeps]
-    names = [] if not asked else known if asked == "all" else asked.split(",")
+    names = [] if not asked else known if asked == "all" else _list(asked)
     for name in names:
         if name not in known:
             raise ValueError(f"argument --gradient: {suggestion(name, known)}, or all of them: all")
@@ -109,7 +114,7 @@ def _chosen(asked: str | None, sweeps: dict[str, rigs.Sweep], axle: Axle) -> lis
 
 
 def _gradients(axle: Axle, names: list[str], sweeps: dict[str, rigs.Sweep], vehicle: rigs.Vehicle, *, compliant: bool):
-    """By characteristic its derivatives by the hardpoints on the chassis, of both sides alike, shape (n, 3), SI."""
+    """By characteristic its derivatives by the hardpoints, alike on both sides, in the axes of the file, (n, 3), SI."""
     needed = {rigs.CHARACTERISTICS[name].sweep: sweeps[rigs.CHARACTERISTICS[name].sweep] for name in names}
 
     def of(points):
@@ -120,7 +125,8 @@ def _gradients(axle: Axle, names: list[str], sweeps: dict[str, rigs.Sweep], vehi
         )
         return {name: value for name, value in found.items() if name in names}
 
-    return {name: np.asarray(found) for name, found in jax.jit(jax.jacfwd(of))(axle.hardpoints).items()}
+    signs = axle.hardpoint_signs
+    return {name: signs * np.asarray(found) for name, found in jax.jit(jax.jacfwd(of))(axle.hardpoints).items()}
 
 
 def _finite(values: Any) -> Any:

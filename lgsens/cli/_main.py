@@ -53,6 +53,19 @@ class _Parser(argparse.ArgumentParser):
         )
         self.add_argument("--hardpoints", metavar="FILE", help="the file of the quarter-car, TOML or JSON")
 
+    def vehicle(self, of: str = "") -> None:
+        """What the rig is told of the car."""
+        self.add_argument("--axle", choices=["rear", "front"], help=f"{of}which it is (default: rear)")
+        for name, default, meaning in (
+            ("wheelbase", "2.7", "of the car [m], for anti-features and Ackermann"),
+            ("centre-height", "0.55", "of the car's centre of mass [m]"),
+            ("braking-share", "0.5", "of this axle in the braking force"),
+            ("traction-share", "1", "of this axle in the traction"),
+            ("rack", "its travel, or 0.06", "way of the rack [m]"),
+        ):
+            metavar = "M" if "[m]" in meaning else "SHARE"
+            self.add_argument(f"--{name}", type=_positive, metavar=metavar, help=f"{of}{meaning} (default: {default})")
+
     def quiet(self, nothing: str) -> None:
         """`--quiet`."""
         self.add_argument("--quiet", action="store_true", help=nothing)
@@ -97,7 +110,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     optimize.set_defaults(run=_optimize.run)
     optimize.hardpoints()
-    optimize.out("out/quarter-car", "result.json and the figures")
+    optimize.out("out/quarter-car", "result.json, the file of the best design, suspension.json, and the figures")
     optimize.resume()
     optimize.option(
         "--parameters",
@@ -136,6 +149,7 @@ def _parser() -> argparse.ArgumentParser:
         optimize.add_argument(f"--keep-{angle}", type=_positive, metavar="DEG", help=meaning)
     kept = "wheel travel up and down over which curves are kept and drawn [m]"
     optimize.option("--travel", 0.05, kept, type=_positive, metavar="M")
+    optimize.vehicle("with --vary: ")
     optimize.quiet("no progress bar and no table")
 
     curves = commands.add_parser(
@@ -168,7 +182,6 @@ def _parser() -> argparse.ArgumentParser:
         "--gradient", metavar="NAME,…|all", help="characteristics to differentiate by the hardpoints (default: none)"
     )
     kc.option("--points", 41, "of each sweep, odd", type=_count)
-    kc.option("--axle", "rear", choices=["rear", "front"])
     kc.add_argument("--rigid", action="store_true", help="ideal joints in place of bushings")
     for name, default, meaning in (
         ("travel", 0.08, "of both wheels [m]"),
@@ -177,13 +190,9 @@ def _parser() -> argparse.ArgumentParser:
         ("braking", 3000.0, "force on each wheel [N]"),
         ("traction", 2000.0, "force on each wheel [N]"),
         ("aligning", 150.0, "moment on each wheel [N m]"),
-        ("wheelbase", 2.7, "of the car [m], for anti-features and Ackermann"),
-        ("centre-height", 0.55, "of the car's centre of mass [m]"),
-        ("braking-share", 0.5, "of this axle in the braking force"),
-        ("traction-share", 1.0, "of this axle in the traction"),
     ):
         kc.option(f"--{name}", default, meaning, type=_positive)
-    kc.add_argument("--rack", type=_positive, metavar="M", help="way of the rack [m] (default: its travel, or 0.06)")
+    kc.vehicle()
     kc.quiet("no table")
 
     top = commands.add_parser(

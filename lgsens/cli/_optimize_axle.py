@@ -7,10 +7,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens import plotting
-from lgsens.cli._report import suspension_file
+from lgsens.cli._kc import vehicle_options
+from lgsens.cli._report import asking_for, suspension_file
 from lgsens.cli._search import BUMP, Goal, Search, band_row, closing_rows, point_row, run_length, stages, table_lines
 from lgsens.examples import Axle
-from lgsens.rigs import CHARACTERISTICS, AxleDesign
+from lgsens.rigs import CHARACTERISTICS, AxleDesign, rack_way, vehicle_of
 
 DEGREE = float(np.degrees(1.0))
 
@@ -39,8 +40,11 @@ class AxleJob(NamedTuple):
             if getattr(arguments, f"keep_{name}"):
                 raise ValueError(f"--keep-{name} is of a corner; of an axle, with --vary, it is --keep {name}=DEG")
         keep = {name: _si(name, bound) for name, bound in arguments.keep or ()}
-        settings = {"travel": arguments.travel} | run_length(arguments)
-        return AxleJob(AxleDesign.of(Axle.load(suspension_file(arguments)), dict(arguments.vary), keep, **settings))
+        axle = Axle.load(suspension_file(arguments))
+        vehicle = vehicle_of(axle, **vehicle_options(arguments))
+        settings = {"travel": arguments.travel, "rack": arguments.rack, "vehicle": vehicle} | run_length(arguments)
+        with asking_for({"travel": arguments.travel, "rack": arguments.rack or rack_way(axle)}):
+            return AxleJob(AxleDesign.of(axle, dict(arguments.vary), keep, **settings))
 
     def criteria(self, x):
         """Ψ₀ of a design, its response, and the result of its simulation."""
@@ -66,7 +70,7 @@ class Outcome(NamedTuple):
     search: Search
 
     def document(self) -> dict[str, Any]:
-        """What is particular to the axle, as JSON: SI units, what is kept in the units shown."""
+        """What is particular to the axle, as JSON: SI units, axes of the file; what is kept in the units shown."""
         names = self.problem.numbers.names
         return {
             "problem": "axle",
@@ -81,6 +85,10 @@ class Outcome(NamedTuple):
                 for factor, unit in [_shown(name)]
             ],
         }
+
+    def suspension(self, file: dict[str, Any]) -> dict[str, Any]:
+        """The document of the file with the best design."""
+        return self.problem.numbers.document(file, self.problem.axle, self.search.result.x)
 
     @property
     def _ends(self) -> dict[str, Response]:
@@ -118,11 +126,12 @@ def _shown(name: str) -> tuple[float, str]:
 
 
 def _si(name: str, bound: float | tuple[float, float]) -> float | tuple[float, float]:
-    """A width, or two bounds, from the unit shown; where that has another sign the bounds change places."""
+    """A width, or two bounds, from the unit shown."""
     factor, _ = _shown(name)
     if not isinstance(bound, tuple):
         if not bound > 0:
             raise ValueError(f"--keep {name}={bound:g} must be a positive width, or two bounds LOWER:UPPER")
         return bound / abs(factor)
-    low, high = sorted(end / factor for end in bound) if bound[0] < bound[1] else bound
-    return low, high
+    if not bound[0] < bound[1]:
+        raise ValueError(f"--keep {name}={bound[0]:g}:{bound[1]:g} must have its lower bound first")
+    return bound[0] / factor, bound[1] / factor

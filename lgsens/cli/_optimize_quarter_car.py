@@ -81,6 +81,9 @@ class QuarterCarJob(NamedTuple):
     def of(arguments: argparse.Namespace) -> "QuarterCarJob":
         """The problem that the arguments ask for."""
         path = suspension_file(arguments)
+        for name in ("axle", "wheelbase", "centre_height", "braking_share", "traction_share", "rack"):
+            if getattr(arguments, name) is not None:
+                raise ValueError(f"--{name.replace('_', '-')} is of an axle, with --vary; leave it out")
         if arguments.keep:
             raise ValueError("--keep is of an axle, with --vary; of a corner, there are --keep-camber and --keep-toe")
         kept = {name: np.radians(width) for name in ("camber", "toe") if (width := getattr(arguments, f"keep_{name}"))}
@@ -136,7 +139,7 @@ class Outcome(NamedTuple):
         return {"before": self.problem.car, "after": self.problem.with_design(self.search.result.x)}
 
     def document(self) -> dict[str, Any]:
-        """What is particular to the quarter-car, as JSON: SI units, finite numbers only."""
+        """What is particular to the quarter-car, as JSON: SI units, points in the axes of the file."""
         return {
             "problem": "quarter-car",
             "suspension": self.problem.car.name,
@@ -156,7 +159,13 @@ class Outcome(NamedTuple):
     def _values(self, name: str, value: Any) -> Any:
         if name != "hardpoints":
             return float(value)
-        return {link: np.asarray(point).tolist() for link, point in zip(self.problem.car.hardpoint_names, value)}
+        car = self.problem.car
+        points = car.axes.signs * np.asarray(value) + car.axes.offset
+        return dict(zip(car.hardpoint_names, points.tolist()))
+
+    def suspension(self, file: dict[str, Any]) -> dict[str, Any]:
+        """The document of the file with the best design."""
+        return self.problem.document(file, self.search.result.x)
 
     def _path_constraints(self) -> list[dict[str, Any]]:
         """The worst moment of each path constraint before and after, and whether it is active at the end."""

@@ -5,7 +5,7 @@ import json
 import platform
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -108,6 +108,6 @@ def write_json(document: dict[str, Any], path: Path, **layout: Any) -> None:
     path.write_text(json.dumps(document, allow_nan=False, **layout) + "\n", encoding="utf-8")
 
 
-def written(out: Path) -> str:
-    """What the last line says."""
-    return f"\nwritten to {out}: {', '.join(sorted(path.name for path in out.iterdir()))}"
+def written(out: Path, names: Iterable[str]) -> str:
+    """What the last line says, of the files of these names."""
+    return f"\nwritten to {out}: {', '.join(sorted(names))}"

@@ -211,11 +211,17 @@ def worst(values: Any, violations: Any, **places: Any) -> dict[str, float]:
 def band_row(
     name: str, band: Any, values: dict[str, Any], unit: str = "rad", factor: float = 1.0, **places: Any
 ) -> dict[str, Any]:
-    """How far what is kept strays from the middle of its band, before and after, at worst; in `unit`."""
-    middle, half = np.asarray(band.lower + band.upper) / 2, np.asarray(band.upper - band.lower) / 2
+    """What is kept in a band, before and after, at worst; in `unit`: of a curve that is kept near that at the start how
+    far it strays from there, else its value."""
+    lower, upper = np.asarray(band.lower), np.asarray(band.upper)
+    middle, half = (lower + upper) / 2, (upper - lower) / 2
     changes = {label: np.asarray(found) - middle for label, found in values.items()}
-    ends = {label: worst(factor * c, np.abs(c) / half - 1, **places) for label, c in changes.items()}
-    return constraint_row(f"change of {name}", unit, abs(factor) * float(half[0]), ends)
+    level = np.ptp(middle) == 0.0
+    shown = lambda change: factor * (change + middle if level else change)
+    ends = {label: worst(shown(c), np.abs(c) / half - 1, **places) for label, c in changes.items()}
+    if level:
+        return constraint_row(name, unit, [factor * float(lower[0]), factor * float(upper[0])], ends)
+    return constraint_row(f"change of {name}", unit, factor * float(half[0]), ends)
 
 
 def closing_rows(found: dict[str, Any]) -> list[tuple[str, float, float, str, int]]:
@@ -228,8 +234,9 @@ def closing_rows(found: dict[str, Any]) -> list[tuple[str, float, float, str, in
         before, after = (factor * row[label]["worst_value"] for label in ("before", "after"))
         violation = row["after"]["violation_over_scale"]
         state = "active" if row["active"] else "satisfied" if violation <= TOLERANCE else "VIOLATED"
-        note = f"{factor * row['limit']:g}, {state} ({violation:+.1e} of scale)"
-        rows.append((f"{row['name']} [{unit}]", before, after, note, 2 if factor * row["limit"] >= 0.1 else 4))
+        limits = factor * np.atleast_1d(row["limit"])
+        note = f"{' .. '.join(f'{limit:.6g}' for limit in limits)}, {state} ({violation:+.1e} of scale)"
+        rows.append((f"{row['name']} [{unit}]", before, after, note, 2 if np.abs(limits).max() >= 0.1 else 4))
     return rows
 
 
@@ -237,7 +244,9 @@ def point_row(name: str, before: float, after: float, lower: float, upper: float
     """A coordinate [mm] in a table."""
     half = (upper - lower) / 2
     at_bound = ", at the bound" if half - abs(after - (lower + upper) / 2) < 1e-3 * half else ""
-    return f"{name} [mm]", before, after, f"+-{half:.0f} mm{at_bound}", 1
+    alike = abs(upper - before - half) < 1e-3 * half
+    limits = f"+-{half:.0f} mm" if alike else f"{lower:.6g} .. {upper:.6g}"
+    return f"{name} [mm]", before, after, limits + at_bound, 1
 
 
 def table_lines(found: dict[str, Any], rows: list[tuple[str, float, float, str, int]]) -> list[str]:

@@ -4,7 +4,11 @@ from lgsens.examples._axle import Axle as Axle
 from lgsens.examples._axle_numbers import AxleNumbers as AxleNumbers
 from lgsens.examples._comparison import COMPARISON as COMPARISON
 from lgsens.examples._curve_bounds import Band as Band, CurveBounds as CurveBounds
-from lgsens.examples._hardpoint_file import DEFAULT as DEFAULT, shipped as shipped
+from lgsens.examples._hardpoint_file import (
+    DEFAULT as DEFAULT,
+    shipped as shipped,
+    suspension_document as suspension_document,
+)
 from lgsens.examples._identification import AccelerationTest as AccelerationTest
 from lgsens.examples._leaf_spring import leaf_spring as leaf_spring
 from lgsens.examples._link_beam import SectionShape as SectionShape

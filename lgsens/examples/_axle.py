@@ -34,6 +34,8 @@ from lgsens.model import (
     static_preload,
 )
 
+LEAST_TRACK = 0.4  # m
+
 
 class Axle(eqx.Module):
     """Two corners of a suspension, with subframe, rack and anti-roll bar between them. `Axle.load()` reads it.
@@ -72,6 +74,12 @@ class Axle(eqx.Module):
         with jax.ensure_compile_time_eval():
             corner = QuarterCar.load(path)
             root, kilogram = reader(*read(path))
+            if not abs(float(corner.wheel.centre[1])) > LEAST_TRACK / 2:
+                raise root.table("wheel").fail(
+                    "centre",
+                    f"is {float(corner.wheel.centre[1]):.4g} m from the middle of the car, y = 0, and the other wheel "
+                    f"of an axle is its mirror image there; no car has a track of less than {LEAST_TRACK} m.",
+                )
             between = axle_members(root, kilogram, corner)
             solid = between.get("solid_axle")
             left = with_nodes(corner, between["bar"].ends) if "bar" in between else corner
@@ -79,7 +87,7 @@ class Axle(eqx.Module):
             if corner.wheel.centre[1] > 0:
                 return axle
             # Links that there are once are where the file has them.
-            return dataclasses.replace(reflected(axle), solid_axle=solid)
+            return dataclasses.replace(reflected(axle), left=axle.left.mirrored(), solid_axle=solid)
 
     @property
     def name(self) -> str:
@@ -111,6 +119,13 @@ class Axle(eqx.Module):
     def hardpoint_names(self) -> list[str]:
         """Theirs, as of `QuarterCar.hardpoint_names`."""
         return self.left.hardpoint_names + numbered(self._own_chassis())
+
+    @property
+    def hardpoint_signs(self) -> np.ndarray:
+        """What derivatives by them are multiplied by to be in the axes of the file, shape (n, 3)."""
+        signs = np.ones((len(self.hardpoint_names), 3))
+        signs[: len(self.left.hardpoint_names)] = self.left.axes.signs
+        return signs
 
     def with_hardpoints(self, points: Float[Array, "n 3"]) -> "Axle":
         """The axle with others, of the left side and their mirror image. Raises `ValueError` for a wrong shape."""

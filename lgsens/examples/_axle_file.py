@@ -120,11 +120,11 @@ def axle_members(root: Reader, kilogram: float, corner: Any) -> dict[str, Any]:
         table.only((*OF_PART, "axis", "on", "travel", "ratio", "c_factor"))
         if "ratio" in table and "c_factor" in table:
             raise table.fail("c_factor", "is 2π times `ratio`; give one of them.")
-        ratio = table.number("ratio") if "ratio" in table else None
+        ratio = table.metres("ratio", 0.1) if "ratio" in table else None
         if "c_factor" in table:
-            ratio = table.number("c_factor") / (2.0 * math.pi)
+            ratio = table.metres("c_factor", 0.5) / (2.0 * math.pi)
         axis = table.direction("axis")
-        travel = table.number("travel") if "travel" in table else None
+        travel = table.metres("travel", 0.5) if "travel" in table else None
         axis = as_float(ALONG_Y, (3,), "axis") if axis is None else axis
         found["rack"] = Rack(part(table), axis, ratio, travel, _carrier(root, table))
     if "anti_roll_bar" in root:

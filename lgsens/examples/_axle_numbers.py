@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import as_float
 from lgsens.examples._axle import Axle
+from lgsens.examples._file_axes import FileAxes, rewritten
 
 POINTS, RATES = "hardpoints", "rates"
 # What is offered of a file, and where: tables of the corner, and numbers that are points or positive rates.
@@ -23,11 +24,14 @@ _UNNAMED = ("ends", "section", "of", "shape", "material")  # that are no keys of
 
 
 class Place(NamedTuple):
-    """A number of an axle: its name, which leaf it is in, and where in that."""
+    """A number of an axle: its name, which leaf it is in, and where in that; `sign` times it and `offset` is that of
+    the file, of whose side and above whose origin a point is."""
 
     name: str
     leaf: int
     index: int
+    sign: float = 1.0
+    offset: float = 0.0
 
 
 def places(axle: Axle) -> dict[str, list[Place]]:
@@ -43,7 +47,14 @@ def places(axle: Axle) -> dict[str, list[Place]]:
         if is_point or (names[-1] in _POSITIVE and np.all(np.asarray(leaf) > 0)):
             key = _key(names, carriers)
             kind = POINTS if is_point else RATES
-            found[kind] += [Place(key + end, i, j) for j, end in enumerate(_components(leaf.shape, is_point))]
+            axes = axle.left.axes if is_point else FileAxes()
+            if names[0] == "solid_axle":
+                axes = axes._replace(mirrored=False)
+            signs, offset = (np.broadcast_to(of, (3,)) for of in (axes.signs, axes.offset))
+            found[kind] += [
+                Place(key + end, i, j, float(signs[j % 3]), float(offset[j % 3]))
+                for j, end in enumerate(_components(leaf.shape, is_point))
+            ]
     return found
 
 
@@ -58,6 +69,8 @@ def _key(names: list[str], carriers: Mapping[str, str]) -> str:
     names = [_TABLES.get(names[0], names[0]), *(name for name in names[1:] if name not in _UNNAMED)]
     if names[-1] == "chassis":
         names[-1] = carriers.get(owner, "chassis")
+    if names[:2] == ["anti_roll_bar", "mount"]:
+        names[1] = "bushing"
     if names[-1] == "rate":
         names[-1] = "stiffness" if names[0] == "spring" else "damping"
     if names[0] == "tyre":
@@ -96,8 +109,8 @@ class AxleNumbers(eqx.Module):
                 (0.3: from 0.7 to 1.3 times), or for either a pair (lower, upper). Later patterns overrule earlier ones.
                 Names are keys of the file, then x, y or z of a point, 1, 2 or 3 for the axes of a bushing, before that
                 1 or 2 for the two points of a hinge: "links.upper_arm.subframe.1.z", "bushings.pivot.stiffness.2.1",
-                "spring.stiffness". Points are in the vehicle frame, z over the road. A pattern has * and ? as for
-                files, and stands for all names that it begins.
+                "spring.stiffness". Points are in metres and the axes of the file, of its side and from its origin. A
+                pattern has * and ? as for files, and stands for all names that it begins.
 
         Raises `ValueError` for a pattern that matches nothing, and bounds that do not contain the start.
         """
@@ -114,7 +127,7 @@ class AxleNumbers(eqx.Module):
         ends = {kind: np.empty((2, len(of))) for kind, of in kept.items()}
         for kind, of in kept.items():
             for i, place in enumerate(of):
-                value = float(np.ravel(leaves[place.leaf])[place.index])
+                value = place.sign * float(np.ravel(leaves[place.leaf])[place.index]) + place.offset
                 pattern, bound = chosen[place.name]
                 ends[kind][:, i] = _bounds(pattern, bound, value, kind == POINTS)
                 low, high = ends[kind][:, i]
@@ -135,7 +148,7 @@ class AxleNumbers(eqx.Module):
     def of(self, axle: Axle) -> dict[str, Float[Array, " n"]]:
         """The numbers of an axle."""
         leaves = jax.tree.leaves(axle)
-        pick = lambda place: leaves[place.leaf].ravel()[place.index]
+        pick = lambda place: place.sign * leaves[place.leaf].ravel()[place.index] + place.offset
         return {kind: as_float([pick(place) for place in of], None, kind) for kind, of in self.places}
 
     def replaced(self, axle: Axle, x: Mapping[str, Float[Array, " n"]]) -> Axle:
@@ -145,8 +158,19 @@ class AxleNumbers(eqx.Module):
             for leaf in dict.fromkeys(place.leaf for place in of):
                 rows = [i for i, place in enumerate(of) if place.leaf == leaf]
                 at, old = np.array([of[i].index for i in rows]), leaves[leaf]
-                leaves[leaf] = old.ravel().at[at].set(x[kind][np.array(rows)]).reshape(old.shape)
+                sign, offset = (
+                    np.array([getattr(of[i], name) for i in rows], old.dtype) for name in ("sign", "offset")
+                )
+                new = sign * (x[kind][np.array(rows)] - offset)
+                leaves[leaf] = old.ravel().at[at].set(new).reshape(old.shape)
         return jax.tree.unflatten(structure, leaves)
+
+    def document(self, file: Mapping[str, Any], axle: Axle, x: Mapping[str, Float[Array, " n"]]) -> dict[str, Any]:
+        """The document of the axle's file with other numbers."""
+        before, values = self.of(axle), {kind: np.asarray(x[kind]).tolist() for kind, _ in self.places}
+        named = {kind: dict(zip(names, values[kind])) for kind, names in self.names.items()}
+        rates = zip(self.names.get(RATES, ()), zip(np.asarray(before.get(RATES, ())).tolist(), values.get(RATES, ())))
+        return rewritten(file, named.get(POINTS, {}), dict(rates))
 
 
 def _bounds(pattern: str, bound: Any, value: float, is_point: bool) -> tuple[float, float]:

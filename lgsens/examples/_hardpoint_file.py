@@ -46,6 +46,11 @@ class Reader:
         """The height of the road in the document."""
         return self._road / self._metre
 
+    @property
+    def metres_of_road(self) -> float:
+        """That height [m]."""
+        return self._road
+
     def fail(self, key: str, why: str) -> ValueError:
         return ValueError(f"Hardpoint file {self._path!r}, key {'.'.join((*self._keys, key))!r}: {why}")
 
@@ -238,3 +243,8 @@ def read(path: str | Path | None) -> tuple[dict, str]:
     if not isinstance(document, dict):
         raise ValueError(f"Hardpoint file {name!r} must hold tables, got a {type(document).__name__}.")
     return document, name
+
+
+def suspension_document(path: str | Path | None = None) -> dict[str, Any]:
+    """The tables of a suspension's file as they are there; `path` as of `QuarterCar.load`."""
+    return read(path)[0]

@@ -16,6 +16,7 @@ from lgsens.model import Beam, BeamSection, upward
 SHAPES = {"tube": ("diameter", "thickness"), "round": ("diameter",), "rectangle": ("width", "height")}
 MATERIAL = ("young", "poisson", "density")
 GENERAL = "section"  # one by its stiffness and mass, in place of shape and material
+LEAST_YOUNG = 1e6  # N/m²
 ELEMENTS = 4  # of a beam that does not say how many
 
 
@@ -131,8 +132,14 @@ def read_beam(table: Reader, instead: tuple[str, ...], shapes: tuple[str, ...] =
         of = partial(BeamSection, mass=dimensions.number("mass"), **rates, **damping)
     else:
         dimensions.only(SHAPES[kind])
-        shape = {kind: {name: dimensions.number(name) for name in SHAPES[kind]}}
+        shape = {kind: {name: dimensions.metres(name, 0.5) for name in SHAPES[kind]}}
         material = {name: beam.number(name, positive=name != "poisson") for name in MATERIAL}
+        if not float(material["young"]) >= LEAST_YOUNG:
+            raise beam.fail(
+                "young",
+                f"is in N/m², and {float(material['young']):g} is less than that of rubber, {LEAST_YOUNG:g}; did you "
+                f"mean {1e6 * float(material['young']):g}?",
+            )
         of = partial(SectionShape, shape, material | damping)
     try:
         return LinkBeam(of(), elements, up)

@@ -1,5 +1,6 @@
 """The quarter-car of the paper's §9 with a real five-link rear suspension."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,9 +15,10 @@ from lgsens._validate import as_float, suggestion
 from lgsens.analysis import FrequencyWeighting, Kinematics, kinematics, linearize, random_road
 from lgsens.examples._axle_parts import Mount, Stop
 from lgsens.examples._bending import bending, rigid, with_nodes
+from lgsens.examples._corner_check import GRAVITY, check_corner
 from lgsens.examples._corner_scene import corner_scene
+from lgsens.examples._file_axes import FileAxes
 from lgsens.examples._hardpoint_file import read
-from lgsens.examples._leverage import motion_ratios
 from lgsens.examples._link_beam import ELEMENTS, SectionShape
 from lgsens.examples._suspension_curves import SuspensionCurves, suspension_curves
 from lgsens.examples._suspension_file import members
@@ -33,7 +35,6 @@ from lgsens.model import (
     static_preload,
 )
 
-GRAVITY = 9.81  # m/s²
 ALONG_Z: Any = (0.0, 0.0, 1.0)
 
 
@@ -79,6 +80,7 @@ class QuarterCar(eqx.Module):
     mounts: dict[str, Mount] = eqx.field(default_factory=dict)  # in its axle, by the joints that they replace
     stops: dict[str, Stop] = eqx.field(default_factory=dict)
     carriers: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())  # what holds on to subframe or rack
+    axes: FileAxes = eqx.field(static=True, default=FileAxes())
 
     @staticmethod
     def load(path: str | Path | None = None) -> "QuarterCar":
@@ -107,7 +109,8 @@ class QuarterCar(eqx.Module):
         axis n is one about −S n, so what was right-handed is left-handed: a screw would change the sign of its pitch.
         Camber, toe and the other curves, whose signs are those of the wheel's side, are the same.
         """
-        return reflected(self)
+        axes = self.axes._replace(mirrored=not self.axes.mirrored)
+        return dataclasses.replace(reflected(self), axes=axes)
 
     def bending(
         self, sections: Mapping[str, BeamSection | SectionShape], *, elements: int = ELEMENTS, up=None
@@ -140,21 +143,10 @@ class QuarterCar(eqx.Module):
 
     def _check(self, name: str) -> None:
         """Raise `ValueError` for what moves or stands as no car does."""
-        struts = {"spring": self.spring, "damper": self.damper}
-        with jax.ensure_compile_time_eval():  # of numbers that are known, inside `jit` too
-            ratios = motion_ratios(name, self.wheel.centre, self.links, self.joints, struts)
-        push = self.spring.push()
-        if not ratios or push is None:
-            return
-        needed = GRAVITY * float(self.chassis.mass) / ratios["spring"]
-        if not needed / 2 <= push <= 2 * needed:
-            raise ValueError(
-                f"{name}, key 'spring.curve': with this `free_length` it pushes with {push:.0f} N at the design "
-                f"position, and must bear about {needed:.0f} N; a preload can make up for half to double of it. Change "
-                "`free_length` or the curve, or leave `free_length` out: it is then counted from the design position."
-            )
+        check_corner(self, name)
 
-    def _on_chassis(self) -> dict[str, Array]:
+    @property
+    def on_chassis(self) -> dict[str, Array]:
         """By link or joint the points at which it holds on to the chassis, in order."""
         links = {name: link.chassis for name, link in sorted(self.links.items()) if "chassis" in link.ends}
         joints = {name: c.at for name, c in sorted(self.joints.items()) if "chassis" in c.between}
@@ -163,12 +155,12 @@ class QuarterCar(eqx.Module):
     @property
     def hardpoints(self) -> Float[Array, "n 3"]:
         """Where links and joints hold on to the chassis [m], shape (n, 3), as `hardpoint_names` says."""
-        return jnp.concatenate([jnp.atleast_2d(points) for points in self._on_chassis().values()])
+        return jnp.concatenate([jnp.atleast_2d(points) for points in self.on_chassis.values()])
 
     @property
     def hardpoint_names(self) -> list[str]:
         """The links in sorted order, then the joints; of one with two points "NAME 1" and "NAME 2"."""
-        return numbered(self._on_chassis())
+        return numbered(self.on_chassis)
 
     @property
     def mass(self) -> Float[Array, ""]:
@@ -186,7 +178,7 @@ class QuarterCar(eqx.Module):
 
         Raises `ValueError` for other shapes.
         """
-        where = lambda car: [car.spring.rate, car.damper.rate, car.bump_height, *car._on_chassis().values()]
+        where = lambda car: [car.spring.rate, car.damper.rate, car.bump_height, *car.on_chassis.values()]
         olds = where(self)
         points: list[Any] = [None] * (len(olds) - 3)
         if hardpoints is not None:

@@ -1,15 +1,21 @@
 """The suspension design problem of the paper's §9: comfort, under bounds on tyre force and spring length."""
 
+import dataclasses
+import functools
+import operator
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import suggestion
 from lgsens.criteria import time_integral
 from lgsens.examples._curve_bounds import CurveBounds
+from lgsens.examples._file_axes import rewritten
 from lgsens.examples._hardpoint_file import Reader, read
 from lgsens.examples._quarter_car import GRAVITY, QuarterCar
 from lgsens.examples._road_limits import RoadLimits
@@ -49,6 +55,7 @@ class DesignLimits(eqx.Module):
         """
         document, name = read(path)
         table = Reader(document, name).table("design")
+        table.only([field.name for field in dataclasses.fields(DesignLimits)])
         shortest, longest = (table.metres(f"{which}_spring_length", 3.0) for which in ("minimum", "maximum"))
         if not shortest < longest:
             raise ValueError(
@@ -182,6 +189,25 @@ class SuspensionDesign(eqx.Module):
     def with_design(self, design: dict[str, Array]) -> QuarterCar:
         """The car with the values of a design."""
         return self.car.with_values(**design)
+
+    def document(self, file: Mapping[str, Any], design: dict[str, Array]) -> dict[str, Any]:
+        """The document of the car's file with the values of a design."""
+        car, points, metre = self.with_design(design), {}, file["units"]["length"]
+        every = {"stiffness": ("spring", self.car.spring.rate), "damping": ("damper", self.car.damper.rate)}
+        rates = {f"{of}.{key}": (float(old), float(design[key])) for key, (of, old) in every.items() if key in design}
+        for name, new in car.on_chassis.items() if "hardpoints" in design else ():
+            if name in car.links:
+                path = ["links", name, dict(car.carriers).get(f"links.{name}", "chassis")]
+                path = path if name in file["links"] else ["solid_axle", *path]
+            else:
+                path = ["joints", name, "at"]
+            # a corner has a hinge of a solid axle as a point
+            given = metre * np.asarray(functools.reduce(operator.getitem, path, file), float)
+            moved = given + car.axes.signs * np.asarray(new - self.car.on_chassis[name])
+            for index in np.ndindex(moved.shape):
+                keys = [*path, *(str(i + 1) for i in index[:-1]), "xyz"[index[-1]]]
+                points[".".join(keys)] = float(moved[index])
+        return rewritten(file, points, rates)
 
     def scene(self, design: dict[str, Array]) -> Model:
         """What runs over the bump."""

@@ -77,6 +77,7 @@ from jaxtyping import Array
 from lgsens._validate import as_float
 from lgsens.examples._axle_file import OF_AXLE, levelled, mounts, solid_axle, stop
 from lgsens.examples._corner_scene import connections
+from lgsens.examples._file_axes import FileAxes
 from lgsens.examples._hardpoint_file import Reader
 from lgsens.examples._link_file import CARRIERS, OF_LINK, carried, read_link
 from lgsens.examples._suspension_parts import ALONG_A_LINE, AT_A_POINT, Connection, Part, Strut
@@ -86,6 +87,7 @@ LEAST_RADIUS, LARGEST_RADIUS = 0.1, 2.0  # m, loaded radii of tyres
 PARTS = ("chassis", "knuckle", "wheel", *CARRIERS, "anti_roll_bar", "drop_link", "twist_beam", "solid_axle")
 TABLES = ("name", "units", "road", "links", "joints", "chassis", "knuckle", "wheel", "spring", "damper", "tyre")
 TABLES += ("link_section", "bump", "design")
+OF_TABLES = {"tyre": ("stiffness",), "bump": ("height", "duration"), "link_section": ("radius",)}
 RATES = {"spring": "stiffness", "damper": "damping"}
 STOPS = ("bump_stop", "rebound_stop")
 OF_MODEL = ("hub", "heave", "travel")  # joints that there are beside those of the file
@@ -95,6 +97,9 @@ def reader(document: dict, path: str) -> tuple[Reader, float]:
     """The tables of a document, read in metres over the road, and its unit of mass [kg]."""
     root = Reader(document, path)
     units = root.table("units")
+    units.only(("length", "mass"))
+    if "road" in root:
+        root.table("road").only(("height",))
     metre, kilogram = float(units.number("length")), float(units.number("mass"))
     road = float(root.table("road").number("height", metre, positive=False)) if "road" in root else 0.0
     return Reader(document, path, metre=metre, road=road), kilogram
@@ -118,11 +123,12 @@ def members(document: dict, path: str) -> dict[str, Any]:
             name, f"another joint of the scene has this name; those taken are {sorted(taken)}."
         )
 
-    def part(key: str, centre: str) -> Part:
+    def part(key: str, centre: str, *more: str) -> Part:
         body = root.table(key)
+        body.only((centre, "mass", "inertia", *more))
         return Part(body.point(centre), body.number("mass", kilogram), body.moments("inertia"))
 
-    wheel = part("wheel", "centre")
+    wheel = part("wheel", "centre", "bearing")
     if not LEAST_RADIUS <= float(wheel.centre[2]) <= LARGEST_RADIUS:
         raise root.table("wheel").fail(
             "centre",
@@ -132,6 +138,9 @@ def members(document: dict, path: str) -> dict[str, Any]:
         )
     every = links if solid is None else links | solid.links
     bars = [link for link in every.values() if link.inertia is None and link.beam is None]
+    for key, keys in OF_TABLES.items():
+        if key in root:
+            root.table(key).only(keys)
     bump = root.table("bump")
     struts = {key: _strut(key, root.table(key), bodies, rate, carriers) for key, rate in RATES.items()}
     root.only((*TABLES, *OF_AXLE))  # after what is missing: a table that is spelled wrong is both
@@ -154,10 +163,12 @@ def members(document: dict, path: str) -> dict[str, Any]:
         "bump_duration": bump.number("duration"),
         "stops": stops,
         "carriers": tuple(sorted(carriers.items())),
+        "axes": FileAxes(root.metres_of_road),
     }
 
 
 def _joint(name: str, table: Reader, bodies: tuple[str, ...], carriers: dict[str, str]) -> Connection:
+    table.only(("type", "between", "at"))
     kind = table.choice("type", [*AT_A_POINT, *ALONG_A_LINE])
     at, wanted = table.points("at"), 1 if kind in AT_A_POINT else 2
     if at.ndim != wanted:

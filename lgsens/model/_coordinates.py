@@ -54,6 +54,8 @@ def _attached(joint: AbstractJoint, a: Frame, b: Frame) -> tuple[Frame, Frame]:
 
 
 def _coordinate(what: str, joint: AbstractJoint, name: str | None) -> Coordinate:
+    if not isinstance(joint, AbstractJoint):
+        raise ValueError(f"{what}: it needs a joint itself, a RevoluteJoint(…), say, and not its name, got {joint!r}.")
     known = {coordinate.name: coordinate for coordinate in joint.coordinates}
     if not known or joint.frames is None:
         raise ValueError(f"{what}: a {type(joint).__name__} has no relative coordinate; give a RevoluteJoint, say.")
@@ -292,6 +294,8 @@ class CoordinateCoupling(AbstractJoint):
         *,
         teeth: int = 1,
     ):
+        if isinstance(names, str) or len(names) != 2:
+            raise ValueError(f"CoordinateCoupling: `names` must be two names, of either joint or None, got {names!r}.")
         self.first, self.second, self.names, self.teeth = first, second, names, as_count(teeth, "teeth")
         self.coefficients = as_float(coefficients, None, "CoordinateCoupling: `coefficients`")
 

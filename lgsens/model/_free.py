@@ -14,6 +14,8 @@ ALL_FREE: Free = TRANSLATIONS + ROTATIONS  # in the order of the coordinates [x,
 
 def as_free(value: str | Iterable[str], what: str) -> Free:
     """The names of the degrees of freedom, in the order of the coordinates; a string is read word by word."""
+    if not isinstance(value, Iterable):
+        raise ValueError(f"{what} must be names of degrees of freedom, such as 'z rx', got {value!r}.")
     names = tuple(value.split()) if isinstance(value, str) else tuple(value)
     for name in names:
         if name not in ALL_FREE:

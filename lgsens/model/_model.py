@@ -105,6 +105,9 @@ class Model(eqx.Module):
         ):
             if not isinstance(of, Mapping | None):
                 raise ValueError(f"Model: `{name}` must be a dict, each {kind} by its name, got {type(of).__name__}.")
+            for key in of or ():
+                if not isinstance(key, str):
+                    raise ValueError(f"Model: a name in `{name}` must be a string, got {key!r}; give {str(key)!r}.")
         self.bodies, self.joints, self.forces = (
             {name: strong(member) if isinstance(member, eqx.Module) else member for name, member in (of or {}).items()}
             for of in (bodies, joints, forces)

@@ -110,6 +110,10 @@ class SampledRoad(AbstractSignal):
     def __init__(self, times, heights):
         self.times, self.heights = samples(times, heights, "SampledRoad", "heights")
 
+    @property
+    def straight(self):
+        return True
+
     @staticmethod
     def random(key: Key[Array, ""], times, *, roughness, speed, wave_number=0.1) -> "SampledRoad":
         """A random road of ISO 8608, passed at constant speed: z = 0 at the first of the times.

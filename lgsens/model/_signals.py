@@ -55,6 +55,11 @@ class AbstractSignal(eqx.Module):
     ```
     """
 
+    @property
+    def straight(self) -> bool:
+        """Whether it follows straight lines between samples, so that its rate jumps there: no driver takes it."""
+        return False
+
     @abc.abstractmethod
     def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
         """The value at time t [s], shape (), in the unit of what it prescribes, shape ()."""
@@ -166,6 +171,10 @@ class Sampled(AbstractSignal):
         self.kind = kind
         if kind not in _KINDS:
             raise ValueError(f"Sampled: `kind` must be one of {_KINDS}, got {kind!r}.")
+
+    @property
+    def straight(self):
+        return self.kind == "linear"
 
     def __call__(self, t):
         return jnp.interp(t, self.times, self.values) if self.kind == "linear" else prepared(self)(t)
@@ -315,7 +324,7 @@ def prescribed_field(name: str, *, positional: bool = False, driven: bool = Fals
     positions follow, and so velocities and accelerations its derivatives."""
 
     def convert(value: Any) -> Prescribed | None:
-        if driven and isinstance(value, Sampled) and value.kind == "linear":
+        if driven and isinstance(value, AbstractSignal) and value.straight:
             raise ValueError(
                 f"`{name}` follows straight lines between samples: at each the velocity would jump, and no force is "
                 'large enough for that. Give Sampled(…, kind="cubic"), or "monotone".'

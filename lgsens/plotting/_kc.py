@@ -67,6 +67,7 @@ def kc_curves(curves: AxleCurves, *, title: str = "", along: str = "", factor: f
     x, lines = factor * np.asarray(curves.value), {}
     for axes, panel in zip(every, shown):
         values = panel.factor * np.asarray(attrgetter(panel.member)(curves))
+        values = np.where(np.isfinite(values), values, np.nan)  # a steering ratio where the wheels do not steer
         if values.ndim == 1:
             axes.plot(x, values, color=COLOURS[3], linewidth=1.6)
         else:
@@ -78,7 +79,8 @@ def kc_curves(curves: AxleCurves, *, title: str = "", along: str = "", factor: f
         axes.axvline(0.0, color="#bcbcbc", linewidth=0.8)
         axes.ticklabel_format(useOffset=False)
         # What does not change but for round-off is drawn as a level line.
-        middle, span = np.nanmean(values), np.nanmax(values) - np.nanmin(values)
+        finite = values[np.isfinite(values)] if np.isfinite(values).any() else np.zeros(1)
+        middle, span = np.mean(finite), np.ptp(finite)
         if not span > 1e-6 * max(abs(middle), 1.0):
             axes.set_ylim(middle - 0.5, middle + 0.5)
         axes.set_title(panel.title, fontsize=10)

@@ -13,6 +13,8 @@ from lgsens.rigs._kc import KC
 DEGREE = float(np.degrees(1.0))
 _PER_100MM, _PER_KN, _MM_PER_KN = (DEGREE / 10, "°/100 mm"), (1e3 * DEGREE, "°/kN"), (1e6, "mm/kN")
 _ANGLE, _LENGTH, _PERCENT, _RATIO = (DEGREE, "°"), (1e3, "mm"), (100.0, "%"), (1.0, "–")
+# Shares of the left and the right side. Camber is outward: to the left on the left.
+_SIDES = {"alike": (0.5, 0.5), "outward": (0.5, -0.5), "rightward": (-0.5, 0.5)}
 
 
 class Characteristic(NamedTuple):
@@ -23,7 +25,7 @@ class Characteristic(NamedTuple):
         member: which of `AxleCurves`: "caster", "rates.toe".
         shown: factor and unit in which it is shown.
         label: what it is, with its sign.
-        mean: of both sides: "alike", or "outward" of what is to the left, and of the inclination, to the right.
+        mean: of both sides: "alike", "outward" of what is to the left, or of camber "rightward", the inclination.
         by: "travel" or "roll": it is divided by the rate of mean wheel travel, or of the roll angle.
         end: at the end of the sweep, and not in its middle.
     """
@@ -42,7 +44,7 @@ class Characteristic(NamedTuple):
         if found is None:
             return None
         at = -1 if self.end else len(found) // 2
-        side = np.array([0.5, -0.5 if self.mean == "outward" else 0.5])
+        side = np.array(_SIDES[self.mean])
         number = found[at] if found.ndim == 1 else jnp.sum(found[at] * side)
         if self.by == "travel":
             return number / jnp.mean(curves.rates.travel[at])
@@ -72,7 +74,7 @@ CHARACTERISTICS = {
     "roll_centre_height": _C("parallel", "roll_centre_height", _LENGTH, "roll centre height, kinematic"),
     "roll_steer": _C("opposite", "rates.steer", (100.0, "%"), "steer to the left per roll to the right", by="roll"),
     "roll_camber": _C(
-        "opposite", "rates.camber", (-100.0, "%"), "inclination to the right per roll to the right", "outward", "roll"
+        "opposite", "rates.camber", (100.0, "%"), "inclination to the right per roll to the right", "rightward", "roll"
     ),
     "steer_per_rack": _C("steering", "steer_per_rack", (DEGREE / 1e3, "°/mm"), "steer angle per way of the rack"),
     "steering_ratio": _C("steering", "steering_ratio", _RATIO, "steering ratio"),
@@ -81,9 +83,9 @@ CHARACTERISTICS = {
     "lateral_camber": _C(
         "lateral",
         "rates.camber",
-        (-1e3 * DEGREE, "°/kN"),
+        _PER_KN,
         "inclination to the right per lateral force to the left",
-        "outward",
+        "rightward",
     ),
     "lateral_compliance": _C("lateral", "rates.contact_y", _MM_PER_KN, "contact centre per lateral force"),
     "lateral_centre_compliance": _C("lateral", "rates.centre_y", _MM_PER_KN, "wheel centre per lateral force"),

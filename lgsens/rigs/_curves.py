@@ -57,17 +57,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens._validate import number_field
+from lgsens._validate import number_field, require
 from lgsens.analysis import Statics
 from lgsens.examples import wheel_plane
 from lgsens.rigs._pads import SIDES, tyre_axes
 from lgsens.rigs._sweeps import RACK
 
+LIMITS = {"wheelbase": (0.5, 30.0), "centre_height": (0.02, 5.0)}  # m
+LIMITS |= {"braking_share": (0.0, 1.0), "traction_share": (0.0, 1.0)}
 NOT_STEERED = np.radians(0.5)  # within which Ackermann's share is not determined
 
 
 class Vehicle(eqx.Module):
     """What anti-features and Ackermann need to know of the car.
+
+    Raises `ValueError` for what no car has.
 
     Arguments:
         wheelbase: l [m], shape ().
@@ -83,6 +87,15 @@ class Vehicle(eqx.Module):
     traction_share: Float[Array, ""] = number_field("traction_share", default=1.0)
     rack_ratio: Float[Array, ""] | None = number_field("rack_ratio", default=None)
     rear: bool = eqx.field(static=True, default=True, kw_only=True)
+
+    def __check_init__(self):
+        for name, (low, high) in LIMITS.items():
+            value = getattr(self, name)
+            require(
+                lambda value, low=low, high=high: low <= value <= high,
+                f"Vehicle: `{name}` must be within {low:g} and {high:g}, got {value}; lengths are in metres.",
+                value,
+            )
 
 
 class WheelCurves(NamedTuple):

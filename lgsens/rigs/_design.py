@@ -14,6 +14,7 @@ from lgsens.criteria import time_integral
 from lgsens.examples import Axle, AxleNumbers, Band
 from lgsens.model import Model
 from lgsens.rigs._characteristics import CHARACTERISTICS
+from lgsens.rigs._curves import Vehicle
 from lgsens.rigs._kc import KC, kc
 from lgsens.rigs._sweeps import Sweep, standard_sweeps
 from lgsens.simulation import Trajectory, simulate
@@ -37,6 +38,7 @@ class AxleDesign(eqx.Module):
         numbers: which numbers of it are free, and their bounds.
         bands: what is kept, by name of a curve or characteristic, SI units.
         sweeps: of the rig, those that the bands ask for; `points` of each.
+        vehicle: the car, of which this is an axle.
         t1, num_steps: end and steps of the run over the bump.
     """
 
@@ -44,6 +46,7 @@ class AxleDesign(eqx.Module):
     numbers: AxleNumbers
     bands: dict[str, Band]
     t1: Float[Array, ""]
+    vehicle: Vehicle
     sweeps: tuple[tuple[str, Sweep], ...] = eqx.field(static=True)
     points: int = eqx.field(static=True)
     num_steps: int = eqx.field(static=True)
@@ -58,6 +61,8 @@ class AxleDesign(eqx.Module):
         points: int = 5,
         t1=0.5,
         num_steps: int = 250,
+        vehicle: Vehicle | None = None,
+        rack=None,
     ) -> "AxleDesign":
         """The problem of an axle.
 
@@ -71,26 +76,30 @@ class AxleDesign(eqx.Module):
             points: of each sweep, odd.
             t1: end of the run over the bump [s], shape ().
             num_steps: of it, static.
+            vehicle: the car, as of `kc`; None: `vehicle_of(axle)`, the rear axle of one.
+            rack: way of the rack in sweeps that steer [m], a Python float; None: `rack_way(axle)`.
 
         Raises `ValueError` for names that there are not, widths that are not positive, an output that the axle does not
         have, and as `AxleNumbers.select`, `Axle.half` and `kc`.
         """
         numbers, bands = AxleNumbers.select(axle, vary), {}
-        known, every = (*CURVES, *CHARACTERISTICS), standard_sweeps(travel=travel)
+        vehicle = vehicle_of(axle) if vehicle is None else vehicle
+        way = rack_way(axle) if rack is None else rack
+        known, every = (*CURVES, *CHARACTERISTICS), standard_sweeps(travel=travel, rack=way)
         for name in keep:
             if name not in known:
                 raise ValueError(f"`keep`: {suggestion(name, known)}.")
         used = {CURVES[name][0] if name in CURVES else CHARACTERISTICS[name].sweep for name in keep}
         sweeps = tuple((name, every[name]) for name in every if name in used)
         t1, num_steps = as_float(t1, (), "`t1`"), as_count(num_steps, "num_steps", " (it is static)")
-        now = _outputs(_test(axle, sweeps, points), keep) if keep else {}
+        now = _outputs(_test(axle, sweeps, points, vehicle), keep) if keep else {}
         for name, bound in keep.items():
             ends = [as_float(end, (), f"`keep[{name!r}]`") for end in (bound if np.ndim(bound) else (bound,))]
             band = Band.around(now[name], ends[0]) if len(ends) == 1 else Band(*(0.0 * now[name] + end for end in ends))
             if not bool(jnp.all(band.lower < band.upper)):
                 raise ValueError(f"`keep[{name!r}]` must be a positive width or a pair (lower, upper), got {bound!r}.")
             bands[name] = band
-        return AxleDesign(axle, numbers, bands, t1, sweeps, points, num_steps)
+        return AxleDesign(axle, numbers, bands, t1, vehicle, sweeps, points, num_steps)
 
     @property
     def start(self) -> Design:
@@ -108,7 +117,7 @@ class AxleDesign(eqx.Module):
 
     def test(self, x: Design, *, throw: bool = True) -> KC:
         """The sweeps of the rig that the bands ask for."""
-        return _test(self.with_design(x), self.sweeps, self.points, throw=throw)
+        return _test(self.with_design(x), self.sweeps, self.points, self.vehicle, throw=throw)
 
     def scene(self, x: Design) -> Model:
         """The left half, which runs over the bump."""
@@ -132,8 +141,21 @@ class AxleDesign(eqx.Module):
         return self.objective(self.bump(x, throw=False)), jnp.concatenate([jnp.zeros(0, self.t1.dtype), *rows])
 
 
-def _test(axle: Axle, sweeps: tuple[tuple[str, Sweep], ...], points: int, *, throw: bool = True) -> KC:
-    return kc(axle.model(links="rods"), axle.wheel_centres, dict(sweeps), points=points, throw=throw)
+def vehicle_of(axle: Axle, **numbers: Any) -> Vehicle:
+    """The car of an axle, with the ratio of its rack; `numbers`: other arguments of `Vehicle`."""
+    return Vehicle(rack_ratio=None if axle.rack is None else axle.rack.ratio, **numbers)
+
+
+def rack_way(axle: Axle) -> float:
+    """How far its rack goes in a sweep that steers [m]: its travel, if that is known."""
+    travel = None if axle.rack is None else axle.rack.travel
+    return 0.06 if travel is None else float(travel)
+
+
+def _test(
+    axle: Axle, sweeps: tuple[tuple[str, Sweep], ...], points: int, vehicle: Vehicle, *, throw: bool = True
+) -> KC:
+    return kc(axle.model(links="rods"), axle.wheel_centres, dict(sweeps), points=points, vehicle=vehicle, throw=throw)
 
 
 def _outputs(test: KC, names: Iterable[str]) -> dict[str, Float[Array, " n"]]:

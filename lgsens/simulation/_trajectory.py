@@ -303,6 +303,8 @@ class Trajectory(AbstractRun):
         Raises `IndexError` for an int that is out of range; a traced one is taken to the nearest state.
         """
         count = self.t.shape[0]
+        if isinstance(index, float | str):
+            raise IndexError(f"`index` must be a whole number, that of a step, got {index!r}.")
         if isinstance(index, int | np.integer) and not -count <= index < count:
             raise IndexError(f"`index` must be from {-count} to {count - 1}, as there are {count} states; got {index}.")
         return jax.tree.map(lambda leaf: leaf[index], self.states)

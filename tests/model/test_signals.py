@@ -126,6 +126,14 @@ def test_derivatives_by_every_number(name):
         (lambda: lg.Sampled((0.0, 1.0), (1.0,)), says("Sampled: `times` and `values`", "(2,) and (1,)")),
         (lambda: lg.Sampled((0.0, 0.0), (1.0, 1.0)), says("Sampled: `times` must increase")),
         (lambda: lg.Sampled((0.0, 1.0), (1.0, 2.0), "quintic"), says("`kind` must be one of", "'quintic'")),
+        (
+            lambda: lg.TranslationDriver("a", "b", at=(0, 0, 0), axis=(0, 0, 1), value=lg.Sampled((0, 1), (1, 2))),
+            says("follows straight lines"),
+        ),
+        (
+            lambda: lg.RotationDriver(None, "b", axis=(0, 0, 1), value=lg.SampledRoad((0.0, 1.0), (1.0, 2.0))),
+            says("`value` follows straight lines"),
+        ),
     ],
 )
 def test_bad_input(make, message):

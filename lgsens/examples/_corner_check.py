@@ -1,0 +1,41 @@
+"""Whether a corner moves and stands as that of a car."""
+
+from typing import Any
+
+import jax
+
+from lgsens._validate import is_concrete
+from lgsens.examples._leverage import motion_ratios
+
+GRAVITY = 9.81  # m/s²
+# How far weight presses springs and tyres of cars [m]: a ride of 0.35 Hz; a tyre is nearly flat.
+MOST_COMPRESSION = {"spring": 2.0, "tyre": 0.2}
+
+
+def check_corner(car: Any, name: str) -> None:
+    """Raise `ValueError` for a suspension, called `name`, that does not move as one, or springs that cannot bear it."""
+    struts = {"spring": car.spring, "damper": car.damper}
+    with jax.ensure_compile_time_eval():  # of numbers that are known, inside `jit` too
+        ratios = motion_ratios(name, car.wheel.centre, car.links, car.joints, struts)
+        masses = car.chassis.mass, car.mass
+    if not ratios or not is_concrete(masses, car.spring, car.tyre_stiffness):
+        return
+    sprung, whole = (GRAVITY * float(mass) for mass in masses)
+    needed = sprung / ratios["spring"]
+    bearing = {"spring": (needed, float(car.spring.rate)), "tyre": (whole, float(car.tyre_stiffness))}
+    for key, (load, rate) in bearing.items():
+        if not load / rate <= MOST_COMPRESSION[key]:
+            raise ValueError(
+                f"{name}, key '{key}.stiffness': {rate:g} N/m would be pressed by {load / rate:.3g} m under the "
+                f"{load:.0f} N that it bears, and no {key} of a car is by more than {MOST_COMPRESSION[key]:g} m. Rates "
+                f"are in SI units whatever 'units' says; did you mean {1e3 * rate:g}?"
+            )
+    push = car.spring.push()
+    if push is None:
+        return
+    if not needed / 2 <= push <= 2 * needed:
+        raise ValueError(
+            f"{name}, key 'spring.curve': with this `free_length` it pushes with {push:.0f} N at the design "
+            f"position, and must bear about {needed:.0f} N; a preload can make up for half to double of it. Change "
+            "`free_length` or the curve, or leave `free_length` out: it is then counted from the design position."
+        )
