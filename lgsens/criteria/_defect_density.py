@@ -61,8 +61,8 @@ def defect_densities(
         b = scheme.defects(system, grid, states)
         if b is None:
             raise ValueError(
-                f"What {scheme!r} misses in its steps is not known of this scene, of which forces depend on the "
-                "multipliers (friction in joints): take AdaptiveSteps, which has steps for the motion."
+                f"What {scheme!r} misses in its steps is not known: GeneralizedAlpha of index 3 says it, where no force "
+                "depends on the multipliers (friction in joints). AdaptiveSteps has steps for the motion by any scheme."
             )
 
         def better(b):

@@ -70,7 +70,8 @@ def steps_for(
             and the shortest event (the bump of a road) seen.
         tolerance: the relative error that is wanted of each value, and of each gradient by its norm.
         num_steps: how many steps there are to be; then `tolerance` is left out.
-        integrator: the scheme, `GeneralizedAlpha` of index 3, without forces that depend on multipliers.
+        integrator: the scheme, of order 2 with `defects`: `GeneralizedAlpha` of index 3, without forces that depend on
+            multipliers.
 
     From the pilot run, its adjoint variables and eight derivatives of what they say of its defects; no other run. The
     steps are those for the numbers p: they serve designs nearby, as smoothly as equal ones, and derivatives on them are
@@ -104,13 +105,13 @@ def steps_for(
         )
     if tolerance is not None and not (isinstance(tolerance, float | int) and 0.0 < tolerance < 1.0):
         raise ValueError(f"`tolerance` must be a number between 0 and 1, got {tolerance!r}.")
-    if not (isinstance(integrator, GeneralizedAlpha) and not integrator.stabilized):
+    if not (isinstance(integrator, AbstractScheme) and integrator.order == 2):
         raise ValueError(
-            f"`integrator` must be a GeneralizedAlpha of index 3, whose defects are known, got {integrator!r}; "
-            "AdaptiveSteps has steps for the motion by any scheme."
+            f"`integrator` must be a scheme of order 2, GeneralizedAlpha(), got {integrator!r}; AdaptiveSteps has steps "
+            "for the motion by any scheme."
         )
     t0, t1 = interval(t0, t1)
-    p = as_parameters(p)
+    p, t0, t1 = jax.lax.stop_gradient((as_parameters(p), t0, t1))
     rows, trajectory = jax.lax.stop_gradient(
         defect_densities(tuple(leaves), build, state0, p, t0, t1, pilot, integrator)
     )
