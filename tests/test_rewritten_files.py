@@ -145,6 +145,23 @@ def test_bad_files_say_what_is_wrong(table, key, value, parts, load):
         load(document, Axle)
 
 
+def test_a_file_says_of_which_car_it_is(load):
+    """And what is said besides goes before that."""
+    document = suspension_document("multi_link")
+    assert rigs.vehicle_of(load(document, Axle)) == rigs.Vehicle()
+    car = {"wheelbase": 3.1, "centre_height": 0.6, "braking_share": 0.7, "traction_share": 0.4}
+    axle = load({**document, "vehicle": {"axle": "front", **car}}, Axle)
+    assert rigs.vehicle_of(axle) == rigs.Vehicle(**car, rear=False)
+    assert rigs.vehicle_of(axle, wheelbase=2.5, rear=True) == rigs.Vehicle(**{**car, "wheelbase": 2.5})
+    for wrong, parts in (
+        ({"wheelbase": 3100.0}, ("vehicle.wheelbase", "did you mean 3.1?")),
+        ({"axle": "middle"}, ("vehicle.axle", "['front', 'rear']")),
+        ({"track": 1.5}, ("vehicle.track", "no key")),
+    ):
+        with pytest.raises(ValueError, match=says(*parts)):
+            load({**document, "vehicle": wrong}, Axle)
+
+
 def test_impossible_racks_beams_and_cars(load):
     document = suspension_document("push_rod")
     document["rack"] = {key: value for key, value in document["rack"].items() if key != "ratio"}

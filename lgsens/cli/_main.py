@@ -55,12 +55,13 @@ class _Parser(argparse.ArgumentParser):
 
     def vehicle(self, of: str = "") -> None:
         """What the rig is told of the car."""
-        self.add_argument("--axle", choices=["rear", "front"], help=f"{of}which it is (default: rear)")
+        known = "that of the file, else"
+        self.add_argument("--axle", choices=["rear", "front"], help=f"{of}which it is (default: {known} rear)")
         for name, default, meaning in (
-            ("wheelbase", "2.7", "of the car [m], for anti-features and Ackermann"),
-            ("centre-height", "0.55", "of the car's centre of mass [m]"),
-            ("braking-share", "0.5", "of this axle in the braking force"),
-            ("traction-share", "1", "of this axle in the traction"),
+            ("wheelbase", f"{known} 2.7", "of the car [m], for anti-features and Ackermann"),
+            ("centre-height", f"{known} 0.55", "of the car's centre of mass [m]"),
+            ("braking-share", f"{known} 0.5", "of this axle in the braking force"),
+            ("traction-share", f"{known} 1", "of this axle in the traction"),
             ("rack", "its travel, or 0.06", "way of the rack [m]"),
         ):
             metavar = "M" if "[m]" in meaning else "SHARE"

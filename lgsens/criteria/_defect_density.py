@@ -61,7 +61,7 @@ def defect_densities(
         b = scheme.defects(system, grid, states)
         if b is None:
             raise ValueError(
-                f"What {scheme!r} misses in its steps is not known: GeneralizedAlpha of index 3 says it, where no force "
+                f"What {scheme!r} misses in its steps is not known: GeneralizedAlpha of index 3 says it, if no force "
                 "depends on the multipliers (friction in joints). AdaptiveSteps has steps for the motion by any scheme."
             )
 

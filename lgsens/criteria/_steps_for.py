@@ -107,8 +107,8 @@ def steps_for(
         raise ValueError(f"`tolerance` must be a number between 0 and 1, got {tolerance!r}.")
     if not (isinstance(integrator, AbstractScheme) and integrator.order == 2):
         raise ValueError(
-            f"`integrator` must be a scheme of order 2, GeneralizedAlpha(), got {integrator!r}; AdaptiveSteps has steps "
-            "for the motion by any scheme."
+            f"`integrator` must be a scheme of order 2, GeneralizedAlpha(), got {integrator!r}; AdaptiveSteps has "
+            "steps for the motion by any scheme."
         )
     t0, t1 = interval(t0, t1)
     p, t0, t1 = jax.lax.stop_gradient((as_parameters(p), t0, t1))

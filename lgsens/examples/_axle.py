@@ -51,6 +51,8 @@ class Axle(eqx.Module):
         rack: it slides and steers; None: the wheels are not steered.
         bar: the anti-roll bar, the same on both sides; None: there is none.
         twist_beam: the cross member of a twist-beam axle, the same on both sides; None: there is none.
+        vehicle: of the car wheelbase, centre_height [m], braking_share, traction_share [–], as far as the file says,
+            shape (), for the rig (`rigs.vehicle_of`). rear: whether this is its rear axle (static).
         solid_axle: what holds an axle whose knuckles are one body, beside the links of its corners; None: they are two.
     """
 
@@ -61,6 +63,8 @@ class Axle(eqx.Module):
     bar: Bar | None = None
     twist_beam: TwistBeam | None = None
     solid_axle: SolidAxle | None = None
+    vehicle: dict[str, Float[Array, ""]] = eqx.field(default_factory=dict)
+    rear: bool = eqx.field(static=True, default=True)
 
     @staticmethod
     def load(path: str | Path | None = None) -> "Axle":

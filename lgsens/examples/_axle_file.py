@@ -19,7 +19,8 @@ from lgsens.examples._solid_axle import BODY, SolidAxle
 from lgsens.examples._suspension_parts import LEVEL, Connection, Link, Part, Strut
 from lgsens.examples._twist_beam import TwistBeam
 
-OF_AXLE = (*CARRIERS, "anti_roll_bar", "twist_beam", "solid_axle", "bushings", "bump_stop", "rebound_stop")
+OF_AXLE = (*CARRIERS, "vehicle", "anti_roll_bar", "twist_beam", "solid_axle", "bushings", "bump_stop", "rebound_stop")
+OF_VEHICLE, SHARES = {"wheelbase": 30.0, "centre_height": 5.0}, ("braking_share", "traction_share")
 OF_MOUNT = (*RATES, *CURVES, "axes", "preload", "rotational_preload")
 OF_PART = ("centre_of_mass", "mass", "inertia")
 SECTION = ("stiffness", "diameter", "length", "bore", "shear_modulus", "damping")
@@ -132,6 +133,12 @@ def axle_members(root: Reader, kilogram: float, corner: Any) -> dict[str, Any]:
     if "twist_beam" in root:
         side = np.sign(root.table("wheel").point("centre")[1])
         found["twist_beam"] = _twist_beam(root.table("twist_beam"), links, side)
+    if "vehicle" in root:
+        table = root.table("vehicle")
+        table.only(("axle", *OF_VEHICLE, *SHARES))
+        found["rear"] = "axle" not in table or table.choice("axle", ["front", "rear"]) == "rear"
+        found["vehicle"] = {key: table.metres(key, most) for key, most in OF_VEHICLE.items() if key in table}
+        found["vehicle"] |= {key: table.number(key) for key in SHARES if key in table}
     if BODY in root:
         found[BODY] = solid_axle(root, kilogram, (), connections(links, corner.joints, dict(corner.carriers)))
     return found

@@ -45,6 +45,8 @@ Of an axle; points (of the side of the file) and masses are in `units` here as w
                    the chassis (joints.NAME, spherical); shear_centre: of the section from its axis, forward and up
                    [m] (left out: on it), see `TwistBeam`
     [twist_beam.beam]  as of a link, elements of either half
+    [vehicle]      of the car, for the rig: axle = "rear" (left out: it) or "front"; wheelbase, centre_height over the
+                   road [m]; braking_share, traction_share of this axle in all forces, see `lgsens.rigs.Vehicle`
     [solid_axle]   both knuckles, each one half of the axle with half its mass, are one body; final_drive = "axle" (left
                    out: there) or "chassis" (De Dion), see `SolidAxle`
     [solid_axle.links.NAME]  as links.NAME, those that the axle has once: a Panhard rod, an upper link in the middle,

@@ -76,7 +76,7 @@ class AxleDesign(eqx.Module):
             points: of each sweep, odd.
             t1: end of the run over the bump [s], shape ().
             num_steps: of it, static.
-            vehicle: the car, as of `kc`; None: `vehicle_of(axle)`, the rear axle of one.
+            vehicle: the car, as of `kc`; None: `vehicle_of(axle)`.
             rack: way of the rack in sweeps that steer [m], a Python float; None: `rack_way(axle)`.
 
         Raises `ValueError` for names that there are not, widths that are not positive, an output that the axle does not
@@ -142,8 +142,9 @@ class AxleDesign(eqx.Module):
 
 
 def vehicle_of(axle: Axle, **numbers: Any) -> Vehicle:
-    """The car of an axle, with the ratio of its rack; `numbers`: other arguments of `Vehicle`."""
-    return Vehicle(rack_ratio=None if axle.rack is None else axle.rack.ratio, **numbers)
+    """The car of an axle, as its file says, with the ratio of its rack; `numbers`: other arguments of `Vehicle`."""
+    known = {"rear": axle.rear, "rack_ratio": None if axle.rack is None else axle.rack.ratio, **axle.vehicle}
+    return Vehicle(**(known | numbers))
 
 
 def rack_way(axle: Axle) -> float:
