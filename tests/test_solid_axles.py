@@ -273,6 +273,36 @@ def test_a_file_of_the_right_side_is_the_same_axle(load):
     jax.tree.map(np.testing.assert_array_equal, dataclasses.replace(axle, left=left), expected)
 
 
+def test_a_subframe_may_carry_it_on_bushings(load):
+    """Four links along and a rod across bind, but for bushings, wherever these are; asymmetric links have no half."""
+    own = FILE["solid_axle"]["links"]
+    lower = {"subframe": [0.62, 0.44, 0.02], "knuckle": [0.02, 0.5, -0.06], "mass": 4.0}
+    upper = {"chassis": [0.45, 0.3, 0.2], "knuckle": [0.0, 0.35, 0.14], "mass": 3.0}
+    bushing = {"stiffness": [5e6] * 3, "rotational_stiffness": [200.0] * 3}
+    frame = {"centre_of_mass": [0.3, 0.0, 0.1], "mass": 15.0, "inertia": [1.0, 1.0, 1.0]}
+    links = {"lower_link": lower, "upper_link": upper}
+    rod = {"panhard_rod": own["panhard_rod"]}
+    axle = load(scene(rod, links=links, subframe=frame, bushings={"lower_link_subframe": bushing}))
+    assert "left_lower_link_subframe" in axle.model().forces
+    two = {**own, "upper_link": {"chassis": [0.4, 0.3, 0.2], "solid_axle": [0.0, 0.1, 0.14], "mass": 3.0}}
+    two["other"] = {"chassis": [0.5, -0.3, 0.18], "solid_axle": [0.0, -0.1, 0.15], "mass": 3.0}
+    del two["panhard_rod"]
+    axle = load(scene(two))  # what leads sideways are two upper links, which are not alike
+    assert {"upper_link", "other"} <= set(axle.model(compliant=False).bodies)
+
+
+def test_motion_ratios_are_of_both_wheels(rigid):
+    """Wheel rate of spring, tyre apart, is k i² in heave and what weight does by angles."""
+    of = rigs.characteristics(rigid)
+    assert 0.97 < float(of["spring_motion_ratio"]) < 1.0
+    assert float(of["wheel_rate"]) == pytest.approx(27e3 * float(of["spring_motion_ratio"]) ** 2, rel=0.02)
+
+
+def test_half_of_it_has_no_roll_centre(load):
+    curves = load(scene(), QuarterCar).curves([-0.02, 0.0, 0.02])
+    assert np.isnan(curves.roll_centre_height).all() and not np.isnan(curves.spring_motion_ratio).any()
+
+
 def test_its_numbers_have_their_keys(load):
     axle = Axle.load("solid_axle")
     patterns = ("solid_axle.links.panhard_rod.chassis.z", "bushings.panhard_rod_chassis.stiffness.2", "links")
@@ -315,14 +345,22 @@ def test_bad_files_say_what_is_wrong(load):
     with fails("repeat each other", "across the car"):
         load(scene({"upper_link": own["upper_link"], "panhard_rod": rod})).model()
     other = {"chassis": [0.45, 0.3, 0.2], "solid_axle": [0.0, 0.3, 0.15], "mass": 3.0}
-    with fails("key 'links'", "has 0 degrees of freedom"):  # a corner would have both uppers
-        load(scene({**own, "other": other}))
+    both = {**own, "other": other}
+    with fails("has 1 degrees of freedom"):
+        load(scene(both))
+    with fails("half of the solid axle", "has 0 degrees of freedom", "upper_link", "whole axle"):
+        load(scene(both), QuarterCar)
+    across = {**own, "panhard_rod": {"chassis": [-0.14, 0.1, 0.5], "solid_axle": [-0.14, 0.1, 0.03], "mass": 3.0}}
+    with fails("repeat each other", "across the car"):
+        load(scene(across))
     rod = {"chassis": [-0.1, 0.4, 0.0], "solid_axle": [-0.1, -0.4, 0.0]}
     beam = {"tube": {"diameter": 0.03, "thickness": 0.003}, "young": 2.1e11, "poisson": 0.3, "density": 7850.0}
     for change, parts in (
         ({"final_drive": "wheel"}, ("final_drive", "['axle', 'chassis']")),
         ({"live": True}, ("live", "no key of this table")),
         ({"links": {**own, "lower_link": own["upper_link"]}}, ("lower_link", "something else")),
+        ({"links": {**own, "left_wheel": own["upper_link"]}}, ("left_wheel", "something else", "after left_")),
+        ({"links": {**own, "right_lower_link": own["upper_link"]}}, ("right_lower_link", "something else")),
         ({"links": {**own, "upper_link": {**own["upper_link"], "knuckle": [0.0, 0.0, 0.0]}}}, ("knuckle", "no body")),
         ({"links": {**own, "panhard_rod": {**rod, "beam": beam}}}, ("panhard_rod.beam", "rigid")),
     ):

@@ -15,7 +15,16 @@ import numpy as np
 from lgsens import plotting, rigs
 from lgsens._progress import compiling
 from lgsens._validate import suggestion
-from lgsens.cli._report import asking_for, output_folder, suspension_file, versions, write_all, write_json, written
+from lgsens.cli._report import (
+    asking_for,
+    finite,
+    output_folder,
+    suspension_file,
+    versions,
+    write_all,
+    write_json,
+    written,
+)
 from lgsens.examples import Axle
 
 # By unit of a sweep's number the factor and the unit shown.
@@ -129,13 +138,6 @@ def _gradients(axle: Axle, names: list[str], sweeps: dict[str, rigs.Sweep], vehi
     return {name: signs * np.asarray(found) for name, found in jax.jit(jax.jacfwd(of))(axle.hardpoints).items()}
 
 
-def _finite(values: Any) -> Any:
-    """A list without NaN, which JSON does not have: null in its place."""
-    if isinstance(values, list):
-        return [_finite(value) for value in values]
-    return values if math.isfinite(values) else None
-
-
 def _members(curves: rigs.AxleCurves) -> dict[str, np.ndarray]:
     """All outputs of a sweep by name, those of the wheels as "wheels.toe" and "rates.toe"."""
     inner = [f"{group}.{name}" for group in ("wheels", "rates") for name in rigs.WheelCurves._fields]
@@ -149,15 +151,15 @@ def _document(axle: Axle, test: rigs.KC, sweeps, numbers: dict[str, float], grad
     return {
         "axle": axle.name,
         "characteristics": {
-            name: {"value": _finite(value), "sweep": rigs.CHARACTERISTICS[name].sweep, "label": _label(name)}
+            name: {"value": finite(value), "sweep": rigs.CHARACTERISTICS[name].sweep, "label": _label(name)}
             for name, value in numbers.items()
         },
         "gradients": {
-            name: dict(zip(axle.hardpoint_names, _finite(found.tolist()))) for name, found in gradients.items()
+            name: dict(zip(axle.hardpoint_names, finite(found.tolist()))) for name, found in gradients.items()
         },
         "sweeps": {
             name: {"unit": sweep.unit, "shares": dict(sweep.shares)}
-            | {member: _finite(values.tolist()) for member, values in _members(test.sweeps[name]).items()}
+            | {member: finite(values.tolist()) for member, values in _members(test.sweeps[name]).items()}
             for name, sweep in sweeps.items()
         },
         "versions": versions(),

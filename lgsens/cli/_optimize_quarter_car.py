@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lgsens import plotting
-from lgsens.cli._report import suspension_file
+from lgsens.cli._report import finite, suspension_file
 from lgsens.cli._search import (
     BUMP,
     Goal,
@@ -151,7 +151,7 @@ class Outcome(NamedTuple):
             "road": self._road(),
             "curves": self.curves
             and {
-                label: {member: np.asarray(values).tolist() for member, values in curves._asdict().items()}
+                label: {member: finite(np.asarray(values).tolist()) for member, values in curves._asdict().items()}
                 for label, curves in self.curves.items()
             },
         }

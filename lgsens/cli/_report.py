@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import platform
 import sys
 import tempfile
@@ -101,6 +102,13 @@ def versions(*names: str) -> dict[str, str]:
     """The versions of Python, of the libraries that every command uses, and of those named."""
     found = {name: version(name) for name in ("lgsens", "jax", "jaxlib", *names, "numpy")}
     return {"python": platform.python_version()} | found
+
+
+def finite(values: Any) -> Any:
+    """A number or a list without NaN, which JSON does not have: null in its place."""
+    if isinstance(values, list):
+        return [finite(value) for value in values]
+    return values if math.isfinite(values) else None
 
 
 def write_json(document: dict[str, Any], path: Path, **layout: Any) -> None:

@@ -17,7 +17,7 @@ from lgsens.examples._bending import with_nodes
 from lgsens.examples._corner_scene import CornerScene, corner_scene
 from lgsens.examples._hardpoint_file import read
 from lgsens.examples._quarter_car import GRAVITY, QuarterCar, check_choice
-from lgsens.examples._solid_axle import SolidAxle
+from lgsens.examples._solid_axle import BODY, SolidAxle
 from lgsens.examples._suspension_file import reader
 from lgsens.examples._suspension_parts import Part, numbered, reflected
 from lgsens.examples._twist_beam import TwistBeam
@@ -76,8 +76,10 @@ class Axle(eqx.Module):
         Raises `ValueError` naming the file and the key as `QuarterCar.load`.
         """
         with jax.ensure_compile_time_eval():
-            corner = QuarterCar.load(path)
+            corner, name = QuarterCar._read(path)
             root, kilogram = reader(*read(path))
+            if BODY not in root:
+                corner._check(f"Hardpoint file {name!r}")
             if not abs(float(corner.wheel.centre[1])) > LEAST_TRACK / 2:
                 raise root.table("wheel").fail(
                     "centre",
@@ -85,9 +87,10 @@ class Axle(eqx.Module):
                     f"of an axle is its mirror image there; no car has a track of less than {LEAST_TRACK} m.",
                 )
             between = axle_members(root, kilogram, corner)
-            solid = between.get("solid_axle")
-            left = with_nodes(corner, between["bar"].ends) if "bar" in between else corner
-            axle = Axle(left if solid is None else solid.freed(left), **between)
+            left, solid = between.pop("left"), between.get("solid_axle")
+            axle = Axle(with_nodes(left, between["bar"].ends) if "bar" in between else left, **between)
+            if solid is not None:
+                solid.check(f"Hardpoint file {name!r}", {"left": axle.left, "right": axle.right}, compliant=True)
             if corner.wheel.centre[1] > 0:
                 return axle
             # Links that there are once are where the file has them.
@@ -244,12 +247,13 @@ class Axle(eqx.Module):
         cars = cars if compliant else {side: car.rigid() for side, car in cars.items()}
         name, solid = f"Suspension {self.name!r}", self.solid_axle
         for side, car in cars.items():
-            if side == "left" or self.other is not None:
-                (car if solid is None else solid.corner(car))._check(name)
+            if solid is None and (side == "left" or self.other is not None):
+                car._check(name)
         if solid is not None and len(cars) == 2:
             solid.check(name, cars, compliant)
         elif solid is not None:
             cars = {side: solid.corner(car) for side, car in cars.items()}
+            cars["left"]._check(name)
         held = [part.link for part in self._spanning]
         if self.twist_beam is not None and (compliant or len(cars) == 2):
             cars = {side: self.twist_beam.instead(car) for side, car in cars.items()}

@@ -108,10 +108,14 @@ def _centred(table: Reader, key: str) -> Array:
 
 
 def axle_members(root: Reader, kilogram: float, corner: Any) -> dict[str, Any]:
-    """The fields of an `Axle` beside its corners, of which this is one, a `QuarterCar`."""
+    """The fields of an `Axle`, of which this is a corner, a `QuarterCar`; the one on the left is on the file's side."""
+    found: dict[str, Any] = {"left": corner}
+    if BODY in root:
+        known = connections(corner.links, corner.joints, dict(corner.carriers))
+        found[BODY] = solid_axle(root, kilogram, (), known)
+        found["left"] = corner = found[BODY].freed(corner)
     links = corner.links
     part = lambda table: Part(table.point("centre_of_mass"), table.number("mass", kilogram), table.moments("inertia"))
-    found: dict[str, Any] = {}
     if "subframe" in root:
         table = root.table("subframe")
         table.only((*OF_PART, "mounts"))
@@ -139,8 +143,6 @@ def axle_members(root: Reader, kilogram: float, corner: Any) -> dict[str, Any]:
         found["rear"] = "axle" not in table or table.choice("axle", ["front", "rear"]) == "rear"
         found["vehicle"] = {key: table.metres(key, most) for key, most in OF_VEHICLE.items() if key in table}
         found["vehicle"] |= {key: table.number(key) for key in SHARES if key in table}
-    if BODY in root:
-        found[BODY] = solid_axle(root, kilogram, (), connections(links, corner.joints, dict(corner.carriers)))
     return found
 
 
@@ -202,8 +204,13 @@ def solid_axle(root: Reader, kilogram: float, taken: Collection[str], corner: Co
     table.only(("final_drive", "links"))
     live = "final_drive" not in table or table.choice("final_drive", ["axle", "chassis"]) == "axle"
     tables = table.tables("links")
-    for name in sorted({*taken} & {*tables}):
-        raise table.table("links").fail(name, f"is the name of something else; those taken are {sorted(taken)}.")
+    of_sides = {f"{side}_{name}" for side in ("left", "right") for name in (*taken, *corner)}
+    for name in tables:
+        if name in taken or name in of_sides:
+            raise table.table("links").fail(
+                name,
+                f"is the name of something else; those taken are {sorted(taken)}, also after left_ and right_.",
+            )
     bodies = ("chassis", BODY, *(["subframe"] if "subframe" in root else []), *tables)
     carriers: dict[str, str] = {}
     links = {name: read_link(name, of, bodies, kilogram, carriers) for name, of in tables.items()}

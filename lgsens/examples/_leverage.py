@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lgsens._validate import is_concrete
-from lgsens.examples._suspension_parts import Connection, Link, Strut
+from lgsens.examples._suspension_parts import PLANAR, Connection, Link, Strut
 
 RATIOS = (0.1, 3.0)  # motion ratios that cars have; racing cars' rockers reach some 0.4 to 1.5
 LEAST_ANGLE = math.radians(10.0)  # of a link to the plane of its universal joint's arms, where it would be singular
@@ -44,6 +44,12 @@ def motion_ratios(
     rows = velocities.rows([connection for _, connection in every])
     free = velocities.unknowns - len(rows)
     if free != 1:
+        if any(joint.kind == PLANAR for joint in joints.values()):
+            raise ValueError(
+                f"{name}: half of the solid axle, both sides moving alike, has {free} degrees of freedom to the "
+                f"chassis and needs one, got, with halves of what there is once and goes along the car, the links "
+                f"{sorted(links)}. The whole axle (`Axle`, `lgsens kc`) may have links that bind its halves."
+            )
         raise ValueError(
             f"{name}, key 'links': the wheel has {free} degrees of freedom to the chassis, and needs "
             f"one, its travel, got the links {sorted(links)} and the joints {sorted(joints)}. A link with two ball "

@@ -22,7 +22,7 @@ from lgsens.examples._hardpoint_file import read
 from lgsens.examples._link_beam import ELEMENTS, SectionShape
 from lgsens.examples._suspension_curves import SuspensionCurves, suspension_curves
 from lgsens.examples._suspension_file import members
-from lgsens.examples._suspension_parts import PLANAR, Connection, Link, Part, Strut, numbered, reflected
+from lgsens.examples._suspension_parts import BOTH_SIDES, PLANAR, Connection, Link, Part, Strut, numbered, reflected
 from lgsens.model import (
     ALL_FREE,
     BeamSection,
@@ -96,10 +96,15 @@ class QuarterCar(eqx.Module):
         motion ratios that no car has.
         """
         with jax.ensure_compile_time_eval():  # the file's numbers are constants, inside `jit` too
-            document, name = read(path)
-            car = with_nodes(QuarterCar(**members(document, name)))
+            car, name = QuarterCar._read(path)
             car._check(f"Hardpoint file {name!r}")
             return car
+
+    @staticmethod
+    def _read(path: str | Path | None) -> tuple["QuarterCar", str]:
+        """A car that is not checked yet, and what its file is called."""
+        document, name = read(path)
+        return with_nodes(QuarterCar(**members(document, name))), name
 
     def mirrored(self) -> "QuarterCar":
         """The corner of the other side: its mirror image in the plane y = 0, S = diag(1, −1, 1).
@@ -290,7 +295,10 @@ class QuarterCar(eqx.Module):
         axle and as `travel`.
         """
         check_choice("axle", axle, ("rear", "front"))
-        return suspension_curves(self.travel(travel, throw=throw), self.wheel.centre, rear=axle == "rear")
+        found = suspension_curves(self.travel(travel, throw=throw), self.wheel.centre, rear=axle == "rear")
+        if any(joint.kind in BOTH_SIDES for joint in self.joints.values()):
+            found = found._replace(roll_centre_height=jnp.full_like(found.travel, jnp.nan))
+        return found
 
     def random_road(self, *, roughness, speed, weighting: str | None = "Wk") -> RoadResponse:
         """What a random road of ISO 8608 does to the car, by its linear equations about the design position.

@@ -121,13 +121,13 @@ class SolidAxle(eqx.Module):
         for side, car in cars.items():
             bodies += [f"{side}_{link}" for link in car.links]
             named = {"knuckle": BODY} | {link: f"{side}_{link}" for link in car.links}
-            for key, connection in connections(car.links, car.joints, {}).items():
+            for key, connection in connections(car.links, car.joints, dict(car.carriers)).items():
                 if compliant and key in car.mounts:
                     soft = True
                 else:
                     between: Any = tuple(named.get(body, body) for body in connection.between)
                     every.append(dataclasses.replace(connection, between=between))
-        for key, connection in connections(self.links, {}, {}).items():
+        for key, connection in self.connections().items():
             if compliant and key in self.mounts:
                 soft = True
             else:
@@ -140,8 +140,8 @@ class SolidAxle(eqx.Module):
             raise ValueError(
                 f"{name}, key '{BODY}.links': the axle has {free} degrees of freedom to the chassis, and needs two, "
                 f"heave and roll, got the links {held}. A link with two ball joints takes one of its six, one with a "
-                "hinge on the chassis and a ball joint takes two; where there are more, bushings (`bushings.NAME`) in "
-                "place of joints let it move."
+                "hinge on the chassis and a ball joint takes two; joints of the file are there on both sides, and no "
+                "wheel is steered. Where there are more, bushings (`bushings.NAME`) in place of joints let it move."
             )
         centre = np.asarray(sum(car.wheel.centre for car in cars.values())) / len(cars)
         heave = velocities.moving("chassis", BODY, np.eye(3)[2:], centre)

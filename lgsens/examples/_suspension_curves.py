@@ -63,7 +63,8 @@ class SuspensionCurves(NamedTuple):
         track_change: change of the track, twice the way of the contact centre outward [m].
         wheelbase_change: change of the wheelbase, by the way of the contact centre along x [m].
         spring_motion_ratio, damper_motion_ratio: compression per wheel travel [–].
-        roll_centre_height: of the kinematic roll centre over the road [m].
+        roll_centre_height: of the kinematic roll centre over the road [m]; NaN of half of a solid axle or of a twist
+            beam, whose other side moves too: `lgsens.rigs.kc` has it.
         spring_length: distance of the spring's two points [m].
     """
 

@@ -37,6 +37,7 @@ ALONG_A_LINE: dict[str, Any] = {
     "revolute": RevoluteJoint,
 }
 LEVEL = "level"  # a hinge through a point, along y: what symmetry makes of a ball joint
+BOTH_SIDES = ("level", "planar")  # these joints, by which one side moves as both do alike
 PLANAR = "planar"  # sliding on a plane through a point, upright to y: what symmetry makes of no joint at all
 VECTORS = {"at", "arms", "axes", "ends", "centre", "arm", "link_arm", "bearing", "lever", "preload", "up"}
 AXIAL = "rotational_preload"

@@ -8,7 +8,7 @@ Positions, of each wheel: steer angle δ, inclination ε and contact centre P by
 Rates. With z the height of a wheel centre, F the vertical forces on its wheel, ℓ the length of its spring and b the
 distance of the contact centres:
 
-    motion ratio  −ℓ′/z′             by the pad of this wheel
+    motion ratio  −ℓ′/z′             by both pads
     wheel rate    F′/z′              by both pads
     roll rate     M′/φ′              by both pads against each other; M′ = −Σ P_y F′, φ′ = (z_R′ − z_L′)/b
     roll centre   ½ Σ P_y S′/P_z′    each by the pad of its wheel, S the sum of P_y of both wheels: over the road; of
@@ -132,7 +132,7 @@ class AxleCurves(NamedTuple):
         track_change, wheelbase_change: of the contact centres [m], in the mean of both sides, shape (n,).
         roll_angle, roll_angle_rate: of the body over its wheels [rad], positive with the right wheel up, and its
             derivative by `value`, shape (n,).
-        spring_motion_ratio, damper_motion_ratio: compression per wheel travel [–], shape (n, 2).
+        spring_motion_ratio, damper_motion_ratio: compression per wheel travel [–], both wheels moving alike, (n, 2).
         wheel_rate: vertical force per wheel travel [N/m], both wheels moving alike, shape (n, 2).
         roll_rate: moment per roll angle [N m/rad], shape (n,).
         roll_centre_height: kinematic, over the road [m], shape (n,).
@@ -198,7 +198,6 @@ def axle_curves(found: Statics, centres: Float[Array, "2 3"], vehicle: Vehicle) 
     wheels = curves_of(at, pads(found))
     rates = [curves_of(*one) for one in zip(by, force_by)]
     _, left, right, *rack = rates
-    own = lambda name: jnp.stack([getattr(left, name)[:, 0], getattr(right, name)[:, 1]], axis=1)
     both, against = (jax.tree.map(lambda l, r, sign=sign: sign * l + r, left, right) for sign in (1.0, -1.0))
     y = centres[None, :, 1] + wheels.contact_y
     difference = lambda of: of[:, 1] - of[:, 0]
@@ -228,7 +227,7 @@ def axle_curves(found: Statics, centres: Float[Array, "2 3"], vehicle: Vehicle) 
         if {f"{side}_{kind}" for side in SIDES} <= known
     }  # ℓ′ (r, n, 2)
     for kind, length in lengths.items():
-        ratio = -jnp.stack([length[1, :, 0], length[2, :, 1]], axis=1) / own("travel")
+        ratio = -(length[1] + length[2]) / both.travel
         curves = curves._replace(**{f"{kind}_motion_ratio": ratio})
     if not rack:
         return curves
