@@ -354,6 +354,15 @@ def test_bad_files_say_what_is_wrong(load):
     with fails("repeat each other", "across the car"):
         load(scene(across))
     rod = {"chassis": [-0.1, 0.4, 0.0], "solid_axle": [-0.1, -0.4, 0.0]}
+    for compliant in (False, True):
+        weak = scene(None, bushings=FILE["bushings"] if compliant else {})
+        weak["spring"]["stiffness"] = 27.0
+        with fails("'spring.stiffness'", "pressed by", "did you mean 27000?"):
+            load(weak)
+    level = scene()
+    level["damper"]["chassis"] = [-0.08, 0.14, -0.02]
+    with fails("'damper'", "its motion ratio"):
+        load(level)
     beam = {"tube": {"diameter": 0.03, "thickness": 0.003}, "young": 2.1e11, "poisson": 0.3, "density": 7850.0}
     for change, parts in (
         ({"final_drive": "wheel"}, ("final_drive", "['axle', 'chassis']")),

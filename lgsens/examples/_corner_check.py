@@ -17,12 +17,21 @@ def check_corner(car: Any, name: str) -> None:
     struts = {"spring": car.spring, "damper": car.damper}
     with jax.ensure_compile_time_eval():  # of numbers that are known, inside `jit` too
         ratios = motion_ratios(name, car.wheel.centre, car.links, car.joints, struts)
+    if ratios:
+        check_springs(car, name, ratios["spring"])
+
+
+def check_springs(car: Any, name: str, ratio: float) -> None:
+    """Raise `ValueError` for spring and tyre that cannot bear the car, with this motion ratio of the spring."""
+    with jax.ensure_compile_time_eval():
         masses = car.chassis.mass, car.mass
-    if not ratios or not is_concrete(masses, car.spring, car.tyre_stiffness):
+    if not is_concrete(masses, car.spring, car.tyre_stiffness):
         return
     sprung, whole = (GRAVITY * float(mass) for mass in masses)
-    needed = sprung / ratios["spring"]
-    bearing = {"spring": (needed, float(car.spring.rate)), "tyre": (whole, float(car.tyre_stiffness))}
+    needed = sprung / ratio
+    bearing = {"tyre": (whole, float(car.tyre_stiffness))}
+    if car.spring.curve is None:
+        bearing["spring"] = needed, float(car.spring.rate)
     for key, (load, rate) in bearing.items():
         if not load / rate <= MOST_COMPRESSION[key]:
             raise ValueError(

@@ -9,13 +9,13 @@ as many equations as unknowns where travel is the one freedom. A spring whose en
 """
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from lgsens._validate import is_concrete
-from lgsens.examples._suspension_parts import PLANAR, Connection, Link, Strut
+from lgsens.examples._suspension_parts import PLANAR, Connection, Link, Strut, itself
 
 RATIOS = (0.1, 3.0)  # motion ratios that cars have; racing cars' rockers reach some 0.4 to 1.5
 LEAST_ANGLE = math.radians(10.0)  # of a link to the plane of its universal joint's arms, where it would be singular
@@ -39,7 +39,7 @@ def motion_ratios(
     every = [*joints.items(), *((f"links.{key}", c) for key, link in links.items() for c in link.connections(key))]
     for key, connection in every:
         if connection.arms is not None:
-            _check_arms(name, key, links[connection.between[1]], connection)
+            check_arms(name, key, links[connection.between[1]], connection)
     velocities = Velocities(("knuckle", *links))
     rows = velocities.rows([connection for _, connection in every])
     free = velocities.unknowns - len(rows)
@@ -62,12 +62,22 @@ def motion_ratios(
             f"{name}, key 'links': joints repeat each other, or leave the wheel no travel at the design position "
             f"(condition {condition:.0e}); move a hardpoint, or check the line of a hinge."
         )
-    twists = np.linalg.solve(matrix, np.append(np.zeros(len(rows)), 1.0))
+    return strut_ratios(name, velocities, np.linalg.solve(matrix, np.append(np.zeros(len(rows)), 1.0)), struts)
+
+
+def strut_ratios(
+    name: str,
+    velocities: "Velocities",
+    twists: np.ndarray,
+    struts: Mapping[str, Strut],
+    named: Callable[[str], str] = itself,
+) -> dict[str, float]:
+    """The motion ratios of struts by twists per wheel travel, of bodies that are called so. Raises `ValueError`."""
     ratios = {}
     for key, strut in struts.items():
         a, b = strut.bodies
         line = np.asarray(strut.ends[b] - strut.ends[a])
-        speeds = [velocities.moving("chassis", end, line[None], strut.ends[end]) @ twists for end in (a, b)]
+        speeds = [velocities.moving("chassis", named(end), line[None], strut.ends[end]) @ twists for end in (a, b)]
         ratios[key] = ratio = float((speeds[0] - speeds[1])[0] / np.linalg.norm(line))
         if not RATIOS[0] <= ratio <= RATIOS[1]:
             raise ValueError(
@@ -116,7 +126,7 @@ class Velocities:
         return np.concatenate(found)
 
 
-def _check_arms(name: str, key: str, link: Link, connection: Connection) -> None:
+def check_arms(name: str, key: str, link: Link, connection: Connection) -> None:
     """The link turns about both arms, and not about itself."""
     arms = [np.asarray(arm) for arm in connection.arms or ()]
     normal = np.cross(arms[0], arms[1])

@@ -1,7 +1,7 @@
 """A solid axle: both knuckles are one body, held by the links of either side and by links of its own."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -11,8 +11,9 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import is_concrete
 from lgsens.examples._axle_parts import Between, Mount
+from lgsens.examples._corner_check import check_springs
 from lgsens.examples._corner_scene import SHARED, connections
-from lgsens.examples._leverage import SINGULAR, Velocities
+from lgsens.examples._leverage import SINGULAR, Velocities, strut_ratios
 from lgsens.examples._suspension_parts import PLANAR, Connection, Link
 from lgsens.model import FixedJoint
 
@@ -117,23 +118,7 @@ class SolidAxle(eqx.Module):
         """
         if not is_concrete(self, cars):
             return
-        every, bodies, soft = [], [BODY, *self.links], False
-        for side, car in cars.items():
-            bodies += [f"{side}_{link}" for link in car.links]
-            named = {"knuckle": BODY} | {link: f"{side}_{link}" for link in car.links}
-            for key, connection in connections(car.links, car.joints, dict(car.carriers)).items():
-                if compliant and key in car.mounts:
-                    soft = True
-                else:
-                    between: Any = tuple(named.get(body, body) for body in connection.between)
-                    every.append(dataclasses.replace(connection, between=between))
-        for key, connection in self.connections().items():
-            if compliant and key in self.mounts:
-                soft = True
-            else:
-                every.append(connection)
-        velocities = Velocities(tuple(bodies))
-        rows = velocities.rows(every)
+        velocities, rows, soft = self._velocities(cars, compliant)
         free = velocities.unknowns - len(rows)
         held = {"one side": sorted(cars["left"].links), "the axle itself": sorted(self.links)}
         if free < 2 or (free > 2 and not soft):
@@ -146,13 +131,50 @@ class SolidAxle(eqx.Module):
         centre = np.asarray(sum(car.wheel.centre for car in cars.values())) / len(cars)
         heave = velocities.moving("chassis", BODY, np.eye(3)[2:], centre)
         roll = velocities.turning("chassis", BODY, np.eye(3)[:1])
-        condition = np.linalg.cond(np.concatenate([rows, heave, roll]))
+        matrix = np.concatenate([rows, roll, heave])
+        condition = np.linalg.cond(matrix)
         if not condition < SINGULAR:
             raise ValueError(
                 f"{name}, key '{BODY}.links': links repeat each other, or leave the axle no heave or no roll at the "
                 f"design position (condition {condition:.0e}). Is there one across the car? Else move a hardpoint, or "
                 "put bushings (`bushings.NAME`) in place of joints."
             )
+        if soft:  # springs are looked at on ball joints, where these do not bind
+            rigid, joined, _ = self._velocities(cars, compliant=False)
+            if rigid.unknowns - len(joined) == 2:
+                self.check(name, cars, compliant=False)
+            return
+        twists = np.linalg.solve(matrix, np.append(np.zeros(len(matrix) - 1), 1.0))
+        for side, car in cars.items():
+            struts = {"spring": car.spring, "damper": car.damper}
+            ratios = strut_ratios(name, velocities, twists, struts, _on_side(side, car))
+            check_springs(car, name, ratios["spring"])
+
+    def _velocities(self, cars: Mapping[str, Any], compliant: bool) -> tuple[Velocities, np.ndarray, bool]:
+        """The axle and all links, the rows of their joints, and whether bushings take the place of some."""
+        every, bodies, soft = [], [BODY, *self.links], False
+        for side, car in cars.items():
+            named = _on_side(side, car)
+            bodies += [named(link) for link in car.links]
+            for key, connection in connections(car.links, car.joints, dict(car.carriers)).items():
+                if compliant and key in car.mounts:
+                    soft = True
+                else:
+                    a, b = map(named, connection.between)
+                    every.append(dataclasses.replace(connection, between=(a, b)))
+        for key, connection in self.connections().items():
+            if compliant and key in self.mounts:
+                soft = True
+            else:
+                every.append(connection)
+        velocities = Velocities(bodies)
+        return velocities, velocities.rows(every), soft
+
+
+def _on_side(side: str, car: Any) -> Callable[[str], str]:
+    """What the bodies of a corner are called."""
+    named = {"knuckle": BODY} | {link: f"{side}_{link}" for link in car.links}
+    return lambda body: named.get(body, body)
 
 
 def _named(body: str) -> str:
