@@ -59,12 +59,13 @@ def lean_and_steer(trajectory):
     "integrator",
     [
         lg.GeneralizedAlpha(stabilized=True),
-        pytest.param(lg.GeneralizedAlpha(0.5), marks=pytest.mark.slow),
-        pytest.param(lg.RadauIIA(), marks=pytest.mark.slow),
+        lg.GeneralizedAlpha(0.5),
+        lg.RadauIIA(),
     ],
     ids=["stabilized", "rho 0.5", "radau"],
 )
-@pytest.mark.parametrize("speed", [4.6, pytest.param(6.5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("speed", [4.6, 6.5])
 def test_it_moves_as_the_benchmark_says(speed, integrator):
     """Weaving in the stable and leaning in the capsizing range of speeds."""
     trajectory = lg.simulate(bicycle(speed, 1e-3), t1=1.0, num_steps=200, integrator=integrator)

@@ -140,7 +140,7 @@ def edited(old, new):
         (edited("[design]", "[designs]"), "key 'designs'"),
         (
             edited("minimum_tyre_force = 650.0", "minimum_tire_force = 650.0"),
-            "key 'design.minimum_tyre_force'",
+            "key 'design.minimum_tire_force'",
         ),
         (edited("[50000.0, 200000.0]", "[200000.0, 50000.0]"), "'design.stiffness': must be two numbers"),
         (edited("[1500.0, 10000.0]", "1500.0"), "'design.damping': must be two numbers [lower, upper]"),

@@ -178,7 +178,8 @@ def check_gradients(scene, p, where, tolerance, *, both_modes):
     return found["reverse"]
 
 
-@pytest.mark.parametrize("both_modes", some_quick([False, True]))
+@pytest.mark.slow
+@pytest.mark.parametrize("both_modes", [False, True])
 def test_gradients_of_the_door(both_modes):
     # round-off of λ, 1e-9 of 200 N, over a relative step of 1e-3
     check_gradients(door, DOOR | {"t1": jnp.asarray(0.2)}, ("door", "upper"), 1e-6, both_modes=both_modes)

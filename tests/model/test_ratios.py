@@ -203,7 +203,8 @@ def test_bad_input():
         lg.GearJoint("a", "b", **GEARS)
 
 
-@pytest.mark.parametrize("mode", some_quick([jax.grad, jax.jacfwd]))
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.grad, jax.jacfwd])
 def test_gears_without_teeth_by_their_ratio(mode):
     """A torque and a damper over twelve turns: values and the derivative by the ratio in closed form.
 
