@@ -111,9 +111,11 @@ def test_the_command_designs_an_axle(tmp_path, capsys):
     found = json.loads((out / "result.json").read_text(encoding="utf-8"))
     assert status == 0 and found["feasible"] and found["objective"]["reduction"] > 0
     (kept,) = found["constraints"]
-    assert kept["unit"] == "N/mm" and abs(kept["after"]["worst_value"]) <= 1.0 * (
-        1 + 1e-3
-    )  # the tolerance of the search
+    low, high = kept["limit"]
+    slack = 1e-3 * (high - low) / 2  # the tolerance of the search
+    assert kept["unit"] == "N/mm" and high - low == pytest.approx(2.0, rel=1e-12)
+    assert low - slack <= kept["after"]["worst_value"] <= high + slack
+    assert kept["before"]["worst_value"] == pytest.approx((low + high) / 2, rel=1e-9)
     design = AxleDesign.of(AXLE, vary, {"wheel_rate": 1e3}, t1=0.2, num_steps=100)
     assert found["design"]["rates"]["before"]["spring.stiffness"] == pytest.approx(float(AXLE.left.spring.rate))
     x = {"rates": jnp.asarray([found["design"]["rates"]["after"][name] for name in design.numbers.names["rates"]])}

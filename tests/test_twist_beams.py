@@ -167,6 +167,17 @@ def outputs(p):
     return jnp.stack([found[name] for name in ("roll_steer", "roll_camber", "lateral_steer")] + [roll])
 
 
+@pytest.mark.slow  # the axle on the rig
+def test_its_roll_centre_is_that_of_the_forces():
+    """Paths of both contact centres, each by either pad, and vertical by lateral forces: reciprocity, which holds of
+    springs and bushings too."""
+    sweeps = {name: rigs.standard_sweeps()[name] for name in ("parallel", "lateral")}
+    of = rigs.characteristics(rigs.kc(AXLE.model(), AXLE.wheel_centres, sweeps, points=3))
+    assert abs(float(of["force_roll_centre_height"])) > 0.05
+    # linear equations from 1e3 to 1e9 N/m
+    assert float(of["roll_centre_height"]) == pytest.approx(float(of["force_roll_centre_height"]), rel=1e-7)
+
+
 @pytest.mark.slow  # the axle on the rig, and its derivatives
 def test_on_the_rig():
     """Roll steer and camber are those of stiff bushings to what these yield; derivatives by G J and along a random
@@ -178,7 +189,7 @@ def test_on_the_rig():
     t = float(AXLE.left.wheel.centre[1])
     # bushings of 3e6 N/m beside wheel rates of 4e4 N/m, and of 0.8e6 N/m along their axes
     assert found[0] == pytest.approx(-float(steer) * t, rel=0.08)
-    assert found[1] == pytest.approx(float(inclination) * t, rel=0.03)
+    assert found[1] == pytest.approx(-float(inclination) * t, rel=0.03)
     rng = np.random.default_rng(0)
     along = {"torsion": 1000.0, "pivot": rng.normal(size=3), "end": rng.normal(size=3), "shear_centre": np.zeros(2)}
     for keys in (("torsion",), ("pivot", "end")):
