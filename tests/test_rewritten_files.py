@@ -162,6 +162,16 @@ def test_a_file_says_of_which_car_it_is(load):
             load({**document, "vehicle": wrong}, Axle)
 
 
+def test_hardpoints_of_another_shape_and_files_that_are_not_there():
+    axle = Axle.load("solid_axle")
+    with pytest.raises(ValueError, match=says("`points` must have shape (3, 3)", "(2, 3)")):
+        axle.with_hardpoints(axle.hardpoints[:2])
+    with pytest.raises(ValueError, match=says("'nowhere.toml' cannot be read", "those that ship")):
+        suspension_document("nowhere.toml")
+    with pytest.raises(ValueError, match="Vehicle: `centre_height` must be within"):
+        rigs.vehicle_of(axle, centre_height=550.0)
+
+
 def test_impossible_racks_beams_and_cars(load):
     document = suspension_document("push_rod")
     document["rack"] = {key: value for key, value in document["rack"].items() if key != "ratio"}

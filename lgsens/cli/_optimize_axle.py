@@ -131,7 +131,7 @@ def _si(name: str, bound: float | tuple[float, float]) -> float | tuple[float, f
     if not isinstance(bound, tuple):
         if not bound > 0:
             raise ValueError(f"--keep {name}={bound:g} must be a positive width, or two bounds LOWER:UPPER")
-        return bound / abs(factor)
+        return bound / factor
     if not bound[0] < bound[1]:
         raise ValueError(f"--keep {name}={bound[0]:g}:{bound[1]:g} must have its lower bound first")
     return bound[0] / factor, bound[1] / factor

@@ -111,7 +111,7 @@ def steps_for(
             "steps for the motion by any scheme."
         )
     t0, t1 = interval(t0, t1)
-    p, t0, t1 = jax.lax.stop_gradient((as_parameters(p), t0, t1))
+    p, t0, t1 = jax.lax.stop_gradient((as_parameters(p), t0, t1))  # and below what `build` has from elsewhere
     rows, trajectory = jax.lax.stop_gradient(
         defect_densities(tuple(leaves), build, state0, p, t0, t1, pilot, integrator)
     )

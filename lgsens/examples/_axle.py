@@ -14,12 +14,13 @@ from lgsens._validate import as_float
 from lgsens.examples._axle_file import axle_members
 from lgsens.examples._axle_parts import Bar, Rack
 from lgsens.examples._bending import with_nodes
+from lgsens.examples._corner_check import check_corner
 from lgsens.examples._corner_scene import CornerScene, corner_scene
 from lgsens.examples._hardpoint_file import read
 from lgsens.examples._quarter_car import GRAVITY, QuarterCar, check_choice
 from lgsens.examples._solid_axle import BODY, SolidAxle
 from lgsens.examples._suspension_file import reader
-from lgsens.examples._suspension_parts import Part, numbered, reflected
+from lgsens.examples._suspension_parts import Part, numbered, reflected, regrouped
 from lgsens.examples._twist_beam import TwistBeam
 from lgsens.model import (
     ALL_FREE,
@@ -79,7 +80,7 @@ class Axle(eqx.Module):
             corner, name = QuarterCar._read(path)
             root, kilogram = reader(*read(path))
             if BODY not in root:
-                corner._check(f"Hardpoint file {name!r}")
+                check_corner(corner, f"Hardpoint file {name!r}")
             if not abs(float(corner.wheel.centre[1])) > LEAST_TRACK / 2:
                 raise root.table("wheel").fail(
                     "centre",
@@ -135,17 +136,15 @@ class Axle(eqx.Module):
         return signs
 
     def with_hardpoints(self, points: Float[Array, "n 3"]) -> "Axle":
-        """The axle with others, of the left side and their mirror image. Raises `ValueError` for a wrong shape."""
+        """The axle with others [m], those of the left side mirrored. Raises `ValueError` for another shape."""
         points = as_float(points, (len(self.hardpoint_names), 3), "`points`")
         count = len(self.left.hardpoint_names)
         left = self.left.with_values(hardpoints=points[:count]) if count else self.left
         own, rest = self._own_chassis(), points[count:]
         if not own:
             return dataclasses.replace(self, left=left)
-        ends = np.cumsum([old.size // 3 for old in own.values()])
-        new = [rest[end - old.size // 3 : end].reshape(old.shape) for old, end in zip(own.values(), ends)]
         where = lambda axle: [axle.left, *axle._own_chassis().values()]
-        return eqx.tree_at(where, self, [left, *new])
+        return eqx.tree_at(where, self, [left, *regrouped(rest, list(own.values()))])
 
     @property
     def mass(self) -> Float[Array, ""]:
@@ -248,12 +247,12 @@ class Axle(eqx.Module):
         name, solid = f"Suspension {self.name!r}", self.solid_axle
         for side, car in cars.items():
             if solid is None and (side == "left" or self.other is not None):
-                car._check(name)
+                check_corner(car, name)
         if solid is not None and len(cars) == 2:
             solid.check(name, cars, compliant)
         elif solid is not None:
             cars = {side: solid.corner(car) for side, car in cars.items()}
-            cars["left"]._check(name)
+            check_corner(cars["left"], name)
         held = [part.link for part in self._spanning]
         if self.twist_beam is not None and (compliant or len(cars) == 2):
             cars = {side: self.twist_beam.instead(car) for side, car in cars.items()}

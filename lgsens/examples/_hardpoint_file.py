@@ -246,5 +246,11 @@ def read(path: str | Path | None) -> tuple[dict, str]:
 
 
 def suspension_document(path: str | Path | None = None) -> dict[str, Any]:
-    """The tables of a suspension's file as they are there; `path` as of `QuarterCar.load`."""
+    """The tables of a suspension's file as they are there, in its own units and axes.
+
+    Arguments:
+        path: as of `QuarterCar.load`.
+
+    Raises `ValueError` for a file that cannot be read.
+    """
     return read(path)[0]

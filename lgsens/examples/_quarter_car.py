@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, suggestion
@@ -22,7 +21,17 @@ from lgsens.examples._hardpoint_file import read
 from lgsens.examples._link_beam import ELEMENTS, SectionShape
 from lgsens.examples._suspension_curves import SuspensionCurves, suspension_curves
 from lgsens.examples._suspension_file import members
-from lgsens.examples._suspension_parts import BOTH_SIDES, PLANAR, Connection, Link, Part, Strut, numbered, reflected
+from lgsens.examples._suspension_parts import (
+    BOTH_SIDES,
+    PLANAR,
+    Connection,
+    Link,
+    Part,
+    Strut,
+    numbered,
+    reflected,
+    regrouped,
+)
 from lgsens.model import (
     ALL_FREE,
     BeamSection,
@@ -97,7 +106,7 @@ class QuarterCar(eqx.Module):
         """
         with jax.ensure_compile_time_eval():  # the file's numbers are constants, inside `jit` too
             car, name = QuarterCar._read(path)
-            car._check(f"Hardpoint file {name!r}")
+            check_corner(car, f"Hardpoint file {name!r}")
             return car
 
     @staticmethod
@@ -146,13 +155,9 @@ class QuarterCar(eqx.Module):
         link = self.links.get(body)
         return own + (body if link is None or link.beam is None else link.beam.node(body, key))
 
-    def _check(self, name: str) -> None:
-        """Raise `ValueError` for what moves or stands as no car does."""
-        check_corner(self, name)
-
     @property
     def on_chassis(self) -> dict[str, Array]:
-        """By link or joint the points at which it holds on to the chassis, in order."""
+        """By link or joint, in order, the points at which it holds on to the chassis [m], shape (3,) or (2, 3)."""
         links = {name: link.chassis for name, link in sorted(self.links.items()) if "chassis" in link.ends}
         joints = {name: c.at for name, c in sorted(self.joints.items()) if "chassis" in c.between}
         return links | {name: at for name, at in joints.items() if self.joints[name].kind != PLANAR}
@@ -188,8 +193,7 @@ class QuarterCar(eqx.Module):
         points: list[Any] = [None] * (len(olds) - 3)
         if hardpoints is not None:
             rows = as_float(hardpoints, (len(self.hardpoint_names), 3), "`hardpoints`")
-            ends = np.cumsum([old.size // 3 for old in olds[3:]])
-            points = [rows[end - old.size // 3 : end].reshape(old.shape) for old, end in zip(olds[3:], ends)]
+            points = regrouped(rows, olds[3:])
         values = [
             old if new is None else as_float(new, old.shape, "`stiffness`, `damping` or `bump_height`")
             for old, new in zip(olds, (stiffness, damping, bump_height, *points))
@@ -259,7 +263,7 @@ class QuarterCar(eqx.Module):
         model = Model(bodies, joints, forces)
         if free_length is not None:
             return model
-        self._check(f"Suspension {self.name!r}")  # else no preload holds it, or one that no car has
+        check_corner(self, f"Suspension {self.name!r}")  # else no preload holds it, or one that no car has
         return static_preload(model, ("tyre", *(called.get(name, name) for name in scene.sought)))[0]
 
     def travel(self, travel, *, links: str = "rods", throw: bool = True) -> Kinematics:
@@ -295,10 +299,8 @@ class QuarterCar(eqx.Module):
         axle and as `travel`.
         """
         check_choice("axle", axle, ("rear", "front"))
-        found = suspension_curves(self.travel(travel, throw=throw), self.wheel.centre, rear=axle == "rear")
-        if any(joint.kind in BOTH_SIDES for joint in self.joints.values()):
-            found = found._replace(roll_centre_height=jnp.full_like(found.travel, jnp.nan))
-        return found
+        alone = not any(joint.kind in BOTH_SIDES for joint in self.joints.values())
+        return suspension_curves(self.travel(travel, throw=throw), self.wheel.centre, rear=axle == "rear", alone=alone)
 
     def random_road(self, *, roughness, speed, weighting: str | None = "Wk") -> RoadResponse:
         """What a random road of ISO 8608 does to the car, by its linear equations about the design position.

@@ -79,7 +79,7 @@ class SuspensionCurves(NamedTuple):
     spring_length: Float[Array, " n"]
 
 
-def suspension_curves(motion: Kinematics, centre: Float[Array, "3"], *, rear: bool) -> SuspensionCurves:
+def suspension_curves(motion: Kinematics, centre: Float[Array, "3"], *, rear: bool, alone: bool) -> SuspensionCurves:
     """The curves of a wheel that was driven over its travel at rate 1.
 
     Arguments:
@@ -88,6 +88,7 @@ def suspension_curves(motion: Kinematics, centre: Float[Array, "3"], *, rear: bo
             `damper`.
         centre: the wheel centre in the reference configuration [m], shape (3,); its height is the loaded radius.
         rear: whether the axle is the rear one, for the sign of the wheelbase.
+        alone: whether it moves as it does where the other wheel stays; else one wheel tells no roll centre.
     """
     wheel = motion.body("wheel")
     axis = wheel.orientation[:, :, 1]
@@ -109,6 +110,6 @@ def suspension_curves(motion: Kinematics, centre: Float[Array, "3"], *, rear: bo
         wheelbase_change=-moved[:, 0] if rear else moved[:, 0],
         spring_motion_ratio=-spring.rate,
         damper_motion_ratio=-damper.rate,
-        roll_centre_height=at[:, 1] * rate[:, 1] / rate[:, 2],
+        roll_centre_height=at[:, 1] * rate[:, 1] / rate[:, 2] if alone else jnp.full_like(at[:, 1], jnp.nan),
         spring_length=spring.length,
     )

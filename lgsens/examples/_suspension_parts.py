@@ -37,8 +37,8 @@ ALONG_A_LINE: dict[str, Any] = {
     "revolute": RevoluteJoint,
 }
 LEVEL = "level"  # a hinge through a point, along y: what symmetry makes of a ball joint
-BOTH_SIDES = ("level", "planar")  # these joints, by which one side moves as both do alike
 PLANAR = "planar"  # sliding on a plane through a point, upright to y: what symmetry makes of no joint at all
+BOTH_SIDES = (LEVEL, PLANAR)  # by which one side moves as both do alike
 VECTORS = {"at", "arms", "axes", "ends", "centre", "arm", "link_arm", "bearing", "lever", "preload", "up"}
 AXIAL = "rotational_preload"
 # Curves of a bushing along its axes e₁, e₂, e₃ = e₁ × e₂: these become S e₁, S e₂, −S e₃, and turns change their sign.
@@ -75,6 +75,12 @@ def itself(body: str) -> str:
 def numbered(points: Mapping[str, Array]) -> list[str]:
     """The names of points, of two of one name "NAME 1" and "NAME 2"."""
     return [name + end for name, at in points.items() for end in ([""] if at.ndim == 1 else [" 1", " 2"])]
+
+
+def regrouped(rows: Float[Array, "n 3"], like: Sequence[Array]) -> list[Array]:
+    """The rows of points in arrays of the shapes of others, (3,) or (2, 3), which have as many in all."""
+    ends = np.cumsum([old.size // 3 for old in like])
+    return [rows[end - old.size // 3 : end].reshape(old.shape) for old, end in zip(like, ends)]
 
 
 class Part(eqx.Module):

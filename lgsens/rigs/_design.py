@@ -142,7 +142,14 @@ class AxleDesign(eqx.Module):
 
 
 def vehicle_of(axle: Axle, **numbers: Any) -> Vehicle:
-    """The car of an axle, as its file says, with the ratio of its rack; `numbers`: other arguments of `Vehicle`."""
+    """The car of an axle, as its file says, with the ratio of its rack.
+
+    Arguments:
+        axle: the axle.
+        numbers: arguments of `Vehicle`, which go before those.
+
+    Raises `ValueError` as `Vehicle`.
+    """
     known = {"rear": axle.rear, "rack_ratio": None if axle.rack is None else axle.rack.ratio, **axle.vehicle}
     return Vehicle(**(known | numbers))
 
