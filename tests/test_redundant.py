@@ -9,9 +9,10 @@ import pytest
 from helpers import says, some_quick
 
 import lgsens as lg
-from lgsens.examples import four_bar
+from lgsens.examples import PROBLEMS, four_bar
 from lgsens.integrate import singular_steps
 
+PENDULUM = PROBLEMS["simple_pendulum_A01"]
 Z = np.array([0.0, 0.0, 1.0])
 EXACT = lg.GeneralizedAlpha(0.8, tolerance=1e-13)
 
@@ -321,6 +322,21 @@ def test_without_joints_nothing_is_singular(factor_every):
     scheme = lg.GeneralizedAlpha(factor_every=factor_every)
     stone = lg.Model({"stone": lg.RigidBody(1.0, (1.0, 1.0, 1.0), free="z")}, {}, {"g": lg.Gravity((0.0, 0.0, -9.81))})
     assert lg.simulate(stone, t1=0.1, num_steps=10, integrator=scheme).result == 0
+
+
+def test_a_pendulum_in_steps_too_long_fails_in_newton():
+    """Its rod never loses rank; multipliers jump between solutions, and so do the margins."""
+    run = lambda num_steps: lg.simulate(PENDULUM.build(PENDULUM.parameters), t1=10.0, num_steps=num_steps)
+    with pytest.raises(lg.SimulationError, match=says("Newton", "It failed at step", "of 128")):
+        run(128)
+
+
+def test_what_is_a_sign_of_a_singular_configuration():
+    falling = [1.0, 0.8, 0.4, 0.09, 0.02, 0.1]
+    signs = lambda margins: jnp.flatnonzero(singular_steps(jnp.asarray(margins))).tolist()
+    assert signs(falling) == [3, 4]  # 0.4 is half of what was before, but not small
+    assert signs([1.0, 0.02, 0.6, 0.04]) == [1]  # one that went up before is none
+    assert signs([1.0, jnp.inf, 0.05, 0.02]) == [3]  # what is not known is none
 
 
 def test_a_reference_that_lies_flat_is_singular():

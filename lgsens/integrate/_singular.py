@@ -11,9 +11,11 @@ falls to zero, so does the margin
     m = |B y|/|μ| ∝ σ_min,
 
 linearly in time on both sides of the singular point, without any part along redundant equations. Two successive steps
-with 2 m_n ≤ m_{n−1} say that it would be zero before the next one. A motion that passes a singular configuration at
-a distance has a minimum of m instead, which steps that resolve it see as such. m lies between the squares of the
-smallest and the largest σ, wherever B y points: 1/|μ| alone would have peaks where B y is small.
+with 2 m_n ≤ m_{n−1} ≤ m_{n−2} say that it would be zero before the next one; where Newton's method jumps from one
+solution to another (steps too long for the motion), multipliers and so A jump with it, and m goes up and down. A motion
+that passes a singular configuration at a distance has a minimum of m instead, which steps that resolve it see as such.
+m lies between the squares of the smallest and the largest σ, wherever B y points: 1/|μ| alone would have peaks where
+B y is small.
 
 m costs one product with the inverse that many steps share. Where m falls so fast that it would be zero before two such
 inverses are over, every step has its own.
@@ -72,9 +74,8 @@ def singular_steps(margins: Float[Array, " n"]):
 
     Not NaN: under `jax_debug_nans` that would be an error in every run.
     """
-    before = jnp.concatenate([jnp.full(1, jnp.inf, margins.dtype), margins[:-1]])
-    known, largest = (
-        jnp.isfinite(margins) & jnp.isfinite(before),
-        jnp.max(margins, where=jnp.isfinite(margins), initial=0.0),
-    )
-    return (2.0 * margins <= before) & (margins <= _SMALL * largest) & known
+    count, padded = margins.shape[0], jnp.concatenate([jnp.full(2, jnp.inf, margins.dtype), margins])
+    earlier, before = padded[:count], padded[1 : count + 1]
+    known = jnp.isfinite(margins) & jnp.isfinite(before)
+    largest = jnp.max(margins, where=jnp.isfinite(margins), initial=0.0)
+    return (2.0 * margins <= before) & (before <= earlier) & (margins <= _SMALL * largest) & known
