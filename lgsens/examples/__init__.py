@@ -39,14 +39,16 @@ from lgsens.examples._quarter_car_design import (
 )
 from lgsens.examples._road_limits import RoadLimits as RoadLimits
 from lgsens.examples._solid_axle import LIVE as LIVE, SolidAxle as SolidAxle
-from lgsens.examples._suspension_curves import (
-    SuspensionCurves as SuspensionCurves,
-    WheelPlane as WheelPlane,
-    wheel_plane as wheel_plane,
-)
+from lgsens.examples._suspension_curves import SuspensionCurves as SuspensionCurves
 from lgsens.examples._tops import (
     free_rigid_body as free_rigid_body,
     heavy_top as heavy_top,
     lagrange_top as lagrange_top,
     spinning_top as spinning_top,
+)
+from lgsens.examples._wheel import (
+    Stance as Stance,
+    Wheel as Wheel,
+    WheelPlane as WheelPlane,
+    wheel_plane as wheel_plane,
 )

@@ -22,6 +22,7 @@ from lgsens.examples._solid_axle import BODY, SolidAxle
 from lgsens.examples._suspension_file import reader
 from lgsens.examples._suspension_parts import Part, numbered, reflected, regrouped
 from lgsens.examples._twist_beam import TwistBeam
+from lgsens.examples._wheel import Stance
 from lgsens.model import (
     ALL_FREE,
     BumpRoad,
@@ -185,7 +186,7 @@ class Axle(eqx.Module):
             compliant: whether there are bushings and beams. False: each is the joint that it replaces, the subframe is
                 fixed to the chassis, no link bends, and a bar or a twist beam has halves and the stiffness of its beam
                 in torsion (`Bar`, `TwistBeam`).
-            tyres: whether the wheels stand on a road, on `TyreSpring`s at their centres.
+            tyres: whether the wheels stand on a road, on `TyreSpring`s over their contact centres.
 
         The preloads of springs, tyres, bushings and beams are those with which the whole car, guided and on tyres,
         rests: of those that do, they are of least energy (`static_preload`). Bushings with preloads of their own then
@@ -262,7 +263,7 @@ class Axle(eqx.Module):
             bodies, joints, forces = bodies | scene.bodies, joints | scene.joints, forces | scene.forces
             for body, masses in scene.ends.items():
                 ends.setdefault(body, []).extend(masses)
-            tyre = {"at": car.wheel.centre, "stiffness": car.tyre_stiffness, "road": road}
+            tyre = {"at": _over_contact(car.wheel.stance), "stiffness": car.tyre_stiffness, "road": road}
             forces[f"{side}_tyre"] = TyreSpring(f"{side}_wheel", **tyre)
             sought, given = [*sought, f"{side}_tyre", *scene.sought], given | scene.given
         for part in self._spanning:
@@ -284,6 +285,12 @@ class Axle(eqx.Module):
             joints[f"rack_{self.rack.carrier}"] = PrismaticJoint(self.rack.carrier, "rack", **line)
             joints["steering"] = TranslationDriver(self.rack.carrier, "rack", **line)
         return shared, joints
+
+
+def _over_contact(stance: Stance) -> Float[Array, "3"]:
+    """The point of a wheel, which does not spin here, over its contact centre, as high as its centre [m]: the force of
+    the tyre goes through both, and turns of the wheel lift both alike."""
+    return stance.contact.at[2].set(stance.centre[2])
 
 
 def _resting(model: Model, scene: CornerScene) -> Model:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from jaxtyping import Array
 
-from lgsens.examples._axle_parts import ALONG_Y, Mount
+from lgsens.examples._axle_parts import Mount
 from lgsens.examples._suspension_parts import Connection, Link
 from lgsens.model import AbstractForce, AbstractJoint, DistanceJoint, FixedJoint, RevoluteJoint, RigidBody
 
@@ -92,7 +92,8 @@ def corner_scene(
     parts |= {name: link.part(car.link_radius) for name, link in car.links.items() if name not in (*rods, *beams)}
     ends: dict[str, list[tuple[Array, Array]]] = {}
     joints, forces, sought, given = {}, {}, [own + "spring"], {}
-    hub: dict[str, Any] = {"at": car.bearing} | ({"axis": ALONG_Y} if wheel == "hinged" else {})
+    hub: dict[str, Any] = {"at": car.wheel.on_axis(car.bearing)}
+    hub |= {"axis": car.wheel.spin_axis} if wheel == "hinged" else {}
     joints[f"{own}hub"] = (RevoluteJoint if hub.keys() > {"at"} else FixedJoint)(own + "knuckle", own + "wheel", **hub)
     for name, rod in rods.items():
         (a, start), (b, end) = sorted(rod.ends.items())

@@ -32,6 +32,7 @@ from lgsens.examples._suspension_parts import (
     reflected,
     regrouped,
 )
+from lgsens.examples._wheel import Wheel
 from lgsens.model import (
     ALL_FREE,
     BeamSection,
@@ -77,7 +78,7 @@ class QuarterCar(eqx.Module):
     links: dict[str, Link]
     joints: dict[str, Connection]
     knuckle: Part
-    wheel: Part
+    wheel: Wheel
     chassis: Part
     bearing: Float[Array, "3"]
     spring: Strut
@@ -294,13 +295,12 @@ class QuarterCar(eqx.Module):
             axle: "rear" or "front", for the sign of the wheelbase.
             throw: as in `lgsens.kinematics`.
 
-        `SuspensionCurves` says what they are and their signs (ISO 8855); the wheel is upright and straight at the
-        design position. Differentiable by every number of the suspension, exactly. Raises `ValueError` for another
-        axle and as `travel`.
+        `SuspensionCurves` says what they are and their signs (ISO 8855). Differentiable by every number of the
+        suspension, exactly. Raises `ValueError` for another axle and as `travel`.
         """
         check_choice("axle", axle, ("rear", "front"))
         alone = not any(joint.kind in BOTH_SIDES for joint in self.joints.values())
-        return suspension_curves(self.travel(travel, throw=throw), self.wheel.centre, rear=axle == "rear", alone=alone)
+        return suspension_curves(self.travel(travel, throw=throw), self.wheel.stance, rear=axle == "rear", alone=alone)
 
     def random_road(self, *, roughness, speed, weighting: str | None = "Wk") -> RoadResponse:
         """What a random road of ISO 8608 does to the car, by its linear equations about the design position.

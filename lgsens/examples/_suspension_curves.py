@@ -1,9 +1,8 @@
 """What a suspension does with its wheel as it travels: the curves by which engineers judge its geometry.
 
-Axes are those of ISO 8855: x forward, y left, z up; the chassis stands still. Let e be the unit vector of the spin
-axis that points left, c the wheel centre, r its height over the road at the design position. The plane of the wheel
-is normal to e, its steepest line is u = (e_z − (e_z·e) e)/|…|, and the tyre touches the road at its lowest point, the
-contact centre P = c − r u. With σ = 1 for a wheel on the left (y > 0), −1 on the right, and ′ = d/ds by the travel s:
+Axes are those of ISO 8855: x forward, y left, z up; the chassis stands still. Spin axis e, wheel centre and contact
+centre P are those of `_wheel.py`. With σ = 1 for a wheel on the left (y > 0), −1 on the right, and ′ = d/ds by the
+travel s:
 
     camber   γ = −σ asin(e·e_z)             ISO 8855: positive with the top of the wheel outward
     toe      δ = −σ atan2(−e·e_x, e·e_y)    positive with the front of the wheel inward (toe-in)
@@ -20,37 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens.analysis import Kinematics
-
-
-class WheelPlane(NamedTuple):
-    """How a wheel stands, ISO 8855 axes.
-
-    Attributes:
-        steer: angle from x to the trace of the wheel plane on the road [rad], positive to the left, shape ().
-        inclination: of the wheel plane to the vertical [rad], positive with its top to the right, shape ().
-        contact: the contact centre, its lowest point [m], inertial frame, shape (3,).
-    """
-
-    steer: Float[Array, ""]
-    inclination: Float[Array, ""]
-    contact: Float[Array, "3"]
-
-
-def wheel_plane(axis: Float[Array, "3"], centre: Float[Array, "3"], radius: Float[Array, ""]) -> WheelPlane:
-    """Steer angle, inclination and contact centre of a wheel.
-
-        δ = atan2(−e·e_x, e·e_y),     ε = asin(e·e_z),     P = c − r u,  u = (e_z − (e_z·e) e)/|…|
-
-    Arguments:
-        axis: e, unit vector of the spin axis that points left, inertial frame, shape (3,).
-        centre: c, the wheel centre [m], inertial frame, shape (3,).
-        radius: r, from the wheel centre to the road [m], shape (); 0: the contact centre is the wheel centre.
-
-    Source: ISO 8855:2011 (wheel plane, contact centre, steer and inclination angle).
-    """
-    up = jnp.asarray([0.0, 0.0, 1.0], axis.dtype) - axis[2] * axis
-    contact = centre - radius * up / jnp.linalg.norm(up)
-    return WheelPlane(jnp.arctan2(-axis[0], axis[1]), jnp.arcsin(axis[2]), contact)
+from lgsens.examples._wheel import Stance, wheel_plane
 
 
 class SuspensionCurves(NamedTuple):
@@ -79,14 +48,13 @@ class SuspensionCurves(NamedTuple):
     spring_length: Float[Array, " n"]
 
 
-def suspension_curves(motion: Kinematics, centre: Float[Array, "3"], *, rear: bool, alone: bool) -> SuspensionCurves:
+def suspension_curves(motion: Kinematics, stance: Stance, *, rear: bool, alone: bool) -> SuspensionCurves:
     """The curves of a wheel that was driven over its travel at rate 1.
 
     Arguments:
-        motion: of a rig with the bodies `wheel`, which does not spin, whose axis is along y in the reference
-            configuration and whose centre of mass is its centre, the driver `travel`, and the forces `spring` and
-            `damper`.
-        centre: the wheel centre in the reference configuration [m], shape (3,); its height is the loaded radius.
+        motion: of a rig with the bodies `wheel`, which does not spin, whose axis is y of its frame and whose centre of
+            mass is its centre, the driver `travel`, and the forces `spring` and `damper`.
+        stance: how the wheel stands in the reference configuration.
         rear: whether the axle is the rear one, for the sign of the wheelbase.
         alone: whether it moves as it does where the other wheel stays; else one wheel tells no roll centre.
     """
@@ -94,13 +62,12 @@ def suspension_curves(motion: Kinematics, centre: Float[Array, "3"], *, rear: bo
     axis = wheel.orientation[:, :, 1]
     turning = jnp.cross(wheel.angular_velocity, jnp.asarray([[0.0, 1.0, 0.0]], axis.dtype))  # Ω × e, body frame
     axis_rate = jnp.einsum("nij,nj->ni", wheel.orientation, turning)
-    side = jnp.where(centre[1] > 0, 1.0, -1.0)
+    side = jnp.where(stance.centre[1] > 0, 1.0, -1.0)
 
-    along = lambda *args: jax.jvp(lambda axis, place: wheel_plane(axis, place, centre[2]), args[:2], args[2:])
+    along = lambda *args: jax.jvp(lambda axis, place: wheel_plane(axis, place, stance.radius), args[:2], args[2:])
     plane, rates = jax.vmap(along)(axis, wheel.position, axis_rate, wheel.velocity)
     at, rate = plane.contact, rates.contact
-    # At the design position the axis is along y, so the contact centre is below the wheel centre.
-    moved = at - jnp.stack([centre[0], centre[1], jnp.zeros_like(side)])[None]
+    moved = at - stance.contact[None]
     spring, damper = motion.force("spring"), motion.force("damper")
     return SuspensionCurves(
         travel=motion.values["travel"],

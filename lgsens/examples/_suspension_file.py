@@ -17,7 +17,10 @@ y left, z up. TOML, or JSON of the same structure.
     [joints.NAME]  type (cylindrical, fixed, prismatic, revolute, spherical), between = [BODY, BODY], at: a point, or
                    the two points of its line
     [knuckle], [wheel], [chassis]: centre_of_mass (wheel: centre, and bearing, its hub), mass, inertia (principal
-                   moments about the axes of the file)
+                   moments about the axes of the file, of the wheel about its own, the second of which is its spin axis)
+    [wheel]        camber_deg, toe_deg: at the design position [degree] (left out: 0, upright and straight), camber
+                   positive with the top outward, toe with the front inward; the bearing is that of a wheel so turned
+                   about its centre
     [spring]       BODY = [x, y, z] twice, and stiffness, or curve = [[compression, force], …], which is counted from
                    the design position, or from free_length [m]; a constant is added so that the car rests there
     [damper]       BODY = [x, y, z] twice, and damping, or curve = [[speed of compression, force], …] with [0, 0]
@@ -83,6 +86,7 @@ from lgsens.examples._file_axes import FileAxes
 from lgsens.examples._hardpoint_file import Reader
 from lgsens.examples._link_file import CARRIERS, OF_LINK, carried, read_link
 from lgsens.examples._suspension_parts import ALONG_A_LINE, AT_A_POINT, Connection, Part, Strut
+from lgsens.examples._wheel import Wheel
 from lgsens.model import Sampled
 
 LEAST_RADIUS, LARGEST_RADIUS = 0.1, 2.0  # m, loaded radii of tyres
@@ -91,6 +95,7 @@ TABLES = ("name", "units", "road", "links", "joints", "chassis", "knuckle", "whe
 TABLES += ("link_section", "bump", "design")
 OF_TABLES = {"tyre": ("stiffness",), "bump": ("height", "duration"), "link_section": ("radius",)}
 RATES = {"spring": "stiffness", "damper": "damping"}
+ANGLES = {"camber_deg": 20.0, "toe_deg": 5.0}  # how large they may be [degree]
 STOPS = ("bump_stop", "rebound_stop")
 OF_MODEL = ("hub", "heave", "travel")  # joints that there are beside those of the file
 
@@ -130,7 +135,7 @@ def members(document: dict, path: str) -> dict[str, Any]:
         body.only((centre, "mass", "inertia", *more))
         return Part(body.point(centre), body.number("mass", kilogram), body.moments("inertia"))
 
-    wheel = part("wheel", "centre", "bearing")
+    wheel = _wheel(root, part("wheel", "centre", "bearing", *ANGLES))
     if not LEAST_RADIUS <= float(wheel.centre[2]) <= LARGEST_RADIUS:
         raise root.table("wheel").fail(
             "centre",
@@ -167,6 +172,17 @@ def members(document: dict, path: str) -> dict[str, Any]:
         "carriers": tuple(sorted(carriers.items())),
         "axes": FileAxes(root.metres_of_road),
     }
+
+
+def _wheel(root: Reader, part: Part) -> Wheel:
+    table, angles = root.table("wheel"), {}
+    for key, most in ANGLES.items():
+        if key in table:
+            angle = table.number(key, positive=False)
+            if abs(float(angle)) > most:
+                raise table.fail(key, f"must be within ±{most:g} degrees, got {float(angle):g}.")
+            angles[key.removesuffix("_deg")] = jnp.radians(angle)
+    return Wheel(part.centre, part.mass, part.inertia, **angles)
 
 
 def _joint(name: str, table: Reader, bodies: tuple[str, ...], carriers: dict[str, str]) -> Connection:

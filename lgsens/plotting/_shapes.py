@@ -202,7 +202,8 @@ def _box(system: MultibodySystem, body: int, points: np.ndarray, centre: np.ndar
 
 
 def _spin_axis(orientation: np.ndarray, owners, wheel: int) -> np.ndarray:
-    """The axis of the wheel's hinge, in its frame; y of the inertial frame without one.
+    """The axis of the wheel's hinge, in its frame; without one y of its frame, if that points to the left, or of the
+    inertial frame.
 
     A hinge and a sleeve have two orthogonalities, both with their axis in b; no other joint has two.
     """
@@ -211,7 +212,8 @@ def _spin_axis(orientation: np.ndarray, owners, wheel: int) -> np.ndarray:
         if len(elements) == 2 and wheel in (a, b):
             inertial = axis if b == GROUND else orientation[b] @ axis
             return orientation[wheel].T @ inertial
-    return orientation[wheel].T @ np.array([0.0, 1.0, 0.0])
+    left = np.array([0.0, 1.0, 0.0])
+    return left if orientation[wheel][1, 1] > 0.8 else orientation[wheel].T @ left
 
 
 def _circle(axis: np.ndarray, orientation: np.ndarray) -> np.ndarray:

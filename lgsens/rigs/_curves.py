@@ -59,7 +59,7 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import number_field, require
 from lgsens.analysis import Statics
-from lgsens.examples import wheel_plane
+from lgsens.examples import Stance, wheel_plane
 from lgsens.rigs._pads import SIDES, tyre_axes
 from lgsens.rigs._sweeps import RACK
 
@@ -170,13 +170,13 @@ class AxleCurves(NamedTuple):
     anti_squat: Float[Array, " n"] | None = None
 
 
-def axle_curves(found: Statics, centres: Float[Array, "2 3"], vehicle: Vehicle) -> AxleCurves:
+def axle_curves(found: Statics, stances: Stance, vehicle: Vehicle) -> AxleCurves:
     """The outputs of an axle on the rig, without those of single sweeps.
 
     Arguments:
         found: its equilibria, with the responses to the sweep, the left pad, the right pad and, if it has one, the
             rack; the bodies `left_wheel`, `right_wheel`, the forces `left_spring`, `left_damper`, … if there are any.
-        centres: the wheel centres in the reference configuration [m].
+        stances: how the wheels stand in the reference configuration, arrays of shape (2, …).
         vehicle: the car.
     """
     moving = [found.along(i) for i in range(found.responses.v.shape[1])]
@@ -189,7 +189,7 @@ def axle_curves(found: Statics, centres: Float[Array, "2 3"], vehicle: Vehicle) 
     axis_rate = jnp.cross(spin, jnp.broadcast_to(axis[:, None], spin.shape))
     side = jnp.asarray([1.0, -1.0], axis.dtype)
     at, by = jax.vmap(jax.vmap(_wheel, (0, 0, 1, 1, 0, 0)), (0, 0, 0, 0, None, None))(
-        axis, centre, axis_rate, velocity, centres, side
+        axis, centre, axis_rate, velocity, stances, side
     )
     by = jnp.moveaxis(by, 2, 0)  # (r, n, 2, quantities)
     pads = lambda run: -jnp.concatenate([run.multiplier(f"{side}_pad") for side in SIDES], axis=1)
@@ -199,7 +199,7 @@ def axle_curves(found: Statics, centres: Float[Array, "2 3"], vehicle: Vehicle) 
     rates = [curves_of(*one) for one in zip(by, force_by)]
     _, left, right, *rack = rates
     both, against = (jax.tree.map(lambda l, r, sign=sign: sign * l + r, left, right) for sign in (1.0, -1.0))
-    y = centres[None, :, 1] + wheels.contact_y
+    y = stances.contact[None, :, 1] + wheels.contact_y
     difference = lambda of: of[:, 1] - of[:, 0]
     apart, rise = -difference(y), difference(wheels.travel)
     rolling = difference(against.travel) / apart
@@ -239,21 +239,23 @@ def axle_curves(found: Statics, centres: Float[Array, "2 3"], vehicle: Vehicle) 
     steer = rack[0].steer
     ratio = None if vehicle.rack_ratio is None else 1.0 / (vehicle.rack_ratio * jnp.abs(jnp.mean(steer, axis=1)))
     return curves._replace(
-        **_steering_axis(combined(spin), combined(velocity), axis, centre, centres, side),
+        **_steering_axis(combined(spin), combined(velocity), axis, centre, stances.radius, side),
         steer_per_rack=steer,
         steering_ratio=ratio,
     )
 
 
-def of_sweep(curves: AxleCurves, shares: tuple[tuple[str, float], ...], centres, vehicle: Vehicle) -> AxleCurves:
+def of_sweep(
+    curves: AxleCurves, shares: tuple[tuple[str, float], ...], stances: Stance, vehicle: Vehicle
+) -> AxleCurves:
     """The outputs of one sweep, with those that are of its loads; `shares` as in `Sweep`."""
     total = lambda kind: sum(share for name, share in shares if name.endswith(f"_{kind}"))
     force = curves.rates.force
     if lateral := total("lateral"):
-        moment = jnp.sum((centres[None, :, 1] + curves.wheels.contact_y) * force, axis=1)
+        moment = jnp.sum((stances.contact[None, :, 1] + curves.wheels.contact_y) * force, axis=1)
         curves = curves._replace(force_roll_centre_height=-moment / lateral)
     if dict(shares).get(RACK):
-        y = centres[None, :, 1] + curves.wheels.contact_y
+        y = stances.contact[None, :, 1] + curves.wheels.contact_y
         curves = curves._replace(ackermann=_ackermann(curves.wheels.steer, vehicle.wheelbase / (y[:, 0] - y[:, 1])))
     lever = vehicle.wheelbase / vehicle.centre_height
     if braking := total("braking"):
@@ -268,13 +270,12 @@ def of_sweep(curves: AxleCurves, shares: tuple[tuple[str, float], ...], centres,
 _PLACED = WheelCurves._fields[:-1]  # what `_wheel` measures first
 
 
-def _wheel(axis, centre, axis_rates, velocities, origin, side):
+def _wheel(axis, centre, axis_rates, velocities, origin: Stance, side):
     """How one wheel stands, and the height of its contact centre; and the derivatives along each direction."""
 
     def measure(axis, centre):
-        steer, inclination, contact = wheel_plane(axis, centre, origin[2])
-        x, y = contact[0] - origin[0], contact[1] - origin[1]
-        moved = centre - origin
+        steer, inclination, contact = wheel_plane(axis, centre, origin.radius)
+        (x, y, _), moved = contact - origin.contact, centre - origin.centre
         return jnp.stack(
             [moved[2], steer, -side * steer, -side * inclination, x, y, moved[0], moved[1], contact[2]],
         )
@@ -283,13 +284,13 @@ def _wheel(axis, centre, axis_rates, velocities, origin, side):
     return measure(axis, centre), jax.vmap(along)(axis_rates, velocities)
 
 
-def _steering_axis(spin, velocity, axis, centre, centres, side) -> dict[str, Array]:
+def _steering_axis(spin, velocity, axis, centre, radii, side) -> dict[str, Array]:
     """Of the screw with this angular velocity and this velocity of the wheel centre, of each wheel."""
 
-    def one(spin, velocity, axis, centre, origin, side):
+    def one(spin, velocity, axis, centre, radius, side):
         square = jnp.sum(spin * spin)
         direction = spin * jnp.sign(spin[2]) / jnp.sqrt(square)
-        contact = wheel_plane(axis, centre, origin[2]).contact
+        contact = wheel_plane(axis, centre, radius).contact
         on_axis = centre + jnp.cross(spin, velocity) / square
         on_road = on_axis + direction * (contact[2] - on_axis[2]) / direction[2]
         forward, left, _ = tyre_axes(axis).T
@@ -300,7 +301,7 @@ def _steering_axis(spin, velocity, axis, centre, centres, side) -> dict[str, Arr
             "trail": jnp.dot(on_road - contact, forward),
         }
 
-    return jax.vmap(jax.vmap(one), (0, 0, 0, 0, None, None))(spin, velocity, axis, centre, centres, side)
+    return jax.vmap(jax.vmap(one), (0, 0, 0, 0, None, None))(spin, velocity, axis, centre, radii, side)
 
 
 def _ackermann(steer, ratio):

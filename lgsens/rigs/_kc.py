@@ -4,7 +4,6 @@ from collections.abc import Mapping
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -12,7 +11,7 @@ from lgsens._validate import as_float
 from lgsens.analysis import Statics, statics
 from lgsens.model import Model
 from lgsens.rigs._curves import AxleCurves, Vehicle, axle_curves, of_sweep
-from lgsens.rigs._pads import SIDES, on_rig
+from lgsens.rigs._pads import SIDES, on_rig, stances
 from lgsens.rigs._sweeps import LOADS, PADS, RACK, Sweep, path, standard_sweeps
 
 
@@ -50,8 +49,8 @@ def kc(
 
     Arguments:
         model: the axle, `Axle.model(chassis="held")` or any scene with the bodies `left_wheel` and `right_wheel`, each
-            locked to its knuckle, its spin axis along y; the forces `left_spring`, `left_damper`, … for motion ratios,
-            the driver `steering` of its rack, if it has them.
+            locked to its knuckle, its spin axis y of its frame; the forces `left_spring`, `left_damper`, … for motion
+            ratios, the driver `steering` of its rack, if it has them.
         centres: the wheel centres in the reference configuration by side [m], inertial frame, shape (3,), the road at
             z = 0: `Axle.wheel_centres`.
         sweeps: by name; None: all of `standard_sweeps()`, "steering" if there is a rack.
@@ -81,20 +80,19 @@ def kc(
     )
     order = {name: tuple(rows) for name, rows in zip(sweeps, way.order.tolist())}
     vehicle = Vehicle() if vehicle is None else vehicle
-    centre = jnp.stack([places[side] for side in SIDES])
     amplitudes = {name: as_float(sweep.amplitude, (), "`sweeps`") for name, sweep in sweeps.items()}
     shares = {name: tuple(sweep.shares.items()) for name, sweep in sweeps.items()}
-    curves = _curves_jit(found, centre, vehicle, amplitudes, shares, order)
+    curves = _curves_jit(found, stances(model, places), vehicle, amplitudes, shares, order)
     return KC(curves, found, found.result)
 
 
 @eqx.filter_jit
-def _curves_jit(found: Statics, centres, vehicle: Vehicle, amplitudes, shares, order) -> dict[str, AxleCurves]:
-    every = axle_curves(found, centres, vehicle)
+def _curves_jit(found: Statics, stances, vehicle: Vehicle, amplitudes, shares, order) -> dict[str, AxleCurves]:
+    every = axle_curves(found, stances, vehicle)
     curves = {}
     for name, rows in order.items():
         index = np.asarray(rows)
         own = jax.tree.map(lambda leaf, index=index: leaf[index], every)
         value = amplitudes[name] * np.linspace(-1.0, 1.0, len(rows))
-        curves[name] = of_sweep(own._replace(value=value), shares[name], centres, vehicle)
+        curves[name] = of_sweep(own._replace(value=value), shares[name], stances, vehicle)
     return curves

@@ -14,8 +14,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens._validate import number_field, point_field
-from lgsens.examples import LIVE, wheel_plane
+from lgsens._validate import number_field, point_field, require
+from lgsens.examples import LIVE, Stance, wheel_plane
 from lgsens.liegroups import cross
 from lgsens.model import (
     AbstractConstraint,
@@ -25,10 +25,12 @@ from lgsens.model import (
     Attached,
     Frame,
     Model,
+    RigidBody,
     body_fixed,
 )
 
 SIDES = ("left", "right")
+MOST_TURNED = 0.8  # of a spin axis its part along y, at least: no wheel stands by more than 36° otherwise
 # By kind of load its force and moment in tyre axes, and whether it acts at the contact centre or the wheel centre: the
 # moment of a brake is taken up by the knuckle, that of a drive shaft by the chassis, but for that of a live axle.
 KINDS = {
@@ -74,9 +76,8 @@ class Pad(AbstractJoint):
     """A pad under a wheel, level and without friction, which prescribes the height of its contact centre; 1 equation.
 
     Arguments:
-        b: name of the wheel, or of what it is locked to; its spin axis is along y in the reference configuration.
-        at: the wheel centre in the reference configuration [m], inertial frame, shape (3,); its height over z = 0 is
-            the loaded radius.
+        b: name of the wheel, or of what it is locked to; y of its frame is the spin axis, to the left.
+        at: the wheel centre in the reference configuration [m], inertial frame, shape (3,), over the road z = 0.
         displacement: of the contact centre [m], shape (), upward.
 
     The multiplier is the vertical force of the wheel on the pad [N], negative where the pad carries it. Raises
@@ -90,8 +91,9 @@ class Pad(AbstractJoint):
     a: str | None = eqx.field(static=True, default=None, init=False)
 
     def constraints(self, a: Frame, b: Frame):
-        left = b.local_axis(jnp.asarray([0.0, 1.0, 0.0], self.at.dtype))
-        return (ContactHeight(b.local_point(self.at), left, self.at[2], self.displacement),)
+        left = jnp.asarray([0.0, 1.0, 0.0], self.at.dtype)
+        radius = Stance.of(b.axis(left), self.at).radius
+        return (ContactHeight(b.local_point(self.at), left, radius, self.displacement),)
 
 
 class TyreWrench(AbstractLoad):
@@ -122,7 +124,7 @@ class TyreLoad(AbstractForce):
     """A load of a tyre on its wheel, in the tyre axes of ISO 8855, times a factor.
 
     Arguments:
-        wheel: name of the wheel, or of what it is locked to; its spin axis is along y in the reference configuration.
+        wheel: name of the wheel, or of what it is locked to; y of its frame is the spin axis, to the left.
         at: the wheel centre in the reference configuration [m], inertial frame, shape (3,).
         force: in X_T, Y_T and Z_T [N], shape (3,).
         moment: about them [N m], shape (3,).
@@ -149,9 +151,26 @@ class TyreLoad(AbstractForce):
 
     def loads(self, bodies):
         b = bodies[self.wheel].frame
-        left = b.local_axis(jnp.asarray([0.0, 1.0, 0.0], self.at.dtype))
+        left = jnp.asarray([0.0, 1.0, 0.0], self.at.dtype)
         wrench = TyreWrench(b.local_point(self.at), left, self.radius, self.force, self.moment, self.factor)
         return (Attached(wrench, None, self.wheel),)
+
+
+def _stance(name: str, wheel: RigidBody, centre: Float[Array, "3"]) -> Stance:
+    axis = wheel.orientation[:, 1]
+    require(
+        lambda axis: axis[1] > MOST_TURNED,
+        f"`model`: y of the frame of {name!r}, its spin axis, points along {axis}, and must point to the left; give "
+        "the body another `orientation`.",
+        axis,
+    )
+    return Stance.of(axis, centre)
+
+
+def stances(model: Model, centres: Mapping[str, Float[Array, "3"]]) -> Stance:
+    """How the wheels stand in the reference configuration, arrays of shape (2, …), left and right."""
+    both = [_stance(f"{side}_wheel", model.bodies[f"{side}_wheel"], centres[side]) for side in SIDES]
+    return Stance(*(jnp.stack(of) for of in zip(*both)))
 
 
 def on_rig(model: Model, centres: Mapping[str, Float[Array, "3"]]) -> Model:
@@ -160,12 +179,12 @@ def on_rig(model: Model, centres: Mapping[str, Float[Array, "3"]]) -> Model:
     Arguments:
         model: with the bodies `left_wheel` and `right_wheel`, which do not turn in their knuckles, the chassis held.
         centres: the wheel centres in the reference configuration by side [m], inertial frame, shape (3,), the road at
-            z = 0; each wheel's spin axis is along y there.
+            z = 0; each wheel's spin axis is y of its frame.
 
     Lateral, braking and aligning loads act at the contact centre (the brake's moment on the knuckle), traction at the
     wheel centre (that of a drive shaft on the chassis), or at the contact centre where the model has the joint
-    `live_axle`: the final drive is in the axle, which takes up its moment. Raises `ValueError` for a missing wheel, or
-    names that the model has already.
+    `live_axle`: the final drive is in the axle, which takes up its moment. Raises `ValueError` for a missing wheel, one
+    whose y is not to the left, or names that the model has already.
     """
     live = LIVE in model.joints
     joints, forces = {}, {}
@@ -173,9 +192,10 @@ def on_rig(model: Model, centres: Mapping[str, Float[Array, "3"]]) -> Model:
         wheel, centre = f"{side}_wheel", centres[side]
         if wheel not in model.bodies:
             raise ValueError(f"`model`: the rig needs the body {wheel!r}; the bodies are {sorted(model.bodies)}.")
+        stance = _stance(wheel, model.bodies[wheel], centre)
         joints[f"{side}_pad"] = Pad(b=wheel, at=centre)
         for kind, (force, moment, contact) in KINDS.items():
-            radius = centre[2] if contact or live else jnp.zeros_like(centre[2])
+            radius = stance.radius if contact or live else jnp.zeros_like(stance.radius)
             wrench: dict[str, Any] = {"force": force, "moment": moment, "radius": radius}
             forces[f"{side}_{kind}"] = TyreLoad(wheel, at=centre, **wrench)
     if taken := sorted(({*joints} & {*model.joints}) | ({*forces} & {*model.forces})):
