@@ -11,6 +11,8 @@ square, and regular where the equilibrium holds every body: a wheel that turns f
 Path. In one scan each point begins at the one before, moved along its tangent K⁻¹ R_s Δs, with the factors of K there:
 modified Newton, factors renewed when an iteration leaves more than a fifth of the step. Once steps are below √ε, one
 more with new factors ends at round-off, and its factors are those of the tangents: one or two factorizations per point.
+Where that finds nothing, a quarter of the way is tried, from there more, along new tangents: a beam moved along its
+tangent by an angle θ is stretched by θ²/2, and Newton's method is lost where forces of E A θ²/2 make K indefinite.
 
 Responses. To rates s′ along the path (a direction, of which there may be several) the equilibrium answers with
 
@@ -40,6 +42,7 @@ from lgsens.dynamics._kinematics import AbstractDrive
 from lgsens.linear import LU, Inverse, LinearEquations, linear_solve
 
 _MAX_ITERATIONS = 60
+_SHORTER, _LONGER, _LEAST = 0.25, 2.0, 1e-3  # stages of the way to a point after one that failed, or not; the least
 _SLOW = 0.2  # what a chord iteration may leave of a step before factors are renewed
 
 
@@ -60,6 +63,16 @@ class StaticPath(NamedTuple):
     lam_rate: Float[Array, "n r m"]
     found: Bool[Array, " n"]
     pivot: Float[Array, " n"]  # the smallest pivot of the scaled K over the largest: 0 where it is singular
+
+
+class _Begin(NamedTuple):
+    """A point of the path and its tangent to the next one, from which that is sought."""
+
+    s: Float[Array, " d"]
+    q: Any
+    lam: Float[Array, " m"]
+    w: Float[Array, " k"]
+    lam_rate: Float[Array, " m"]
 
 
 class _Factors(NamedTuple):
@@ -113,8 +126,6 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
     begins = jnp.zeros(n, bool).at[jnp.asarray((0, *starts))].set(True)
     ahead = jnp.concatenate([values[1:] - values[:-1], jnp.zeros_like(values[:1])])
     ahead = jnp.where(jnp.roll(begins, -1)[:, None], 0.0, ahead)
-    # The last direction is that to the next point.
-    rates = jnp.concatenate([rates, ahead[:, None]], axis=1)
 
     def factorize(s, q, lam):
         matrix, units = _matrix(drive, s, q, lam, t)
@@ -136,8 +147,8 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
             return q, lam, factors, small | (left > _SLOW * size), left, iteration + 1, small & stale
 
         def unfinished(carry):
-            *_, iteration, done = carry
-            return ~done & (iteration < _MAX_ITERATIONS)
+            *_, left, iteration, done = carry
+            return ~done & (iteration < _MAX_ITERATIONS) & ~jnp.isnan(left)
 
         start = (q, lam, factors, stale, jnp.full((), jnp.inf, dtype), jnp.zeros((), jnp.int32), jnp.zeros((), bool))
         q, lam, factors, *_, done = while_loop(unfinished, body, start)
@@ -154,22 +165,44 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
 
     def follow(carry, row):
         home, before, factors, held = carry
-        s, rates, begins, first = row
-        q, lam = jax.tree.map(lambda far, near: jnp.where(begins, far, near), home, before)
-        q, lam, factors, done = newton(s, q, lam, factors, begins | ~held)
-        w, lam_rate = respond(s, rates, q, lam, factors)
-        keep = lambda new, old: jnp.where(done, new, old)
-        after = jax.tree.map(keep, move(q, lam, w[-1], lam_rate[-1]), before)
-        home = jax.tree.map(lambda new, old: jnp.where(first & done, new, old), (q, lam), home)
+        s, rates, ahead, begins, first = row
+        near = jax.tree.map(lambda far, near: jnp.where(begins, far, near), home, before)
+        way = s - near.s
+
+        def stage(carry):
+            near, factors, stale, reached, size, *_ = carry
+            to = jnp.minimum(reached + size, 1.0)
+            at, share = s - (1.0 - to) * way, to - reached
+            q, lam = move(near.q, near.lam, share * near.w, share * near.lam_rate)
+            q, lam, factors, done = newton(at, q, lam, factors, stale)
+            # The last direction is that onward.
+            along = jnp.concatenate([rates, jnp.where(to < 1.0, way, ahead)[None]])
+            w, lam_rate = respond(at, along, q, lam, factors)
+            keep = lambda new, old: jnp.where(done, new, old)
+            near = jax.tree.map(keep, _Begin(at, q, lam, w[-1], lam_rate[-1]), near)
+            size = jnp.where(done, _LONGER, _SHORTER) * share
+            return near, factors, ~done, keep(to, reached), size, w[:-1], lam_rate[:-1]
+
+        def unfinished(carry):
+            _, _, _, reached, size, *_ = carry
+            return (reached < 1.0) & (size > jnp.where(first, 0.5, _LEAST))  # the first point has no way to it
+
+        none, one = jnp.zeros((), dtype), jnp.ones((), dtype)
+        answers = jnp.zeros((len(rates), k), dtype), jnp.zeros((len(rates), m), dtype)
+        stages = near, factors, begins | ~held, none, one, *answers
+        near, factors, _, reached, _, w, lam_rate = while_loop(unfinished, stage, stages)
+        done = reached == 1.0
+        home = jax.tree.map(lambda new, old: jnp.where(first & done, new, old), near, home)
+        home = home._replace(w=jnp.zeros_like(home.w), lam_rate=jnp.zeros_like(home.lam_rate))
         pivots = jnp.abs(jnp.diagonal(factors.lu.lu))
         ended = done.astype(dtype), jnp.min(pivots) / jnp.max(pivots)
-        return (home, after, factors, done), (q, lam, w[:-1], lam_rate[:-1], *ended)
+        return (home, near, factors, done), (near.q, near.lam, w, lam_rate, *ended)
 
     whole = jnp.arange(k + m, dtype=jnp.int32)
-    start = home, jnp.zeros(m, dtype)
+    start = _Begin(values[0], home, jnp.zeros(m, dtype), jnp.zeros(k, dtype), jnp.zeros(m, dtype))
     none = LU(jnp.zeros((k + m, k + m), dtype), whole, whole)
     factors = _Factors(none, jnp.ones(k, dtype), jnp.ones((), dtype))
-    rows = values, rates, begins, jnp.arange(n) == 0
+    rows = values, rates, ahead, begins, jnp.arange(n) == 0
     return scan(follow, (start, start, factors, jnp.zeros((), bool)), rows)[1]
 
 

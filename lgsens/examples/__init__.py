@@ -10,6 +10,7 @@ from lgsens.examples._hardpoint_file import (
     suspension_document as suspension_document,
 )
 from lgsens.examples._identification import AccelerationTest as AccelerationTest
+from lgsens.examples._leaf_pack import LeafPack as LeafPack
 from lgsens.examples._leaf_spring import leaf_spring as leaf_spring
 from lgsens.examples._link_beam import SectionShape as SectionShape
 from lgsens.examples._mechanisms import (
@@ -28,7 +29,6 @@ from lgsens.examples._problems import (
 )
 from lgsens.examples._quarter_car import (
     QuarterCar as QuarterCar,
-    RoadResponse as RoadResponse,
     stiff_quarter_car as stiff_quarter_car,
 )
 from lgsens.examples._quarter_car_design import (
@@ -38,6 +38,7 @@ from lgsens.examples._quarter_car_design import (
     SuspensionDesign as SuspensionDesign,
 )
 from lgsens.examples._road_limits import RoadLimits as RoadLimits
+from lgsens.examples._road_response import RoadResponse as RoadResponse
 from lgsens.examples._solid_axle import LIVE as LIVE, SolidAxle as SolidAxle
 from lgsens.examples._suspension_curves import SuspensionCurves as SuspensionCurves
 from lgsens.examples._tops import (

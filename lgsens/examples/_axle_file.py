@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from lgsens._validate import as_float
 from lgsens.examples._axle_parts import ALONG_Y, CURVED, CURVES, RATES, Bar, Mount, Rack, Stop
-from lgsens.examples._corner_scene import connections
+from lgsens.examples._corner_scene import connections, joints_of
 from lgsens.examples._hardpoint_file import Reader
 from lgsens.examples._link_beam import read_beam
 from lgsens.examples._link_file import CARRIERS, carried, read_link
@@ -111,7 +111,7 @@ def axle_members(root: Reader, kilogram: float, corner: Any) -> dict[str, Any]:
     """The fields of an `Axle`, of which this is a corner, a `QuarterCar`; the one on the left is on the file's side."""
     found: dict[str, Any] = {"left": corner}
     if BODY in root:
-        known = connections(corner.links, corner.joints, dict(corner.carriers))
+        known = connections(corner.links, joints_of(corner), dict(corner.carriers))
         found[BODY] = solid_axle(root, kilogram, (), known)
         found["left"] = corner = found[BODY].freed(corner)
     links = corner.links

@@ -41,7 +41,7 @@ def places(axle: Axle) -> dict[str, list[Place]]:
     for i, (path, leaf) in enumerate(jax.tree_util.tree_leaves_with_path(axle)):
         names = [str(getattr(entry, "name", getattr(entry, "key", ""))) for entry in path]
         names = names[1:] if names[0] == "left" else names
-        if names[0] not in ("links", "joints", "spring", "damper", "twist_beam", "solid_axle", *_TABLES):
+        if names[0] not in ("links", "joints", "spring", "damper", "twist_beam", "solid_axle", "leaf_spring", *_TABLES):
             continue
         is_point = "ends" in names or names[-1] in _AT
         if is_point or (names[-1] in _POSITIVE and np.all(np.asarray(leaf) > 0)):

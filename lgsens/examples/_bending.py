@@ -58,7 +58,9 @@ def _carried_by(car: Any, link: str, drop_link: Mapping[str, Array]) -> dict[str
     for name, connection in connections(car.links, car.joints, {}).items():
         if link in connection.between and f"joints.{name}" not in found:
             found[f"joints.{name}"] = connection.at if connection.at.ndim == 1 else jnp.mean(connection.at, axis=0)
-    acting = {"spring": car.spring.ends, "damper": car.damper.ends, "drop_link": drop_link}
+    acting = {"damper": car.damper.ends, "drop_link": drop_link} | (
+        {} if car.spring is None else {"spring": car.spring.ends}
+    )
     acting |= {key: stop.ends for key, stop in car.stops.items()}
     return found | {key: of[link] for key, of in acting.items() if link in of}
 

@@ -30,6 +30,11 @@ class CornerScene(NamedTuple):
     given: dict[str, AbstractForce]
 
 
+def joints_of(car: Any) -> dict[str, Connection]:
+    """The joints of a corner but for those of its links: those that it has by name, and of its leaf spring."""
+    return car.joints if car.leaf_spring is None else {**car.joints, **car.leaf_spring.connections()}
+
+
 def connections(
     links: Mapping[str, Link], joints: Mapping[str, Connection], carriers: Mapping[str, str]
 ) -> dict[str, Connection]:
@@ -80,18 +85,19 @@ def corner_scene(
         """By a joint, which has its carrier."""
         return lambda body: body if body in SHARED else node(f"joints.{name}", body)
 
-    joined = connections(car.links, car.joints, carriers)
-    struts = {"spring": car.spring, "damper": car.damper}
+    leaf, own_joints = car.leaf_spring, joints_of(car)
+    joined = connections(car.links, own_joints, carriers)
+    struts = {"damper": car.damper} | ({"spring": car.spring} if leaf is None else {})
     busy = {*held, *(end for link in car.links.values() for end in link.ends)}
     busy |= {end for acting in (*struts.values(), *car.stops.values()) for end in acting.ends}
-    busy |= {end for name, c in joined.items() if name in car.joints or name in mounts for end in c.between}
+    busy |= {end for name, c in joined.items() if name in own_joints or name in mounts for end in c.between}
     beams = {name: link.bent(own + name) for name, link in car.links.items() if link.beam is not None}
     rods = {name: link for name, link in car.links.items() if links == "rods" and link.is_bar and name not in busy}
     rods = {name: link for name, link in rods.items() if not {*link.ends} & {*beams}}
     parts = {"knuckle": car.knuckle, "wheel": car.wheel}
     parts |= {name: link.part(car.link_radius) for name, link in car.links.items() if name not in (*rods, *beams)}
     ends: dict[str, list[tuple[Array, Array]]] = {}
-    joints, forces, sought, given = {}, {}, [own + "spring"], {}
+    joints, forces, sought, given = {}, {}, [own + "spring"] if leaf is None else [], {}
     hub: dict[str, Any] = {"at": car.wheel.on_axis(car.bearing)}
     hub |= {"axis": car.wheel.spin_axis} if wheel == "hinged" else {}
     joints[f"{own}hub"] = (RevoluteJoint if hub.keys() > {"at"} else FixedJoint)(own + "knuckle", own + "wheel", **hub)
@@ -116,6 +122,9 @@ def corner_scene(
     bodies = {own + name: part.body(ends.pop(own + name, ())) for name, part in parts.items()}
     for beam in beams.values():
         bodies, forces, sought = bodies | beam.bodies, forces | beam.forces, [*sought, *beam.forces]
+    if leaf is not None:
+        of_leaf, elements = leaf.parts(own)
+        bodies, forces, sought = bodies | of_leaf, forces | elements, [*sought, *elements]
     forces |= {own + key: strut.element(key, named=named(key)) for key, strut in struts.items()}
     forces |= {own + key: stop.element(named(key)) for key, stop in car.stops.items()}
     return CornerScene(bodies, joints, forces, ends, sought, given)

@@ -118,7 +118,7 @@ class Velocities:
 
     def rows(self, joints: Iterable[Connection]) -> np.ndarray:
         """What the joints say."""
-        found = []
+        found = [np.zeros((0, self.unknowns))]
         for joint in joints:
             at, turning, moving = joint.blocked()
             turning = turning / np.linalg.norm(turning, axis=1, keepdims=True)

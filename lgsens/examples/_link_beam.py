@@ -108,6 +108,17 @@ def nearest(
     return tuple((key, int(np.clip(np.rint(elements * share(at)), 0, elements))) for key, at in sorted(points.items()))
 
 
+def read_material(table: Reader) -> dict[str, Array]:
+    """Young's modulus, Poisson's ratio and density."""
+    material = {name: table.number(name, positive=name != "poisson") for name in MATERIAL}
+    if not (young := float(material["young"])) >= LEAST_YOUNG:
+        raise table.fail(
+            "young",
+            f"is in N/m², and {young:g} is less than that of rubber, {LEAST_YOUNG:g}; did you mean {1e6 * young:g}?",
+        )
+    return material
+
+
 def read_beam(table: Reader, instead: tuple[str, ...], shapes: tuple[str, ...] = (*SHAPES, GENERAL)) -> LinkBeam:
     """The table `beam`; mass and stiffness follow from it, so that it stands for the keys `instead`."""
     key = "beam"
@@ -133,14 +144,7 @@ def read_beam(table: Reader, instead: tuple[str, ...], shapes: tuple[str, ...] =
     else:
         dimensions.only(SHAPES[kind])
         shape = {kind: {name: dimensions.metres(name, 0.5) for name in SHAPES[kind]}}
-        material = {name: beam.number(name, positive=name != "poisson") for name in MATERIAL}
-        if not float(material["young"]) >= LEAST_YOUNG:
-            raise beam.fail(
-                "young",
-                f"is in N/m², and {float(material['young']):g} is less than that of rubber, {LEAST_YOUNG:g}; did you "
-                f"mean {1e6 * float(material['young']):g}?",
-            )
-        of = partial(SectionShape, shape, material | damping)
+        of = partial(SectionShape, shape, read_material(beam) | damping)
     try:
         return LinkBeam(of(), elements, up)
     except ValueError as error:

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,14 +11,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, suggestion
-from lgsens.analysis import FrequencyWeighting, Kinematics, kinematics, linearize, random_road
+from lgsens.analysis import Kinematics, kinematics
 from lgsens.examples._axle_parts import Mount, Stop
 from lgsens.examples._bending import bending, rigid, with_nodes
 from lgsens.examples._corner_check import GRAVITY, check_corner
-from lgsens.examples._corner_scene import corner_scene
+from lgsens.examples._corner_scene import corner_scene, joints_of
 from lgsens.examples._file_axes import FileAxes
 from lgsens.examples._hardpoint_file import read
+from lgsens.examples._leaf_pack import LeafPack
 from lgsens.examples._link_beam import ELEMENTS, SectionShape
+from lgsens.examples._road_response import RoadResponse, road_response
 from lgsens.examples._suspension_curves import SuspensionCurves, suspension_curves
 from lgsens.examples._suspension_file import members
 from lgsens.examples._suspension_parts import (
@@ -48,20 +50,6 @@ from lgsens.model import (
 ALONG_Z: Any = (0.0, 0.0, 1.0)
 
 
-class RoadResponse(NamedTuple):
-    """A quarter-car on a random road: standard deviations (RMS about the equilibrium), shape () each.
-
-    Attributes:
-        acceleration: of the chassis, vertical [m/s²], weighted by frequency.
-        tyre: of the load of the tyre [N].
-        travel: of the centre of the wheel to the chassis, vertical [m].
-    """
-
-    acceleration: Float[Array, ""]
-    tyre: Float[Array, ""]
-    travel: Float[Array, ""]
-
-
 class QuarterCar(eqx.Module):
     """A quarter-car with any independent suspension: its data, all numbers leaves. `QuarterCar.load()` reads them.
 
@@ -81,7 +69,7 @@ class QuarterCar(eqx.Module):
     wheel: Wheel
     chassis: Part
     bearing: Float[Array, "3"]
-    spring: Strut
+    spring: Strut | None
     damper: Strut
     tyre_stiffness: Float[Array, ""]
     link_radius: Float[Array, ""] | None
@@ -91,6 +79,7 @@ class QuarterCar(eqx.Module):
     stops: dict[str, Stop] = eqx.field(default_factory=dict)
     carriers: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())  # what holds on to subframe or rack
     axes: FileAxes = eqx.field(static=True, default=FileAxes())
+    leaf_spring: LeafPack | None = None  # in place of a spring, of half of a solid axle
 
     @staticmethod
     def load(path: str | Path | None = None) -> "QuarterCar":
@@ -160,8 +149,8 @@ class QuarterCar(eqx.Module):
     def on_chassis(self) -> dict[str, Array]:
         """By link or joint, in order, the points at which it holds on to the chassis [m], shape (3,) or (2, 3)."""
         links = {name: link.chassis for name, link in sorted(self.links.items()) if "chassis" in link.ends}
-        joints = {name: c.at for name, c in sorted(self.joints.items()) if "chassis" in c.between}
-        return links | {name: at for name, at in joints.items() if self.joints[name].kind != PLANAR}
+        joints = {name: c for name, c in sorted(joints_of(self).items()) if "chassis" in c.between}
+        return links | {name: joint.at for name, joint in joints.items() if joint.kind != PLANAR}
 
     @property
     def hardpoints(self) -> Float[Array, "n 3"]:
@@ -176,8 +165,9 @@ class QuarterCar(eqx.Module):
     @property
     def mass(self) -> Float[Array, ""]:
         """Of all bodies [kg]."""
-        links = [link.own_mass for link in self.links.values()]
-        return jnp.sum(jnp.stack([self.chassis.mass, self.knuckle.mass, self.wheel.mass, *links]))
+        own = [link.own_mass for link in self.links.values()]
+        own += [] if self.leaf_spring is None else [self.leaf_spring.own_mass]
+        return jnp.sum(jnp.stack([self.chassis.mass, self.knuckle.mass, self.wheel.mass, *own]))
 
     def with_values(self, *, stiffness=None, damping=None, bump_height=None, hardpoints=None) -> "QuarterCar":
         """The car with some numbers replaced; None: it keeps its own.
@@ -187,9 +177,12 @@ class QuarterCar(eqx.Module):
                 position and at rest, with which the curves grow; and of the bump [m], shape ().
             hardpoints: as the property [m], shape (n, 3).
 
-        Raises `ValueError` for other shapes.
+        Raises `ValueError` for other shapes, and a stiffness where there are leaf springs.
         """
-        where = lambda car: [car.spring.rate, car.damper.rate, car.bump_height, *car.on_chassis.values()]
+        if self.spring is None and stiffness is not None:
+            raise ValueError("`stiffness`: the car is on leaf springs; what they are made of is in `leaf_spring`.")
+        rate = lambda car: car.bump_duration if car.spring is None else car.spring.rate  # stands for one
+        where = lambda car: [rate(car), car.damper.rate, car.bump_height, *car.on_chassis.values()]
         olds = where(self)
         points: list[Any] = [None] * (len(olds) - 3)
         if hardpoints is not None:
@@ -260,6 +253,8 @@ class QuarterCar(eqx.Module):
         called = {f"{name}_knuckle": f"{name}_bushing" for name in bushings}
         forces = {called.get(name, name): force for name, force in forces.items()}
         if free_length is not None:
+            if self.spring is None:
+                raise ValueError("`free_length` is of a spring, and the car is on leaf springs; leave it out, None.")
             forces["spring"] = self.spring.element("spring", free_length, lambda body: self.scene_name(body, "spring"))
         model = Model(bodies, joints, forces)
         if free_length is not None:
@@ -278,8 +273,13 @@ class QuarterCar(eqx.Module):
             throw: as in `lgsens.kinematics`.
 
         Velocities and rates are derivatives by the travel. The forces are not those of the car: its spring has no
-        preload here. Raises `ValueError` for travel that the links do not allow.
+        preload here. Raises `ValueError` for travel that the links do not allow, and on leaf springs.
         """
+        if self.leaf_spring is not None:
+            raise ValueError(
+                f"Suspension {self.name!r} is guided by leaf springs, which bend as it travels: take the rig, "
+                "`rigs.kc` or `lgsens kc`."
+            )
         # Lengths that are given need no preload to be found.
         scene = self.rigid().model(wheel="locked", chassis="heave", links=links, free_length=1.0, free_radius=1.0)
         driver = TranslationDriver(None, "wheel", at=self.wheel.centre, axis=ALONG_Z)
@@ -314,20 +314,7 @@ class QuarterCar(eqx.Module):
         every number of the car, by the adjoint Lyapunov equation. Raises `ValueError` as `lgsens.random_road`. Source:
         `lgsens.random_road`.
         """
-        linear = linearize(self.model(wheel="locked", chassis="heave"), inputs=("tyre",), outputs=_ON_ROAD)
-        weighted = {} if weighting is None else {"acceleration": FrequencyWeighting(weighting)}
-        return RoadResponse(**random_road(linear, roughness=roughness, speed=speed, weighting=weighted))
-
-
-def _travel(instant) -> Float[Array, ""]:
-    return instant.body("wheel").position[2] - instant.body("chassis").position[2]
-
-
-_ON_ROAD = {
-    "acceleration": lambda instant: instant.body("chassis").acceleration[2],
-    "tyre": lambda instant: instant.force("tyre"),
-    "travel": _travel,
-}
+        return road_response(self, roughness=roughness, speed=speed, weighting=weighting)
 
 
 def stiff_quarter_car(car: QuarterCar, *, wheel: str = "locked", **settings: Any) -> Model:

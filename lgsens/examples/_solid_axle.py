@@ -139,9 +139,12 @@ class SolidAxle(eqx.Module):
                 f"design position (condition {condition:.0e}). Is there one across the car? Else move a hardpoint, or "
                 "put bushings (`bushings.NAME`) in place of joints."
             )
+        leaves = [car for car in cars.values() if car.leaf_spring is not None]
+        for car in leaves:
+            check_springs(car, name, 1.0)
         if soft:  # springs are looked at on ball joints, where these do not bind
             rigid, joined, _ = self._velocities(cars, compliant=False)
-            if rigid.unknowns - len(joined) == 2:
+            if not leaves and rigid.unknowns - len(joined) == 2:
                 self.check(name, cars, compliant=False)
             return
         twists = np.linalg.solve(matrix, np.append(np.zeros(len(matrix) - 1), 1.0))
@@ -151,8 +154,10 @@ class SolidAxle(eqx.Module):
             check_springs(car, name, ratios["spring"])
 
     def _velocities(self, cars: Mapping[str, Any], compliant: bool) -> tuple[Velocities, np.ndarray, bool]:
-        """The axle and all links, the rows of their joints, and whether bushings take the place of some."""
-        every, bodies, soft = [], [BODY, *self.links], False
+        """The axle and all links, the rows of their joints, and whether bushings take the place of some, or leaf
+        springs of all that the axle needs."""
+        every, bodies = [], [BODY, *self.links]
+        soft = any(car.leaf_spring is not None for car in cars.values())
         for side, car in cars.items():
             named = _on_side(side, car)
             bodies += [named(link) for link in car.links]

@@ -55,6 +55,12 @@ Of an axle; points (of the side of the file) and masses are in `units` here as w
     [solid_axle.links.NAME]  as links.NAME, those that the axle has once: a Panhard rod, an upper link in the middle,
                    what a Watt's linkage is made of; their bodies are `chassis`, `subframe`, `solid_axle` and each
                    other, and bushings may replace their joints NAME_BODY
+    [leaf_spring]  in place of `spring`, of a solid axle: front, rear: its eyes, front on the chassis; seat: where it is
+                   clamped to the axle; shackle: where that of the rear eye is pinned to the chassis, all pins along y;
+                   width, thickness of a leaf [m]; leaves, and full_length, how many of them go from eye to eye (left
+                   out: 1); young, poisson, density, damping as of a beam; shackle_mass; elements of either half (left
+                   out: 4); bushings may replace leaf_spring_front, leaf_spring_seat, leaf_spring_rear,
+                   leaf_spring_shackle; see `LeafPack`
     [anti_roll_bar.bushing]  the keys of a bushing: of the bearings of such a bar, left out: ball joints
     [bushings.NAME]  in place of the joint NAME, LINK_BODY of a link: stiffness, rotational_stiffness [N/m], [N m/rad],
                    damping, rotational_damping (left out: none), three numbers, or two times three of the two
@@ -84,15 +90,18 @@ from lgsens.examples._axle_file import OF_AXLE, levelled, mounts, solid_axle, st
 from lgsens.examples._corner_scene import connections
 from lgsens.examples._file_axes import FileAxes
 from lgsens.examples._hardpoint_file import Reader
+from lgsens.examples._leaf_pack import SHACKLE, TABLE as LEAF, LeafPack, read_leaf_spring
 from lgsens.examples._link_file import CARRIERS, OF_LINK, carried, read_link
+from lgsens.examples._solid_axle import BODY
 from lgsens.examples._suspension_parts import ALONG_A_LINE, AT_A_POINT, Connection, Part, Strut
 from lgsens.examples._wheel import Wheel
 from lgsens.model import Sampled
 
 LEAST_RADIUS, LARGEST_RADIUS = 0.1, 2.0  # m, loaded radii of tyres
 PARTS = ("chassis", "knuckle", "wheel", *CARRIERS, "anti_roll_bar", "drop_link", "twist_beam", "solid_axle")
+PARTS += (LEAF, SHACKLE)
 TABLES = ("name", "units", "road", "links", "joints", "chassis", "knuckle", "wheel", "spring", "damper", "tyre")
-TABLES += ("link_section", "bump", "design")
+TABLES += ("link_section", "bump", "design", LEAF)
 OF_TABLES = {"tyre": ("stiffness",), "bump": ("height", "duration"), "link_section": ("radius",)}
 RATES = {"spring": "stiffness", "damper": "damping"}
 ANGLES = {"camber_deg": 20.0, "toe_deg": 5.0}  # how large they may be [degree]
@@ -122,7 +131,10 @@ def members(document: dict, path: str) -> dict[str, Any]:
     carriers: dict[str, str] = {}
     links = {name: read_link(name, table, bodies, kilogram, carriers) for name, table in tables.items()}
     joints = {name: _joint(name, table, bodies, carriers) for name, table in root.tables("joints").items()}
-    solid = solid_axle(root, kilogram, (*PARTS, *OF_LINK, *links, *joints), connections(links, joints, carriers))
+    leaf = _leaf_spring(root, kilogram)
+    of_leaf = {} if leaf is None else leaf.connections()
+    known = connections(links, {**joints, **of_leaf}, carriers)
+    solid = solid_axle(root, kilogram, (*PARTS, *OF_LINK, *links, *joints), known)
     joints = levelled(root, links, joints)
     taken = {*OF_MODEL, *links, *(f"{name}_{body}" for name, link in links.items() for body in link.ends)}
     for name in sorted(taken & set(joints)):
@@ -149,10 +161,12 @@ def members(document: dict, path: str) -> dict[str, Any]:
         if key in root:
             root.table(key).only(keys)
     bump = root.table("bump")
-    struts = {key: _strut(key, root.table(key), bodies, rate, carriers) for key, rate in RATES.items()}
+    of_corner = {key: rate for key, rate in RATES.items() if leaf is None or key != "spring"}
+    struts = {key: _strut(key, root.table(key), bodies, rate, carriers) for key, rate in of_corner.items()}
     root.only((*TABLES, *OF_AXLE))  # after what is missing: a table that is spelled wrong is both
     stops = {key: stop(root.table(key), key, bodies, struts["damper"], carriers) for key in STOPS if key in root}
-    held = {"links": links, "joints": joints, "mounts": mounts(root, links, joints, carriers, solid)}
+    bushings = mounts(root, links, {**joints, **of_leaf}, carriers, solid)
+    held = {"links": links, "joints": joints, "mounts": bushings}
     if solid is not None:
         held = solid.more(wheel.centre, **held)
         carriers |= dict(solid.carriers)
@@ -163,7 +177,8 @@ def members(document: dict, path: str) -> dict[str, Any]:
         "wheel": wheel,
         "chassis": part("chassis", "centre_of_mass"),
         "bearing": root.table("wheel").point("bearing"),
-        **struts,
+        **({"spring": None} | struts),
+        "leaf_spring": leaf,
         "tyre_stiffness": root.table("tyre").number("stiffness"),
         "link_radius": root.table("link_section").number("radius") if bars else None,
         "bump_height": bump.metres("height", 1.0, positive=False),
@@ -183,6 +198,16 @@ def _wheel(root: Reader, part: Part) -> Wheel:
                 raise table.fail(key, f"must be within ±{most:g} degrees, got {float(angle):g}.")
             angles[key.removesuffix("_deg")] = jnp.radians(angle)
     return Wheel(part.centre, part.mass, part.inertia, **angles)
+
+
+def _leaf_spring(root: Reader, kilogram: float) -> LeafPack | None:
+    if LEAF not in root:
+        return None
+    if "spring" in root:
+        raise root.fail("spring", f"the axle is on leaf springs, `{LEAF}`; leave one of the two out.")
+    if BODY not in root:
+        raise root.fail(LEAF, f"bears and guides a solid axle; give the table `{BODY}`, empty if it has no links.")
+    return read_leaf_spring(root.table(LEAF), kilogram)
 
 
 def _joint(name: str, table: Reader, bodies: tuple[str, ...], carriers: dict[str, str]) -> Connection:
