@@ -214,7 +214,7 @@ def test_preloads_of_rods_and_curves(load):
 
 
 def test_shipped_suspensions():
-    assert shipped() == [*sorted((*SCENES, "five_link_suspension", "solid_axle", "twist_beam"))]
+    assert shipped() == [*sorted((*SCENES, "five_link_suspension", "leaf_springs", "solid_axle", "twist_beam"))]
     five = QuarterCar.load("quarter-car")
     assert jax.tree.all(jax.tree.map(np.array_equal, five, QuarterCar.load()))
 

@@ -72,7 +72,7 @@ class LeafPack(eqx.Module):
 
         def half(eye):
             along = jnp.dot(eye - seat, tangent) * tangent
-            return seat + share * along + share**2 * (eye - seat - along)
+            return (seat[None] + share * along[None]) + share**2 * (eye - seat - along)[None]
 
         return jnp.concatenate([half(self.ends[FRONT])[::-1], seat[None], half(self.ends[REAR])])
 

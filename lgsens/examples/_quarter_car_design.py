@@ -156,7 +156,13 @@ class SuspensionDesign(eqx.Module):
         Raises `ValueError` naming the file and the key for a file that cannot be read, is incomplete, or
         starts outside its own bounds.
         """
-        car, limits = QuarterCar.load(path), DesignLimits.load(path)
+        car = QuarterCar.load(path)
+        if car.spring is None:
+            raise ValueError(
+                f"Suspension {car.name!r} is on leaf springs, and the design problem looks at the length of a spring: "
+                "take that of an axle, `rigs.AxleDesign` or `lgsens optimize FILE --vary …`."
+            )
+        limits = DesignLimits.load(path)
         for key, value in (("stiffness", car.spring.rate), ("damping", car.damper.rate)):
             lower, upper = map(float, getattr(limits, key))
             if not lower <= float(value) <= upper:
