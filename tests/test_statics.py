@@ -211,3 +211,18 @@ def test_points_that_start_anew_are_told_from_the_first():
     np.testing.assert_allclose(-found.multiplier("drive")[:, 0], 2.0 * angles, atol=1e-11)  # round-off of Newton
     with pytest.raises(lg.SimulationError, match=says("passes half a turn", "before position 3")):
         lg.statics(model, driven={"drive": angles})
+
+
+@pytest.mark.parametrize("thickness", [0.01, 1e-4])
+def test_a_beam_that_is_bent_by_three_radians_at_once(thickness):
+    """To an arc, of which the end is known; along the tangent it would be stretched by half of its length."""
+    section = lg.BeamSection.rectangle(0.03, thickness, young=2.1e11, poisson=0.3, density=7850.0)
+    beam = lg.Beam("beam", section, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], elements=8)
+    joints = {
+        "clamp": lg.FixedJoint(None, "beam.0", at=(0.0, 0.0, 0.0)),
+        "turn": lg.RotationDriver(None, "beam.8", axis=(0.0, 1.0, 0.0)),
+    }
+    found = lg.statics(lg.Model(beam.bodies, joints, beam.forces), {"turn": [0.0, 3.0]})
+    end = np.array([np.sin(3.0), 0.0, np.cos(3.0) - 1.0]) / 3.0
+    # exact for any number of elements; of round-off 1e-16 times the condition, EA L²/EI of 1e9
+    np.testing.assert_allclose(found.body("beam.8").position[1], end, rtol=0, atol=1e-7)

@@ -1,6 +1,7 @@
 """The axle of `lgsens optimize FILE --vary … --keep …`: designed to bands of what the rig says, over the bump."""
 
 import argparse
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -116,7 +117,8 @@ class Outcome(NamedTuple):
                 if kind == "hardpoints":
                     rows.append(point_row(name, *(1e3 * end for end in (before, after, lower, upper))))
                 else:
-                    rows.append((name, before, after, f"{lower:.6g} .. {upper:.6g}", 3 if before < 1e3 else 0))
+                    digits = max(0, 3 - math.floor(math.log10(before)))  # four that count
+                    rows.append((name, before, after, f"{lower:.6g} .. {upper:.6g}", digits))
         return table_lines(found, rows + closing_rows(found))
 
 
