@@ -52,12 +52,13 @@ def test_an_axle_with_other_numbers_is_a_file(name, load):
     moved = {
         "hardpoints": x["hardpoints"] + 1e-4 * rng.normal(size=x["hardpoints"].shape),
         "rates": x["rates"] * (1 + 1e-3 * rng.normal(size=x["rates"].shape)),
+        "angles": x["angles"] + 0.1 * rng.normal(size=x["angles"].shape),
     }
     close(load(numbers.document(document, axle, moved), Axle), numbers.replaced(axle, moved))
     close(numbers.replaced(axle, x), axle)
 
 
-@pytest.mark.parametrize("name", [*shipped(), CURVED])
+@pytest.mark.parametrize("name", [name for name in (*shipped(), CURVED) if name != "leaf_springs"])
 def test_a_corner_with_another_design_is_a_file(name, load):
     document = document_of(name)
     load(document, QuarterCar)  # writes it

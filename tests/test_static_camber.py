@@ -13,11 +13,14 @@ from small_axle import POINTS, small_axle
 from test_rigs import ARM, STANDARD, trailing_arms
 from test_suspension_curves import Closure, differences
 
+import lgsens as lg
 from lgsens import rigs
 from lgsens.examples import Axle, AxleNumbers, QuarterCar, suspension_document
+from lgsens.plotting._shapes import placed, shapes
 
 CAMBER, TOE = -0.03, 0.005  # rad
 TRAVEL = np.array([-0.06, 0.0, 0.05])
+SIDES = {"left": 1.0, "right": -1.0}
 
 
 def spin_axis(side, camber, toe):
@@ -114,9 +117,10 @@ def turned(model, axes):
     return eqx.tree_at(lambda model: model.bodies, model, bodies)
 
 
-AXES = {"left": spin_axis(1.0, CAMBER, TOE), "right": spin_axis(-1.0, CAMBER, TOE)}
+AXES = {side: spin_axis(sign, CAMBER, TOE) for side, sign in SIDES.items()}
 
 
+@pytest.mark.slow  # the roll angle, and contact centres that are not below wheel centres, are in the tests after it
 def test_trailing_arms_in_closed_form():
     """The pads are under contact centres that are not below the wheel centres; forces at both are the same to a hinge
     along y, whose arm turns the wheel about y: e by the angle of the arm, P in the plane of the wheel."""
@@ -133,10 +137,12 @@ def test_trailing_arms_in_closed_form():
     curves = test.sweeps["opposite"]
     middle = jax.tree.map(lambda leaf: leaf[1], curves)
     np.testing.assert_allclose(middle.wheels.contact_y, 0.0, atol=1e-15)
-    # A pad lifts its contact centre, which is by `back` off the wheel centre, and that by the share of the arm: its
-    # force has the longer lever, and rolls by 1/half per lift of one pad, the other one lowered.
-    force = (rate + bar) * ARM["length"] / (ARM["length"] + back)
-    np.testing.assert_allclose(middle.roll_rate, 2 * half**2 * force, rtol=1e-8)
+    # A pad lifts its contact centre, which is by `back` off the wheel centre, and that by a share of it; the work of its
+    # force says by how much the force is less than at the centre. One pad up, the other one down, the line of centres
+    # turns by that share over half of the track.
+    share = ARM["length"] / (ARM["length"] + back)
+    force, roll = (rate + bar) * share**2, share / (ARM["track"] / 2)
+    np.testing.assert_allclose(middle.roll_rate, 2 * half * force / roll, rtol=1e-8)
 
 
 def test_the_steering_axis_meets_the_road_beside_the_contact_centre():
@@ -185,9 +191,75 @@ def test_files(load):
     assert again["wheel"] == document["wheel"]
 
 
+def test_a_bearing_is_on_the_spin_axis(load):
+    """As it stands, in or out along the axis; of a wheel thought upright the nearest point."""
+    car, _ = load()
+    centre, axis = np.asarray(car.wheel.centre), spin_axis(1.0, CAMBER, TOE)
+    angles = dict(camber_deg=np.degrees(CAMBER), toe_deg=np.degrees(TOE))
+    for bearing, along in ((centre - 0.12 * axis, -0.12), (centre - [0.0, 0.03, 0.0], -0.03 * axis[1])):
+        given = [*(bearing - [0.0, 0.0, centre[2] - suspension_document("double_wishbone")["wheel"]["centre"][2]])]
+        hub = load(bearing=given, **angles)[0].model(wheel="hinged").joints["hub"]
+        np.testing.assert_allclose(hub.at, centre + along * axis, atol=1e-12)
+
+
+def test_angles_are_numbers_of_a_design(load):
+    axle, document = load(Axle, camber_deg=-1.0)
+    numbers = AxleNumbers.select(axle, {"wheel.*": 0.5, "wheel.toe_deg": (-0.2, 0.3)})
+    assert numbers.names == {"angles": ("wheel.camber_deg", "wheel.toe_deg")}
+    np.testing.assert_allclose(numbers.lower["angles"], [-1.5, -0.2])
+    np.testing.assert_allclose(numbers.upper["angles"], [-0.5, 0.3])
+    x = {"angles": jnp.array([-1.2, 0.1])}
+    moved = numbers.replaced(axle, x)
+    np.testing.assert_allclose(numbers.of(moved)["angles"], x["angles"], rtol=1e-12)
+    assert (
+        numbers.document(document, axle, x)["wheel"] | {"camber_deg": -1.2, "toe_deg": 0.1}
+        == (numbers.document(document, axle, x)["wheel"])
+    )
+    assert float(moved.left.wheel.camber) == pytest.approx(np.radians(-1.2))
+
+
+def test_the_roll_angle_is_that_of_the_wheel_centres():
+    """Wheels that lean out from a shaft which turns about x: the camber changes by the roll angle, which no static
+    camber changes, nor the stiffness over it."""
+    shaft = lg.RigidBody(80.0, (9.0, 1.0, 9.0), position=(0.0, 0.0, 0.3))
+    centres = {"left": jnp.array([0.0, 0.7, 0.3]), "right": jnp.array([0.0, -0.7, 0.3])}
+    wheels = {f"{side}_wheel": lg.RigidBody(20.0, (0.5, 0.9, 0.5), position=at) for side, at in centres.items()}
+    joints = {f"{side}_hub": lg.FixedJoint("shaft", f"{side}_wheel", at=at) for side, at in centres.items()}
+    joints["slide"] = lg.PlanarJoint(None, "shaft", at=(0.0, 0.0, 0.3), axis=(1.0, 0.0, 0.0))
+    springs = {
+        name: lg.Bushing(None, "shaft", at=(0.0, y, 0.3), stiffness=(1.0, 1e6, 4e4))
+        for name, y in (("left", 0.5), ("right", -0.5))
+    }
+    model = lg.Model({"shaft": shaft} | wheels, joints, springs)
+    sweeps = {name: STANDARD[name] for name in ("parallel", "opposite")}
+    for scene in (model, turned(model, {side: spin_axis(sign, -0.07, 0.0) for side, sign in SIDES.items()})):
+        found = rigs.characteristics(rigs.kc(scene, centres, sweeps, points=3))
+        np.testing.assert_allclose(found["roll_camber"], -1.0, rtol=1e-12)
+        np.testing.assert_allclose(found["roll_rate"], 2 * 4e4 * 0.5**2, rtol=1e-9)
+
+
+def test_wheels_are_drawn_as_they_stand():
+    """On the rig, and on a road: round their centres, on the contact centre, in the plane that the spin axis says."""
+    axle = leaning(Axle.load("solid_axle").left)
+    axle = eqx.tree_at(lambda axle: axle.left, Axle.load("solid_axle"), axle)
+    wheel = axle.left.wheel
+    on_road = axle.model(tyres=True, compliant=False)
+    for model in (on_road, rigs.on_rig(on_road, axle.wheel_centres)):
+        system = model.system()
+        body = system.body_names.index("left_wheel")
+        (outline,) = (of for of in shapes(system).outlines if of.body == body)
+        assert outline.role == "wheel"
+        points = placed(outline, *(np.asarray(array) for array in system.pose))
+        points = points - np.asarray(wheel.centre)
+        np.testing.assert_allclose(points @ np.asarray(wheel.spin_axis), 0.0, atol=1e-12)
+        np.testing.assert_allclose(np.linalg.norm(points, axis=1), wheel.stance.radius, rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     "key, value, words",
     [
+        ("bearing", [0.0, 0.9, 0.2], ("wheel.bearing", "off the spin axis")),
+        ("inertia", [4e5, 7e5, 4e5], ("wheel.inertia", "radius of gyration", "did you mean [0.4, ")),
         ("camber_deg", 25.0, ("wheel.camber_deg", "within ±20 degrees, got 25")),
         ("toe_deg", -6.0, ("wheel.toe_deg", "within ±5 degrees, got -6")),
         ("camber", -1.5, ("wheel.camber", "is no key of this table", "camber_deg")),

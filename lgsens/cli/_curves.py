@@ -9,7 +9,7 @@ import numpy as np
 from lgsens import plotting
 from lgsens._progress import compiling
 from lgsens.cli._report import asking_for, output_folder, suspension_file, write_all, written
-from lgsens.examples import QuarterCar, SuspensionCurves
+from lgsens.examples import QuarterCar, SuspensionCurves, suspension_document
 
 # Heading, member of SuspensionCurves, factor to the unit shown, decimals.
 COLUMNS = (
@@ -31,11 +31,13 @@ def run(arguments: argparse.Namespace) -> int:
         raise ValueError(f"argument --points: must be at least 2, got {arguments.points}")
     with output_folder(arguments.out, arguments.overwrite) as out:
         plotting.figure()  # asks for matplotlib now
-        car = QuarterCar.load(suspension_file(arguments))
+        file = suspension_file(arguments)
+        car = QuarterCar.load(file)
+        axle = arguments.axle or suspension_document(file).get("vehicle", {}).get("axle", "rear")
         travel = np.linspace(-arguments.travel, arguments.travel, arguments.points)
         quiet = arguments.quiet
         with asking_for({"travel": arguments.travel}), compiling("the positions of the wheel", not quiet):
-            curves = car.curves(travel, axle=arguments.axle)
+            curves = car.curves(travel, axle=axle)
         files = {
             "curves.csv": lambda path: write_table(curves, path),
             "curves.png": lambda path: plotting.save(

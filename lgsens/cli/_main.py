@@ -120,10 +120,8 @@ def _parser() -> argparse.ArgumentParser:
         choices=list(PARAMETERS),
         metavar="WHAT",
     )
-    free = (
-        "of an axle: numbers that are free, by keys of its file, and how far: points either way [m], rates by a share"
-    )
-    free += " of their value, or either between LOWER:UPPER; as often as needed"
+    free = "of an axle: numbers that are free, by keys of its file, and how far: points either way [m], camber and toe"
+    free += " [degree], rates by a share of their value, or any between LOWER:UPPER; as often as needed"
     optimize.add_argument("--vary", type=_named, action="append", metavar="PATTERN=WIDTH", help=free)
     kept = (
         "of an axle: its toe or camber curve [degree], or a characteristic that `lgsens kc` shows, in its unit, that "
@@ -162,7 +160,7 @@ def _parser() -> argparse.ArgumentParser:
     curves.set_defaults(run=_curves.run)
     curves.hardpoints()
     curves.out("out/curves", "curves.png, curves.csv and travel.html")
-    curves.option("--axle", "rear", choices=["rear", "front"])
+    curves.add_argument("--axle", choices=["rear", "front"], help="(default: that of the file, else rear)")
     curves.option("--travel", 0.08, "up and down [m]", type=_positive, metavar="M")
     curves.option("--points", 41, "positions", type=_count)
     curves.quiet("no table")

@@ -101,7 +101,7 @@ class Outcome(NamedTuple):
         panels = [plotting.Panel("chassis acceleration\n[m/s²]", series, {})]
         title = f"Axle over a bump: {self.search.change}"
         axles = {"before": self.problem.axle, "after": self.problem.with_design(self.search.result.x)}
-        models = {label: axle.model(links="rods") for label, axle in axles.items()}
+        models = {label: axle.model(links="rods", tyres=True) for label, axle in axles.items()}
         axes = ("x, forward", "y, left", "z, up")
         return {
             "response": plotting.time_histories(self.search.before.t, panels, title),
@@ -116,6 +116,8 @@ class Outcome(NamedTuple):
                 before, after, lower, upper = (design[label][name] for label in ("before", "after", "lower", "upper"))
                 if kind == "hardpoints":
                     rows.append(point_row(name, *(1e3 * end for end in (before, after, lower, upper))))
+                elif kind == "angles":
+                    rows.append((f"{name[:-4]} [deg]", before, after, f"{lower:.6g} .. {upper:.6g}", 3))
                 else:
                     digits = max(0, 3 - math.floor(math.log10(before)))  # four that count
                     rows.append((name, before, after, f"{lower:.6g} .. {upper:.6g}", digits))

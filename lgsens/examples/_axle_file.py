@@ -115,7 +115,7 @@ def axle_members(root: Reader, kilogram: float, corner: Any) -> dict[str, Any]:
         found[BODY] = solid_axle(root, kilogram, (), known)
         found["left"] = corner = found[BODY].freed(corner)
     links = corner.links
-    part = lambda table: Part(table.point("centre_of_mass"), table.number("mass", kilogram), table.moments("inertia"))
+    part = lambda table: Part(table.point("centre_of_mass"), *table.mass_and_moments(kilogram))
     if "subframe" in root:
         table = root.table("subframe")
         table.only((*OF_PART, "mounts"))

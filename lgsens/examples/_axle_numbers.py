@@ -13,7 +13,7 @@ from lgsens._validate import as_float
 from lgsens.examples._axle import Axle
 from lgsens.examples._file_axes import FileAxes, rewritten
 
-POINTS, RATES = "hardpoints", "rates"
+POINTS, RATES, ANGLES = "hardpoints", "rates", "angles"
 # What is offered of a file, and where: tables of the corner, and numbers that are points or positive rates.
 _TABLES = {"mounts": "bushings", "stops": "", "bar": "anti_roll_bar", "tyre_stiffness": "tyre"}
 _AT = {"at", "bearing", "lever"}
@@ -24,23 +24,25 @@ _UNNAMED = ("ends", "section", "of", "shape", "material")  # that are no keys of
 
 
 class Place(NamedTuple):
-    """A number of an axle: its name, which leaf it is in, and where in that; `sign` times it and `offset` is that of
-    the file, of whose side and above whose origin a point is."""
+    """A number of an axle: its name, which leaf it is in, and where in that; `factor` times it and `offset` is that of
+    the file, of whose side and above whose origin a point is, and in degrees an angle."""
 
     name: str
     leaf: int
     index: int
-    sign: float = 1.0
+    factor: float = 1.0
     offset: float = 0.0
 
 
 def places(axle: Axle) -> dict[str, list[Place]]:
-    """The coordinates of hardpoints and the positive rates of an axle, in the order of its leaves."""
-    found: dict[str, list[Place]] = {POINTS: [], RATES: []}
+    """The coordinates of hardpoints, the positive rates, and camber and toe of an axle, in the order of its leaves."""
+    found: dict[str, list[Place]] = {POINTS: [], RATES: [], ANGLES: []}
     carriers = dict(axle.left.carriers) | ({} if axle.solid_axle is None else dict(axle.solid_axle.carriers))
     for i, (path, leaf) in enumerate(jax.tree_util.tree_leaves_with_path(axle)):
         names = [str(getattr(entry, "name", getattr(entry, "key", ""))) for entry in path]
         names = names[1:] if names[0] == "left" else names
+        if names[0] == "wheel" and names[-1] in ("camber", "toe"):
+            found[ANGLES].append(Place(f"wheel.{names[-1]}_deg", i, 0, float(np.degrees(1.0))))
         if names[0] not in ("links", "joints", "spring", "damper", "twist_beam", "solid_axle", "leaf_spring", *_TABLES):
             continue
         is_point = "ends" in names or names[-1] in _AT
@@ -91,8 +93,8 @@ class AxleNumbers(eqx.Module):
     """Numbers of an axle that a design changes, those of the left side with their mirror image.
 
     Attributes:
-        places: of `hardpoints` [m] and `rates` (SI units, positive), static.
-        lower, upper: bounds, by "hardpoints" and "rates" as far as there are any, shape (n,).
+        places: of `hardpoints` [m], `rates` (SI units, positive) and `angles` [degree], static.
+        lower, upper: bounds, by "hardpoints", "rates" and "angles" as far as there are any, shape (n,).
     """
 
     places: tuple[tuple[str, tuple[Place, ...]], ...] = eqx.field(static=True)
@@ -105,12 +107,13 @@ class AxleNumbers(eqx.Module):
 
         Arguments:
             axle: the axle at the start.
-            vary: by pattern how far numbers may go: of coordinates either way [m], of rates the share of their value
-                (0.3: from 0.7 to 1.3 times), or for either a pair (lower, upper). Later patterns overrule earlier ones.
+            vary: by pattern how far numbers may go: of coordinates either way [m], of angles either way [degree], of
+                rates the share of their value (0.3: from 0.7 to 1.3 times), or for any a pair (lower, upper). Later
+                patterns overrule earlier ones.
                 Names are keys of the file, then x, y or z of a point, 1, 2 or 3 for the axes of a bushing, before that
                 1 or 2 for the two points of a hinge: "links.upper_arm.subframe.1.z", "bushings.pivot.stiffness.2.1",
-                "spring.stiffness". Points are in metres and the axes of the file, of its side and from its origin. A
-                pattern has * and ? as for files, and stands for all names that it begins.
+                "spring.stiffness", "wheel.toe_deg". Points are in metres and the axes of the file, of its side and from
+                its origin. A pattern has * and ? as for files, and stands for all names that it begins.
 
         Raises `ValueError` for a pattern that matches nothing, and bounds that do not contain the start.
         """
@@ -127,9 +130,9 @@ class AxleNumbers(eqx.Module):
         ends = {kind: np.empty((2, len(of))) for kind, of in kept.items()}
         for kind, of in kept.items():
             for i, place in enumerate(of):
-                value = place.sign * float(np.ravel(leaves[place.leaf])[place.index]) + place.offset
+                value = place.factor * float(np.ravel(leaves[place.leaf])[place.index]) + place.offset
                 pattern, bound = chosen[place.name]
-                ends[kind][:, i] = _bounds(pattern, bound, value, kind == POINTS)
+                ends[kind][:, i] = _bounds(pattern, bound, value, kind)
                 low, high = ends[kind][:, i]
                 if not low <= value <= high or (kind == RATES and not low > 0) or not low < high:
                     more = ", and rates stay positive" if kind == RATES else ""
@@ -148,7 +151,7 @@ class AxleNumbers(eqx.Module):
     def of(self, axle: Axle) -> dict[str, Float[Array, " n"]]:
         """The numbers of an axle."""
         leaves = jax.tree.leaves(axle)
-        pick = lambda place: place.sign * leaves[place.leaf].ravel()[place.index] + place.offset
+        pick = lambda place: place.factor * leaves[place.leaf].ravel()[place.index] + place.offset
         return {kind: as_float([pick(place) for place in of], None, kind) for kind, of in self.places}
 
     def replaced(self, axle: Axle, x: Mapping[str, Float[Array, " n"]]) -> Axle:
@@ -158,10 +161,10 @@ class AxleNumbers(eqx.Module):
             for leaf in dict.fromkeys(place.leaf for place in of):
                 rows = [i for i, place in enumerate(of) if place.leaf == leaf]
                 at, old = np.array([of[i].index for i in rows]), leaves[leaf]
-                sign, offset = (
-                    np.array([getattr(of[i], name) for i in rows], old.dtype) for name in ("sign", "offset")
+                factor, offset = (
+                    np.array([getattr(of[i], name) for i in rows], old.dtype) for name in ("factor", "offset")
                 )
-                new = sign * (x[kind][np.array(rows)] - offset)
+                new = (x[kind][np.array(rows)] - offset) / factor
                 leaves[leaf] = old.ravel().at[at].set(new).reshape(old.shape)
         return jax.tree.unflatten(structure, leaves)
 
@@ -170,18 +173,18 @@ class AxleNumbers(eqx.Module):
         before, values = self.of(axle), {kind: np.asarray(x[kind]).tolist() for kind, _ in self.places}
         named = {kind: dict(zip(names, values[kind])) for kind, names in self.names.items()}
         rates = zip(self.names.get(RATES, ()), zip(np.asarray(before.get(RATES, ())).tolist(), values.get(RATES, ())))
-        return rewritten(file, named.get(POINTS, {}), dict(rates))
+        return rewritten(file, named.get(POINTS, {}), dict(rates), named.get(ANGLES, {}))
 
 
-def _bounds(pattern: str, bound: Any, value: float, is_point: bool) -> tuple[float, float]:
+def _bounds(pattern: str, bound: Any, value: float, kind: str) -> tuple[float, float]:
     if np.shape(bound) == (2,):
         return float(bound[0]), float(bound[1])
     if np.shape(bound) != () or not float(bound) > 0:
         raise ValueError(f"`vary`, {pattern!r}: must be a positive number or a pair (lower, upper), got {bound!r}.")
-    if is_point and float(bound) > 1.0:
+    if kind == POINTS and float(bound) > 1.0:
         raise ValueError(
             f"`vary`, {pattern!r}: is in metres, whatever the unit of the file, and no point moves {bound:g} m "
             f"either way; did you mean {float(bound) / 1e3:g}?"
         )
-    width = float(bound) * (1.0 if is_point else value)
+    width = float(bound) * (value if kind == RATES else 1.0)
     return value - width, value + width

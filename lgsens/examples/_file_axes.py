@@ -33,7 +33,10 @@ class FileAxes(NamedTuple):
 
 
 def rewritten(
-    document: Mapping[str, Any], points: Mapping[str, float], rates: Mapping[str, tuple[float, float]]
+    document: Mapping[str, Any],
+    points: Mapping[str, float],
+    rates: Mapping[str, tuple[float, float]],
+    angles: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
     """The document of a file with other numbers.
 
@@ -43,11 +46,14 @@ def rewritten(
             "links.upper_arm.chassis.1.z", "spring.chassis.x".
         rates: numbers before and after in SI units by names such as "spring.stiffness",
             "bushings.pivot.stiffness.2.1". A curve of a spring or damper grows as its slope.
+        angles: by names such as "wheel.toe_deg" [degree].
     """
     found = copy.deepcopy(dict(document))
     for name, value in points.items():
         *path, axis = name.split(".")
         _put(found, [*path, "xyz".index(axis)], value / found["units"]["length"])
+    for name, value in (angles or {}).items():
+        _put(found, name.split("."), value)
     for name, (before, after) in rates.items():
         owner, *path = name.split(".")
         if owner in ("spring", "damper") and "curve" in found[owner]:

@@ -19,6 +19,9 @@ DEFAULT = "quarter-car"  # what the car that ships with lgsens is called, and it
 DEFAULT_FILE = "five_link_suspension"
 
 
+MOST_GYRATION = 5.0  # m
+
+
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
@@ -194,6 +197,19 @@ class Reader:
         except ValueError as error:
             raise self.fail(key, str(error)) from error
         return value
+
+    def mass_and_moments(self, kilogram: float) -> tuple[Array, Array]:
+        """Of a body: `mass`, and `inertia` that it can have."""
+        mass, inertia = self.number("mass", kilogram), self.moments("inertia")
+        radius = math.sqrt(float(np.max(inertia)) / float(mass))
+        if not radius <= MOST_GYRATION:
+            raise self.fail(
+                "inertia",
+                f"is in kg m² ('units' is of masses and points alone), and {np.asarray(inertia).tolist()} of "
+                f"{float(mass):g} kg is a radius of gyration of {radius:.3g} m, more than of any part of a car; did "
+                f"you mean {[float(f'{1e-6 * moment:.6g}') for moment in np.asarray(inertia)]}?",
+            )
+        return mass, inertia
 
     def interval(self, key: str) -> tuple[Array, Array]:
         holds = lambda value: _are_numbers(value, 2) and 0 < value[0] < value[1]

@@ -34,11 +34,14 @@ def read_link(name: str, table: Reader, bodies: tuple[str, ...], kilogram: float
         table.point(next(body for body in bodies if body not in ends))
     if len(ends) > 2 and not own:
         table.point("centre_of_mass")
+    mass, inertia = table.mass_and_moments(kilogram) if own else (None, None)
+    if not own and beam is None:
+        mass = table.number("mass", kilogram)
     link = Link(
         ends,
-        table.number("mass", kilogram) if beam is None else None,
+        mass,
         centre=table.point("centre_of_mass") if own else None,
-        inertia=table.moments("inertia") if own else None,
+        inertia=inertia,
         arm=table.direction("arm"),
         link_arm=table.direction("link_arm"),
         beam=beam,

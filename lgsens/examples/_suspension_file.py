@@ -19,8 +19,7 @@ y left, z up. TOML, or JSON of the same structure.
     [knuckle], [wheel], [chassis]: centre_of_mass (wheel: centre, and bearing, its hub), mass, inertia (principal
                    moments about the axes of the file, of the wheel about its own, the second of which is its spin axis)
     [wheel]        camber_deg, toe_deg: at the design position [degree] (left out: 0, upright and straight), camber
-                   positive with the top outward, toe with the front inward; the bearing is that of a wheel so turned
-                   about its centre
+                   positive with the top outward, toe with the front inward; the bearing is on the spin axis
     [spring]       BODY = [x, y, z] twice, and stiffness, or curve = [[compression, force], …], which is counted from
                    the design position, or from free_length [m]; a constant is added so that the car rests there
     [damper]       BODY = [x, y, z] twice, and damping, or curve = [[speed of compression, force], …] with [0, 0]
@@ -105,6 +104,7 @@ TABLES += ("link_section", "bump", "design", LEAF)
 OF_TABLES = {"tyre": ("stiffness",), "bump": ("height", "duration"), "link_section": ("radius",)}
 RATES = {"spring": "stiffness", "damper": "damping"}
 ANGLES = {"camber_deg": 20.0, "toe_deg": 5.0}  # how large they may be [degree]
+MOST_OFF_AXIS = 0.01  # m; a bearing of a wheel thought upright is as far off where it leans
 STOPS = ("bump_stop", "rebound_stop")
 OF_MODEL = ("hub", "heave", "travel")  # joints that there are beside those of the file
 
@@ -145,7 +145,7 @@ def members(document: dict, path: str) -> dict[str, Any]:
     def part(key: str, centre: str, *more: str) -> Part:
         body = root.table(key)
         body.only((centre, "mass", "inertia", *more))
-        return Part(body.point(centre), body.number("mass", kilogram), body.moments("inertia"))
+        return Part(body.point(centre), *body.mass_and_moments(kilogram))
 
     wheel = _wheel(root, part("wheel", "centre", "bearing", *ANGLES))
     if not LEAST_RADIUS <= float(wheel.centre[2]) <= LARGEST_RADIUS:
@@ -197,7 +197,14 @@ def _wheel(root: Reader, part: Part) -> Wheel:
             if abs(float(angle)) > most:
                 raise table.fail(key, f"must be within ±{most:g} degrees, got {float(angle):g}.")
             angles[key.removesuffix("_deg")] = jnp.radians(angle)
-    return Wheel(part.centre, part.mass, part.inertia, **angles)
+    wheel, bearing = Wheel(part.centre, part.mass, part.inertia, **angles), table.point("bearing")
+    if not (off := float(jnp.linalg.norm(bearing - wheel.on_axis(bearing)))) <= MOST_OFF_AXIS:
+        raise table.fail(
+            "bearing",
+            f"is {off:.4g} m off the spin axis, the line through `centre` {np.asarray(wheel.centre).tolist()} along "
+            f"{np.asarray(wheel.spin_axis).round(6).tolist()} [m]; the wheel would turn about another axis.",
+        )
+    return wheel
 
 
 def _leaf_spring(root: Reader, kilogram: float) -> LeafPack | None:

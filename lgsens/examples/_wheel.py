@@ -108,9 +108,9 @@ class Wheel(Part):
         """How it stands on the road."""
         return Stance.of(self.spin_axis, self.centre)
 
-    def on_axis(self, bearing: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Where a bearing is, which a file has as of an upright and straight wheel [m], shape (3,)."""
-        return self.centre + self.axes @ (bearing - self.centre)
+    def on_axis(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
+        """The point of the spin axis that is nearest to one [m], shape (3,)."""
+        return self.centre + self.spin_axis * jnp.dot(self.spin_axis, point - self.centre)
 
     def body(self, points: Sequence[tuple[Array, Array]] = (), free: str | Sequence[str] = ALL_FREE) -> RigidBody:
         """It, with its own axes, and point masses, pairs of a mass and a place, fixed to it."""

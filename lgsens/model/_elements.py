@@ -27,7 +27,7 @@ class AbstractElement(eqx.Module):
 
     `drawn` is what is drawn from its first point to its last: a "joint" or "link" that holds bodies, a "beam"
     (bent, its axes at both ends with the first along it, in the colour of the `stress` that it measures, if any), a
-    "spring", a "damper", or a "wheel" on its `road`; None: nothing.
+    "spring", a "damper", a "wheel" on its `road`, or a "tyre" by its `radius` and axis; None: nothing.
     """
 
     drawn: ClassVar[Any] = "joint"

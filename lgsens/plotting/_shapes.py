@@ -71,7 +71,7 @@ def shapes(system: MultibodySystem) -> Shapes:
     """The shapes of a system with concrete numbers."""
     position, orientation = (np.asarray(array) for array in system.pose)
     held: list[list[np.ndarray]] = [[] for _ in system.body_names]
-    struts, joints, tyres, axes = [], [], [], {}
+    struts, joints, tyres, axes, wheels = [], [], [], {}, {}
     for stack in (*system.constraints, *system.loads):
         for i, owner in enumerate(stack.owners):
             element: Any = jax.tree.map(lambda leaf, i=i: leaf[i], stack.elements)
@@ -94,17 +94,21 @@ def shapes(system: MultibodySystem) -> Shapes:
                     struts[-1] = struts[-1]._replace(along_a=along_a, along_b=along_b)
             if role == "wheel":
                 tyres.append(Tyre(marks[-1], element.road))
+            if role == "tyre":
+                wheels[marks[-1].body] = marks[-1].at, float(element.radius), np.asarray(element.fixed("axis", "b")[0])
     if system.centre is not None:  # a body with a pivot has it in place of a joint
         for body, (own, centre) in enumerate(zip(held, np.asarray(system.centre))):
             if centre.any():
                 own.append(np.zeros(3))
                 joints.append(CentreMark(body, np.zeros(3)))
-    wheels = {tyre.centre.body: tyre.centre.at for tyre in tyres}
+    for body, at in (tyre.centre for tyre in tyres):
+        axis = _spin_axis(orientation, axes.values(), body)
+        wheels[body] = *_disc(position, orientation, body, at, axis), axis
     outlines = []
     for body, points in enumerate(held):
-        if body in wheels and (radius := _world(position, orientation, body, wheels[body])[2]) > 0:
-            axis = _spin_axis(orientation, axes.values(), body)
-            outlines.append(Outline(body, "wheel", wheels[body] + radius * _circle(axis, orientation[body]), True))
+        if body in wheels and wheels[body][1] > 0:
+            centre, radius, axis = wheels[body]
+            outlines.append(Outline(body, "wheel", centre + radius * _circle(axis, orientation[body]), True))
         else:
             outlines += _solid(system, body, _distinct(points))
     return Shapes(outlines, struts, joints, tyres)
@@ -214,6 +218,16 @@ def _spin_axis(orientation: np.ndarray, owners, wheel: int) -> np.ndarray:
             return orientation[wheel].T @ inertial
     left = np.array([0.0, 1.0, 0.0])
     return left if orientation[wheel][1, 1] > 0.8 else orientation[wheel].T @ left
+
+
+def _disc(position, orientation, wheel: int, at: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre of a wheel in its frame, and the radius with which it touches the road, z = 0: where its tyre acts, or, of
+    one that leans, whose tyre acts over its contact centre, its centre of mass, which is as high."""
+    tyre, centre = _world(position, orientation, wheel, at), position[wheel]
+    if abs(tyre[2] - centre[2]) < 1e-6 * abs(tyre[2]) and np.linalg.norm(tyre - centre) < 0.4 * abs(tyre[2]):
+        at = np.zeros(3)
+    inclined = (orientation[wheel] @ axis)[2]
+    return at, float(tyre[2] / np.sqrt(max(1.0 - inclined**2, 0.1)))
 
 
 def _circle(axis: np.ndarray, orientation: np.ndarray) -> np.ndarray:

@@ -5,12 +5,12 @@ what the rig moves: along the sweep (`rates`), by one pad, by both, or by the ra
 
 Positions, of each wheel: steer angle δ, inclination ε and contact centre P by `wheel_plane`, camber γ = −σ ε, toe −σ δ.
 
-Rates. With z the height of a wheel centre, F the vertical forces on its wheel, ℓ the length of its spring and b the
-distance of the contact centres:
+Rates. With z the height of a wheel centre, F the vertical forces on its wheel, ℓ the length of its spring and φ the
+roll angle, that of the line through both wheel centres, tan φ = (z_R − z_L)/(y_L − y_R):
 
     motion ratio  −ℓ′/z′             by both pads
     wheel rate    F′/z′              by both pads
-    roll rate     M′/φ′              by both pads against each other; M′ = −Σ P_y F′, φ′ = (z_R′ − z_L′)/b
+    roll rate     M′/φ′              by both pads against each other; M′ = −Σ P_y F′
     roll centre   ½ Σ P_y S′/P_z′    each by the pad of its wheel, S the sum of P_y of both wheels: over the road; of
                                      wheels that are independent, S′ = P_y′, where the normals to the paths of the
                                      contact centres in front view meet the middle of the car, in the mean of both sides
@@ -20,9 +20,9 @@ they are, and the links alone change the vertical forces by F′; their moment a
 
     h = −Σ P_y F′ / Σ F_y′     along "lateral", in phase:
 
-the definition of ISO 8855 (where a lateral force on the body does not roll it). Without compliance it is the kinematic
-one: one pad moved, forces F_y on both contact centres do the work F_y S′ + F′ P_z′ = 0 (virtual work), also where a
-solid axle or a twist beam moves the other wheel too.
+the definition of ISO 8855 (where a lateral force on the body does not roll it). Without compliance, and without toe,
+of which lateral forces of tyres have a part along x, it is the kinematic one: one pad moved, forces F_y on both contact
+centres do the work F_y S′ + F′ P_z′ = 0 (virtual work), also where a solid axle or a twist beam moves the other wheel.
 
 Anti-features. The same with longitudinal forces: the vertical force that links add per force, over what the car's
 inertia adds, h_c/l of all of it, of which this axle has a share p:
@@ -201,8 +201,9 @@ def axle_curves(found: Statics, stances: Stance, vehicle: Vehicle) -> AxleCurves
     both, against = (jax.tree.map(lambda l, r, sign=sign: sign * l + r, left, right) for sign in (1.0, -1.0))
     y = stances.contact[None, :, 1] + wheels.contact_y
     difference = lambda of: of[:, 1] - of[:, 0]
-    apart, rise = -difference(y), difference(wheels.travel)
-    rolling = difference(against.travel) / apart
+    apart = -difference(stances.centre[None, :, 1] + wheels.centre_y)
+    rise = difference(wheels.travel)
+    rolled = lambda by: (difference(by.travel) * apart + rise * difference(by.centre_y)) / (rise**2 + apart**2)
     sideways = jnp.stack([jnp.sum(by_pad.contact_y, axis=1) for by_pad in (left, right)], axis=1)
     contact_rise = jnp.stack([by[1, :, 0, -1], by[2, :, 1, -1]], axis=1)
     curves = AxleCurves(
@@ -212,12 +213,11 @@ def axle_curves(found: Statics, stances: Stance, vehicle: Vehicle) -> AxleCurves
         track_change=-difference(wheels.contact_y),
         wheelbase_change=(-1.0 if vehicle.rear else 1.0) * jnp.mean(wheels.contact_x, axis=1),
         roll_angle=jnp.arctan2(rise, apart),
-        roll_angle_rate=(difference(rates[0].travel) * apart + rise * difference(rates[0].contact_y))
-        / (rise**2 + apart**2),
+        roll_angle_rate=rolled(rates[0]),
         spring_motion_ratio=None,
         damper_motion_ratio=None,
         wheel_rate=both.force / both.travel,
-        roll_rate=-jnp.sum(y * against.force, axis=1) / rolling,
+        roll_rate=-jnp.sum(y * against.force, axis=1) / rolled(against),
         roll_centre_height=jnp.mean(y * sideways / contact_rise, axis=1),
     )
     known = {owner for stack in found.system.loads for owner in stack.owners}

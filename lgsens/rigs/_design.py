@@ -16,7 +16,7 @@ from lgsens.model import Model
 from lgsens.rigs._characteristics import CHARACTERISTICS
 from lgsens.rigs._curves import Vehicle
 from lgsens.rigs._kc import KC, kc
-from lgsens.rigs._sweeps import Sweep, standard_sweeps
+from lgsens.rigs._sweeps import RACK, Sweep, standard_sweeps
 from lgsens.simulation import Trajectory, simulate
 
 Design = dict[str, Float[Array, " n"]]
@@ -27,7 +27,7 @@ CURVES = {"toe": ("parallel", "wheels.toe"), "camber": ("parallel", "wheels.camb
 class AxleDesign(eqx.Module):
     """Least acceleration of the chassis over the bump, with what the rig measures kept in bands.
 
-        min ∫ z̈² dt [m²/s³] over hardpoints, bushing, spring and damper rates;  lower ≤ outputs of `kc` ≤ upper
+        min ∫ z̈² dt [m²/s³] over hardpoints, rates, camber and toe;  lower ≤ outputs of `kc` ≤ upper
 
     The car goes over the bump of the file with both wheels at once (`Axle.half`). A problem for `optimize.minimize` and
     `optimize.scipy_problem`: a function of `start`, between `lower` and `upper`, with its constraints in half widths of
@@ -89,7 +89,9 @@ class AxleDesign(eqx.Module):
         for name in keep:
             if name not in known:
                 raise ValueError(f"`keep`: {suggestion(name, known)}.")
-        used = {CURVES[name][0] if name in CURVES else CHARACTERISTICS[name].sweep for name in keep}
+        used = {_sweep_of(name) for name in keep}
+        if axle.rack is None and (steered := [name for name in keep if _sweep_of(name) == RACK]):
+            raise ValueError(f"`keep`: {steered} need a rack that steers, and the axle {axle.name!r} has none.")
         sweeps = tuple((name, every[name]) for name in every if name in used)
         t1, num_steps = as_float(t1, (), "`t1`"), as_count(num_steps, "num_steps", " (it is static)")
         now = _outputs(_test(axle, sweeps, points, vehicle), keep) if keep else {}
@@ -158,6 +160,11 @@ def rack_way(axle: Axle) -> float:
     """How far its rack goes in a sweep that steers [m]: its travel, if that is known."""
     travel = None if axle.rack is None else axle.rack.travel
     return 0.06 if travel is None else float(travel)
+
+
+def _sweep_of(name: str) -> str:
+    """The sweep that a curve or a characteristic is of."""
+    return CURVES[name][0] if name in CURVES else CHARACTERISTICS[name].sweep
 
 
 def _test(

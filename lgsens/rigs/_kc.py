@@ -55,7 +55,8 @@ def kc(
             z = 0: `Axle.wheel_centres`.
         sweeps: by name; None: all of `standard_sweeps()`, "steering" if there is a rack.
         points: of each sweep, odd, from −amplitude to +amplitude.
-        vehicle: the car, for anti-features, Ackermann and the steering ratio; None: `Vehicle()`.
+        vehicle: the car, for anti-features, Ackermann and the steering ratio, of a file `vehicle_of(axle)`; None:
+            `Vehicle()`, a rear axle.
         throw: as in `lgsens.statics`.
 
     Differentiable by every number of the model, of sweeps and vehicle, exactly, rates included. `AxleCurves` says what

@@ -57,7 +57,7 @@ class ContactHeight(AbstractConstraint):
     radius: Float[Array, ""]
     displacement: Float[Array, ""]
 
-    drawn = None
+    drawn = "tyre"
 
     @property
     def num_rows(self):
