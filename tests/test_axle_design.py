@@ -64,6 +64,7 @@ def test_chosen_numbers_are_replaced_on_both_sides_and_no_others():
         ({"spring.stiffness": 1.5}, {}, "rates stay positive"),
         ({"links.tie_rod": 10.0}, {}, "'links.tie_rod': is in metres, .* no point moves 10 m either way"),
         ({"spring.stiffness": 0.3}, {"tow": 0.1}, "`keep`: .*'tow'"),
+        ({"spring.stiffness": 0.3}, {"ackermann": 0.1}, r"`keep`: \['ackermann'\] need a rack that steers"),
     ],
 )
 def test_bad_input(vary, keep, message):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from lgsens import plotting
+from lgsens.cli._curves import axle_of
 from lgsens.cli._main import main
 from lgsens.cli._optimize_quarter_car import Outcome
 from lgsens.examples import CurveBounds, QuarterCar, SuspensionDesign
@@ -151,3 +152,10 @@ def test_hardpoints_that_keep_the_curves(tmp_path):
     for row in rows.values():
         assert row["after"]["violation_over_scale"] <= 1e-3
     assert result["objective"]["reduction"] > 0.05
+
+
+def test_the_axle_is_that_of_the_file(tmp_path):
+    for text, expected in (("[vehicle]\naxle = 'front'\n", "front"), ("[vehicle]\n", "rear"), ("", "rear")):
+        path = tmp_path / "suspension.toml"
+        path.write_text(text, encoding="utf-8")
+        assert axle_of(path) == expected

@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
         plotting.figure()  # asks for matplotlib now
         file = suspension_file(arguments)
         car = QuarterCar.load(file)
-        axle = arguments.axle or suspension_document(file).get("vehicle", {}).get("axle", "rear")
+        axle = arguments.axle or axle_of(file)
         travel = np.linspace(-arguments.travel, arguments.travel, arguments.points)
         quiet = arguments.quiet
         with asking_for({"travel": arguments.travel}), compiling("the positions of the wheel", not quiet):
@@ -50,6 +50,11 @@ def run(arguments: argparse.Namespace) -> int:
         if not quiet:
             print(table(curves), written(out, files), sep="\n")
     return 0
+
+
+def axle_of(file: str | Path | None) -> str:
+    """Which axle the suspension of a file is of, "front" or "rear", as far as it says."""
+    return suspension_document(file).get("vehicle", {}).get("axle", "rear")
 
 
 def write_table(curves: SuspensionCurves, path: Path) -> None:

@@ -66,6 +66,7 @@ def quarter_car(bushings: Sequence[str] = ()) -> Scene:
     import diffrax  # takes its time to import
 
     car = QuarterCar.load()
+    assert car.spring is not None  # that of the car that ships
     parameters = {"stiffness": car.spring.rate, "damping": car.damper.rate, "hardpoints": car.hardpoints}
 
     def build(p, **options):

@@ -17,6 +17,7 @@ the eye.
 """
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -59,8 +60,8 @@ class LeafPack(eqx.Module):
     @property
     def leaf(self) -> BeamSection:
         """The section of one leaf."""
-        width, height = self.section["width"], self.section["thickness"]
-        return BeamSection.rectangle(width, height, **self.material)
+        numbers: dict[str, Any] = self.material
+        return BeamSection.rectangle(self.section["width"], self.section["thickness"], **numbers)
 
     @property
     def points(self) -> Float[Array, "n 3"]:
@@ -137,7 +138,8 @@ class LeafPack(eqx.Module):
 
 
 def _times(section: BeamSection, leaves: float) -> BeamSection:
-    return BeamSection(leaves * section.stiffness, leaves * section.mass, leaves * section.inertia, section.damping)
+    rates = (leaves * of for of in (section.stiffness, section.mass, section.inertia))
+    return eqx.tree_at(lambda section: (section.stiffness, section.mass, section.inertia), section, tuple(rates))
 
 
 def read_leaf_spring(table: Reader, kilogram: float) -> LeafPack:

@@ -30,6 +30,16 @@ PARAMETERS = {
 }
 
 
+def rates_of(car: QuarterCar) -> dict[str, Array]:
+    """Stiffness of the spring [N/m] and damping of the damper [N s/m], shape (). Raises `ValueError` without a spring."""
+    if car.spring is None:
+        raise ValueError(
+            f"Suspension {car.name!r} is on leaf springs, and the design problem looks at the length of a spring: take "
+            "that of an axle, `rigs.AxleDesign` or `lgsens optimize FILE --vary …`."
+        )
+    return {"stiffness": car.spring.rate, "damping": car.damper.rate}
+
+
 class DesignLimits(eqx.Module):
     """The limits of a suspension design, the table `[design]` of a hardpoint file; `DesignLimits.load()`.
 
@@ -157,13 +167,9 @@ class SuspensionDesign(eqx.Module):
         starts outside its own bounds.
         """
         car = QuarterCar.load(path)
-        if car.spring is None:
-            raise ValueError(
-                f"Suspension {car.name!r} is on leaf springs, and the design problem looks at the length of a spring: "
-                "take that of an axle, `rigs.AxleDesign` or `lgsens optimize FILE --vary …`."
-            )
+        rates = rates_of(car)
         limits = DesignLimits.load(path)
-        for key, value in (("stiffness", car.spring.rate), ("damping", car.damper.rate)):
+        for key, value in rates.items():
             lower, upper = map(float, getattr(limits, key))
             if not lower <= float(value) <= upper:
                 raise ValueError(
@@ -175,8 +181,7 @@ class SuspensionDesign(eqx.Module):
     @property
     def start(self) -> dict[str, Array]:
         """The design of the hardpoint file."""
-        car = self.car
-        every = {"stiffness": car.spring.rate, "damping": car.damper.rate, "hardpoints": car.hardpoints}
+        every = {**rates_of(self.car), "hardpoints": self.car.hardpoints}
         return {name: every[name] for name in PARAMETERS[self.parameters]}
 
     @property
@@ -199,8 +204,9 @@ class SuspensionDesign(eqx.Module):
     def document(self, file: Mapping[str, Any], design: dict[str, Array]) -> dict[str, Any]:
         """The document of the car's file with the values of a design."""
         car, points, metre = self.with_design(design), {}, file["units"]["length"]
-        every = {"stiffness": ("spring", self.car.spring.rate), "damping": ("damper", self.car.damper.rate)}
-        rates = {f"{of}.{key}": (float(old), float(design[key])) for key, (of, old) in every.items() if key in design}
+        of = {"stiffness": "spring", "damping": "damper"}
+        every = rates_of(self.car).items()
+        rates = {f"{of[key]}.{key}": (float(old), float(design[key])) for key, old in every if key in design}
         for name, new in car.on_chassis.items() if "hardpoints" in design else ():
             if name in car.links:
                 path = ["links", name, dict(car.carriers).get(f"links.{name}", "chassis")]
