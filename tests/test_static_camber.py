@@ -137,9 +137,9 @@ def test_trailing_arms_in_closed_form():
     curves = test.sweeps["opposite"]
     middle = jax.tree.map(lambda leaf: leaf[1], curves)
     np.testing.assert_allclose(middle.wheels.contact_y, 0.0, atol=1e-15)
-    # A pad lifts its contact centre, which is by `back` off the wheel centre, and that by a share of it; the work of its
-    # force says by how much the force is less than at the centre. One pad up, the other one down, the line of centres
-    # turns by that share over half of the track.
+    # A pad lifts its contact centre, which is by `back` off the wheel centre, and that by a share of it; the work of
+    # its force says by how much the force is less than at the centre. One pad up, the other one down, the line of
+    # centres turns by that share over half of the track.
     share = ARM["length"] / (ARM["length"] + back)
     force, roll = (rate + bar) * share**2, share / (ARM["track"] / 2)
     np.testing.assert_allclose(middle.roll_rate, 2 * half * force / roll, rtol=1e-8)

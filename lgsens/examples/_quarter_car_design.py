@@ -31,7 +31,7 @@ PARAMETERS = {
 
 
 def rates_of(car: QuarterCar) -> dict[str, Array]:
-    """Stiffness of the spring [N/m] and damping of the damper [N s/m], shape (). Raises `ValueError` without a spring."""
+    """Stiffness of the spring [N/m] and damping of the damper [N s/m], shape (); without a spring a `ValueError`."""
     if car.spring is None:
         raise ValueError(
             f"Suspension {car.name!r} is on leaf springs, and the design problem looks at the length of a spring: take "
