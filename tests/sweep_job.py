@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import lgsens as lg
-from lgsens.examples import spinning_top
 from lgsens.sweeps._folder import Store
 
 COUNT = 4096
@@ -18,15 +17,17 @@ BATCH = 128
 
 
 def psi(design):
-    """∫ x² dt of the top over five steps."""
-    model = spinning_top(design["angle"], mass=design["mass"])
-    trajectory = lg.simulate(model, t1=0.05, num_steps=5)
-    return lg.time_integral(trajectory.t, trajectory.body("top").position[:, 0] ** 2)
+    """∫ x² dt of a mass across a spring that is under tension, over five steps."""
+    ends = {"at_a": (0.0, 0.0, 0.0), "at_b": (0.0, 0.0, -1.0)}
+    spring = lg.SpringDamper(None, "mass", stiffness=design["stiffness"], preload=100.0, **ends)
+    mass = lg.RigidBody(design["mass"], None, position=(0.0, 0.0, -1.0), velocity=(1.0, 0.0, 0.0), free="x")
+    trajectory = lg.simulate(lg.Model({"mass": mass}, {}, {"spring": spring}), t1=0.05, num_steps=5)
+    return lg.time_integral(trajectory.t, trajectory.body("mass").position[:, 0] ** 2)
 
 
 def designs(count=COUNT):
     rng = np.random.default_rng(0)
-    return {"angle": rng.uniform(0.5, 1.0, count), "mass": rng.uniform(10.0, 20.0, count)}
+    return {"stiffness": rng.uniform(500.0, 1000.0, count), "mass": rng.uniform(10.0, 20.0, count)}
 
 
 def die_in_batch(number: int) -> None:

@@ -39,10 +39,13 @@ def test_hand_derived_rule_on_every_joint_and_force():
     dz = random_like(z)
     # tangents in the tangent space, as all that a simulation meets
     dz = (dz[0], system.group.to_ambient(q, jnp.asarray(rng.normal(size=v.shape))), *dz[2:])
-    wanted, wanted_change = jax.jit(lambda z, dz: jax.jvp(accelerations, z, dz))(z, dz)
-    found, change = jax.jit(lambda z, dz: jax.jvp(by_hand, z, dz))(z, dz)
-    weights = random_like(found)
-    pulled = jax.jit(lambda z, weights: jax.vjp(by_hand, *z)[1](weights))(z, weights)
+    weights = random_like(jax.eval_shape(by_hand, *z))
+
+    @jax.jit
+    def derivatives(z, dz, weights):
+        return jax.jvp(accelerations, z, dz), jax.jvp(by_hand, z, dz), jax.vjp(by_hand, *z)[1](weights)
+
+    (wanted, wanted_change), (found, change), pulled = derivatives(z, dz, weights)
     for actual, expected in zip((*found, *change), (*wanted, *wanted_change)):
         close(actual, expected, 1e6)
     inner = lambda a, b: sum(float(jnp.vdot(x, y)) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b)))

@@ -303,6 +303,7 @@ def hinged_four_bar(length, *, planar: bool) -> lg.Model:
     return lg.Model(bodies, joints, {"gravity": lg.Gravity((0.0, -9.81, 0.0))}, redundant=redundant)
 
 
+@jax.jit
 def looked_at(found):
     rocker = found.body("rocker")
     parts = rocker.position, rocker.orientation, rocker.acceleration, found.multiplier("motor")

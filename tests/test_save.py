@@ -47,7 +47,8 @@ def test_values_and_final_state():
     "derivative", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev], ids=["forward", "reverse"]
 )
 def test_derivatives(derivative):
-    same(derivative(lambda alpha: saved(alpha).values)(0.7), derivative(of_trajectory)(0.7))
+    both = jax.jit(lambda alpha: [derivative(of)(alpha) for of in (lambda alpha: saved(alpha).values, of_trajectory)])
+    same(*both(0.7))
 
 
 @pytest.mark.slow  # as reverse mode above
@@ -100,7 +101,9 @@ def in_a_module(a):
 )
 def test_traced_numbers_in_what_is_asked_have_derivatives(save, derivative):
     of, expected = weighted(save)
-    np.testing.assert_allclose(derivative(of)(jnp.asarray(7.0)), jax.grad(expected)(7.0), rtol=1e-9)  # two programs
+    np.testing.assert_allclose(
+        derivative(of)(jnp.asarray(7.0)), jax.jit(jax.grad(expected))(7.0), rtol=1e-9
+    )  # two programs
 
 
 def test_traced_numbers_in_what_is_asked_are_refused_with_checkpoints():

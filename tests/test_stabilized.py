@@ -20,12 +20,13 @@ from lgsens.integrate import EqualGrid, Node, states_of
 STABILIZED = lg.GeneralizedAlpha(0.9, stabilized=True)
 
 
+@jax.jit
 def violations(trajectory):
     """The largest entries of Φ and of B v at the steps, the first state left out."""
     system, states = trajectory.system, jax.tree.map(lambda leaf: leaf[1:], trajectory.states)
     position = jax.vmap(lambda q: system.constraint(q, 0.0))(states.q)
     velocity = jax.vmap(lambda q, v: constraint_velocity(system, q, v, 0.0))(states.q, states.v)
-    return float(jnp.abs(position).max()), float(jnp.abs(velocity).max())
+    return jnp.abs(position).max(), jnp.abs(velocity).max()
 
 
 # Runs of 50 and 100 steps of one structure: compiled once, they serve most tests below.

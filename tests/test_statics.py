@@ -17,7 +17,7 @@ ANCHOR, WEIGHT = np.array([0.4, 1.0]), 2.0 * 9.81
 
 def lever(stiffness=5000.0, arm=0.4):
     """A bar of 1 m hinged at one end, a spring from above at `arm`, a load of 1 N downward at the other end."""
-    bar = lg.RigidBody(mass=2.0, inertia=(0.1, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    bar = lg.RigidBody(mass=2.0, inertia=(0.1, 0.1, 0.1), position=(0.5, 0.0, 0.0), free="x z ry")
     forces = {
         "spring": lg.SpringDamper(
             None,
@@ -178,34 +178,29 @@ def test_bad_input(arguments, message):
 
 def test_a_fixed_moment_is_a_load():
     """About the axis of a hinge it turns the bar as the moment that turns with it does, and both add to a force."""
-    spring = lg.TorsionSpringDamper(None, "bar", axis=(0.0, 1.0, 0.0), stiffness=100.0)
-
-    def turned(**load):
-        model = lg.Model(
-            {"bar": lg.RigidBody(2.0, (0.1, 0.1, 0.1), position=(0.5, 0.0, 0.0))},
-            {"hinge": lg.RevoluteJoint(None, "bar", at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))},
-            {"spring": spring, "load": lg.AppliedForce("bar", **load)},
-        )
-        found = lg.statics(model, loads={"load": np.array([0.0, 10.0])})
-        return found.joint("hinge").angle, found.along().joint("hinge").rate
-
+    axis, fixed = {"axis": (0.0, 1.0, 0.0)}, {"fixed_moment": (0.0, 1.0, 0.0)}
     up = {"at": (0.5, 0.0, 0.0), "force": (0.0, 0.0, 1.0), "follows": True}  # −0.5 N m about y, however it turns
-    for load, moment in (({"fixed_moment": (0.0, 1.0, 0.0)}, 1.0), (up | {"fixed_moment": (0.0, 1.0, 0.0)}, 0.5)):
-        angles, rates = turned(**load)
+    loads, moments = {"one": fixed, "other": up | fixed}, {"one": 1.0, "other": 0.5}
+    bodies, joints, forces = {}, {}, {}
+    for bar, load in loads.items():  # two bars that have nothing to do with each other
+        bodies[bar] = lg.RigidBody(2.0, (0.1, 0.1, 0.1), position=(0.5, 0.0, 0.0), free="x z ry")
+        joints[bar] = lg.RevoluteJoint(None, bar, at=(0.0, 0.0, 0.0), **axis)
+        forces[f"spring of {bar}"] = lg.TorsionSpringDamper(None, bar, stiffness=100.0, **axis)
+        forces[bar] = lg.AppliedForce(bar, **load)
+    found = lg.statics(lg.Model(bodies, joints, forces), loads=dict.fromkeys(loads, np.array([0.0, 10.0])))
+    along = found.along()
+    for bar, moment in moments.items():
         # round-off of angles of 0.1 rad in rotations and their logarithm, a few
-        np.testing.assert_allclose(angles, [0.0, 0.1 * moment], atol=1e-13)
-        np.testing.assert_allclose(rates, [0.01 * moment] * 2, rtol=1e-11)
+        np.testing.assert_allclose(found.joint(bar).angle, [0.0, 0.1 * moment], atol=1e-13)
+        np.testing.assert_allclose(along.joint(bar).rate, [0.01 * moment] * 2, rtol=1e-11)
 
 
 def test_points_that_start_anew_are_told_from_the_first():
     """Upwards to 3 rad and then downwards to −3 rad, 6 rad apart: the moment is that of the spring all the way."""
     axis = {"axis": (0.0, 0.0, 1.0)}
-    joints = {
-        "hinge": lg.RevoluteJoint(None, "rotor", at=(0.0, 0.0, 0.0), **axis),
-        "drive": lg.RotationDriver(None, "rotor", **axis),
-    }
+    joints = {"drive": lg.RotationDriver(None, "rotor", **axis)}
     spring = {"spring": lg.TorsionSpringDamper(None, "rotor", stiffness=2.0, **axis)}
-    model = lg.Model({"rotor": lg.RigidBody(1.0, (0.1, 0.1, 0.2))}, joints, spring)
+    model = lg.Model({"rotor": lg.RigidBody(1.0, (0.1, 0.1, 0.2), free="rz")}, joints, spring)
     angles = np.array([0.0, 1.5, 3.0, -1.5, -3.0])
     found = lg.statics(model, driven={"drive": angles}, starts=(3,))
     np.testing.assert_allclose(-found.multiplier("drive")[:, 0], 2.0 * angles, atol=1e-11)  # round-off of Newton

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import some_quick
 
 import lgsens as lg
 from lgsens import rigs
@@ -82,7 +83,7 @@ def rolled(p, compliant):
 
 @pytest.mark.parametrize(
     ("compliant", "by_numbers"),
-    [(True, False), (False, True), pytest.param(True, True, marks=pytest.mark.slow)],  # the last compiles longest
+    some_quick([(False, True), (True, False), (True, True)]),  # of beams: `test_axles.py` has their forces in balance
 )
 def test_it_rolls_as_closed_forms_say(compliant, by_numbers):
     """On ball joints, of a beam and of halves, derivatives by G J, both hardpoints and the shear centre too. The shear

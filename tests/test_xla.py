@@ -68,7 +68,7 @@ def test_other_flags_stay_and_so_does_a_choice_of_ones_own(flags):
     assert found.stdout.split() == " ".join(expected).split(), found.stderr
 
 
-@pytest.mark.parametrize("flags", ["", f"{EXTRA}=xla_lgsens=off"])
+@pytest.mark.parametrize("flags", some_quick([f"{EXTRA}=xla_lgsens=off", ""]))  # without others: `test_sums_are_right`
 def test_xla_takes_the_options(flags):
     """It ends the process at one that it cannot read."""
     found = run("import lgsens, jax\nassert jax.jit(lambda x: x + 1)(1) == 2", flags)
@@ -97,7 +97,7 @@ def test_what_is_traced_sets_the_collector_back():
     assert gc.get_threshold() == before
 
 
-@pytest.mark.parametrize("cores, own, threads", [(2, None, "1"), (2, "2", "2"), (16, None, "None")])
+@pytest.mark.parametrize("cores, own, threads", some_quick([(2, None, "1"), (2, "2", "2"), (16, None, "None")]))
 def test_few_cores_get_one_thread_unless_the_user_says_otherwise(cores, own, threads):
     """On two, batched factorizations at once wait for each other for ever, before 0.12."""
     if own is None and VERSION >= (0, 12):

@@ -41,8 +41,13 @@ def by_jax():
     """The gradients by jax.grad of the criterion of a trajectory."""
     p = jax.tree.map(jnp.asarray, P)
     is_criterion = lambda leaf: isinstance(leaf, lg.Criterion)
-    all_of = lambda p: jax.tree.map(lambda c: psi(c, p), CRITERIA, is_leaf=is_criterion)
-    return jax.jit(all_of)(p), jax.jit(jax.jacrev(all_of))(p)
+
+    def all_of(p):
+        values = jax.tree.map(lambda c: psi(c, p), CRITERIA, is_leaf=is_criterion)
+        return values, values
+
+    gradients, values = jax.jit(jax.jacrev(all_of, has_aux=True))(p)
+    return values, gradients
 
 
 @pytest.mark.parametrize(

@@ -252,7 +252,7 @@ def test_depth(scheme):
     A level has a product, a sum, and what takes rows apart and puts them together again, on the way down and up, in
     two solutions: 12 to 16 operations each.
     """
-    few, many = programs(scheme, 64), programs(scheme, 512)
+    few, many = programs(scheme, 16), programs(scheme, 128)
     for name in few:
         (sweep, scan), (long_sweep, long_scan) = (list(map(depth, found[name])) for found in (few, many))
         assert 7.0 < long_sweep / sweep <= 8.5, name

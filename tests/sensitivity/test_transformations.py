@@ -96,15 +96,14 @@ def test_reverse_and_forward(scene):
     np.testing.assert_allclose(jacobian, expected, rtol=0, atol=1e-8 * scale)
 
     @jax.jit
-    def forward(x, d):
-        return jax.jacfwd(scene.function)(x), jax.jvp(scene.function, (x,), (d,))[1]
+    def others(x, d, w):
+        along = jax.jvp(scene.function, (x,), (d,))[1]
+        return jax.jacfwd(scene.function)(x), along, jax.vjp(scene.function, x)[1](w)[0]
 
-    direction = jnp.array([0.3, -0.7])
-    by_columns, along = forward(scene.x, direction)
+    direction, weights = jnp.array([0.3, -0.7]), jnp.array([0.4, 0.9])
+    by_columns, along, pulled_back = others(scene.x, direction, weights)
     np.testing.assert_allclose(by_columns, jacobian, rtol=0, atol=1e-11 * scale)
     np.testing.assert_allclose(along, jacobian @ direction, rtol=0, atol=1e-11 * scale)
-    weights = jnp.array([0.4, 0.9])
-    pulled_back = jax.jit(lambda x, w: jax.vjp(scene.function, x)[1](w)[0])(scene.x, weights)
     np.testing.assert_allclose(pulled_back, weights @ jacobian, rtol=0, atol=1e-11 * scale)
 
 
