@@ -417,11 +417,10 @@ def test_a_criterion_of_one_argument():
 
 def test_drivers_that_contradict_each_other():
     """They are named, where no configuration is found."""
-    hinge = lg.RevoluteJoint(None, "bob", at=ORIGIN, axis=Z)
     ramps = {
         f"to {end}": lg.RotationDriver(None, "bob", axis=Z, value=lg.Ramp(end=end, duration=1.0)) for end in (0.5, 1.0)
     }
-    model = lg.Model({"bob": body(position=X)}, {"hinge": hinge} | ramps)
+    model = lg.Model({"bob": body(position=X, free="x rz")}, ramps)
     with pytest.raises(ValueError, match=says("constrain the same motion twice", "['to 0.5', 'to 1.0']")):
         lg.simulate(model, t1=0.1, num_steps=1)
 

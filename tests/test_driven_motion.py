@@ -29,6 +29,7 @@ def crank(value) -> lg.Model:
     return lg.Model(model.bodies, model.joints | {"motor": motor}, model.forces | {"weight": lg.Gravity(GRAVITY)})
 
 
+@jax.jit
 def quantities(motion):
     """Of a motion at its end: positions, velocities, accelerations of slider and rod, the motor's moment."""
     bodies = [motion.body(name) for name in ("slider", "conrod")]

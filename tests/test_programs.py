@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from driven_pendulum import P as PENDULUM, make as driven_pendulum
-from helpers import says
+from helpers import says, some_quick
 from jax import export
 
 import lgsens as lg
@@ -114,7 +114,7 @@ def test_designs_over_a_mesh(derivative, f):
         np.testing.assert_allclose(found, expected, rtol=1e-9)  # two programs
 
 
-@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
+@pytest.mark.parametrize("derivative", some_quick([jax.grad, jax.jacfwd]))
 def test_controlled_steps_over_a_mesh_are_lowered(derivative):
     """What varies is checked there; compiled above."""
     assert over_mesh(derivative(controlled)).lower(jnp.ones((2, 2))).out_info.shape == (2, 2)

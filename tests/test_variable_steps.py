@@ -151,7 +151,7 @@ def test_second_derivatives_on_a_given_grid():
 
 def test_error_control():
     """Grid, statistics, and what repeats after the last step."""
-    run = adaptive()(jnp.array(P))
+    (_, run), _ = DIFFERENTIATED(jnp.array(P))
     steps, sizes = int(run.stats.steps), np.diff(run.t)
     assert run.result == lg.RESULTS.successful and 50 <= steps < 250
     assert np.all(sizes[:steps] > 0) and np.all(sizes[steps:] == 0)

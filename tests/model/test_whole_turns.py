@@ -192,8 +192,8 @@ def test_positions_do_not_tell_more_than_half_a_turn(name):
 
 
 @pytest.mark.parametrize(
-    "name", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("bushing", "beam")), "rotational"]
-)
+    "name", [pytest.param(name, marks=pytest.mark.slow) for name in ("bushing", "beam", "rotational")]
+)  # in the quick run: positions of a bushing, above, and the motion of a torsion spring
 def test_springs_against_all_rotations_fail_there_too(name):
     """ω₀ √(J/k) = 4 rad, which none within half a turn can hold; without stiffness about the hinge it may turn."""
     start = 4.0 * np.sqrt(STIFFNESS / INERTIA)

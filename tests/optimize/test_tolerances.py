@@ -1,5 +1,6 @@
 """Tolerances against closed forms and against scatter that was drawn."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -94,6 +95,7 @@ def test_of_a_simulation():
     """The top's criterion by tilt and length: T is that of its gradient."""
     from lgsens.examples import spinning_top
 
+    @jax.jit
     def psi(p):
         run = lg.simulate(spinning_top(p["tilt"], length=p["length"]), t1=0.1, num_steps=5, throw=False)
         return lg.time_integral(run.t, run.body("top").position[:, 0] ** 2)

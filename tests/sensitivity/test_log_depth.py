@@ -108,8 +108,8 @@ def linear_problem(scheme, num_steps, uneven=False):
     sizes = h * jnp.array([1.0, 0.0, 1.5, 0.0, 0.0, 1.2][:num_steps])
     grid = UnevenGrid.first(t0, sizes) if uneven else EqualGrid(t0, h, num_steps)
     parameters = Parameters(system, grid)
-    start = scheme.complete(system, initial_state(system, t0).state)
-    states, _ = jax.jit(lambda: states_of(scheme, *parameters, start))()
+    start = lambda: scheme.complete(system, initial_state(system, t0).state)
+    states, _ = jax.jit(lambda: states_of(scheme, *parameters, start()))()
     rng = np.random.default_rng(1)
     return scheme, states, parameters, *(random_like((Variation.none(states), parameters), rng) for _ in range(2))
 
@@ -231,11 +231,14 @@ def depth(jaxpr) -> int:
 
 
 def programs(scheme, n):
-    """The derivative alone, at given states, which the march finds one after the other: forward, reverse; and twice."""
+    """The derivative alone, at given states, which the march finds one after the other: forward, reverse; and twice.
+
+    Programs do not depend on the numbers in states: these are zeros.
+    """
     system, zero = spinning_top(0.7).system(), jnp.asarray(0.0)
     parameters = Parameters(system, EqualGrid(zero, jnp.asarray(1e-3), n))
-    state = scheme.complete(system, initial_state(system, zero).state)
-    states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n + 1, *leaf.shape)), state)
+    state = jax.eval_shape(lambda: scheme.complete(system, initial_state(system, zero).state))
+    states = jax.tree.map(lambda leaf: jnp.zeros((n + 1, *leaf.shape), leaf.dtype), state)
     b = Variation.none(states), parameters
     of = scheme, states, parameters
     pairs = {"forward": (direct_sweep, direct_at_once), "reverse": (adjoint_sweep, adjoint_at_once)}
