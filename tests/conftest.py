@@ -2,7 +2,8 @@
 
 Nearly all their time is compilation, so XLA's costly optimizations are off, as in JAX's own tests: a third less. So are
 its fusion emitters where they can be (jaxlib 0.10), as with lgsens, but loops are left as they are: a tenth less. Nor
-does XLA look for what a loop may leave outside or inside, again and again in loops in loops: a quarter less.
+does XLA look for what a loop may leave outside or inside, again and again in loops in loops: a quarter less. LLVM gets
+a program as one module and not as 32, which may be compiled side by side and cost more together: a tenth less.
 `pytest --optimized` compiles as users do. Programs that two tests have in common, mostly single operations, are
 compiled once in a run: JAX keeps them in a folder that ends with it.
 """
@@ -41,7 +42,8 @@ def pytest_configure(config):
     jax.config.update("jax_disable_most_optimizations", True)
     option = "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters=true"
     passes = "--xla_disable_hlo_passes=while-loop-invariant-code-motion,while-loop-constant-sinking"
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {option} {passes}"
+    whole = "--xla_cpu_parallel_codegen_split_count=1"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {option} {passes} {whole}"
 
 
 def _forget_programs():
