@@ -197,5 +197,5 @@ def test_the_front_axle_has_the_other_wheelbase(car, curves):
 def test_bad_input(car):
     with pytest.raises(ValueError, match="`axle` must be 'rear' or 'front', got 'middle'"):
         car.curves(TRAVEL, axle="middle")
-    with pytest.raises(ValueError, match=r"No position satisfies.* at position 1, driven values \[0.5\]"):
+    with pytest.raises(ValueError, match=r"No position satisfies.* at position 1, driven values travel = 0.5"):
         car.curves([0.0, 0.5])

@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from lgsens._validate import as_float
@@ -121,6 +122,7 @@ def kinematics(
     clock = jnp.zeros_like(time) if t is None else jnp.ones_like(time)
     (states, result), details = _kinematics_jit(*alike((drive, (given, time), (speed, clock))))
     if throw:
+        details = details if isinstance(result, Tracer) else details | {"names": names}
         states = throw_if_failed(states, result, details, system.constraint_names)
     return Kinematics(values=values, t=time, states=states, result=result, system=system, joints=model.joints)
 

@@ -131,8 +131,10 @@ def statics(
     drive, path, slopes, start = alike((drive, path, slopes, start))
     (states, responses, result), details = _statics_jit(drive, path, slopes, start, tuple(starts))
     if throw:
-        if not isinstance(result, Tracer) and int(result) == RESULTS.not_held:
-            details = details | {"free": _free_bodies(drive, details)}
+        if not isinstance(result, Tracer):
+            details = details | {"names": names}
+            if int(result) == RESULTS.not_held:
+                details = details | {"free": _free_bodies(drive, details)}
         states, responses = throw_if_failed((states, responses), result, details, system.constraint_names)
     time = jnp.broadcast_to(start, shape)
     own = {"states": states, "responses": responses, "result": result}

@@ -1,6 +1,7 @@
 """The numbers of an axle by the keys that they have in its file, and those of them that a design may change."""
 
 from collections.abc import Iterator, Mapping
+from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
@@ -123,7 +124,9 @@ class AxleNumbers(eqx.Module):
             matched = [name for name in every if fnmatchcase(name, pattern) or fnmatchcase(name, f"{pattern}.*")]
             if not matched:
                 known = sorted({name.rpartition(".")[0] if name[-1] in "xyz123" else name for name in every})
-                raise ValueError(f"`vary`: {pattern!r} matches no number of the axle; there are {known}.")
+                close = [repr(name) for name in get_close_matches(pattern, known)]
+                meant = f"did you mean {' or '.join(close)}? There" if close else "there"
+                raise ValueError(f"`vary`: {pattern!r} matches no number of the axle; {meant} are {known}.")
             chosen |= {name: (pattern, bound) for name in matched}
         kept = {kind: tuple(place for place in of if place.name in chosen) for kind, of in places(axle).items()}
         kept = {kind: of for kind, of in kept.items() if of}

@@ -71,17 +71,14 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
                 f"{np.ceil(num_steps * turn / 0.3):.0f}. `throw=False` returns the data."
             )
         case RESULTS.angle_jumped if "position" in details:
-            driven = np.array2string(details["values"], precision=6)
-            more = f"It did so before position {int(details['position'])}, driven values {driven}. It is told from the "
+            more = f"It did so before position {int(details['position'])}{_driven(details)}. It is told from the "
             more += "position before: let them be less than half a turn apart. `throw=False` returns the data."
         case RESULTS.angle_jumped:
             more = f"It did so in {place}, {time}. `throw=False` returns the data."
         case RESULTS.position_failed:
-            driven = np.array2string(details["values"], precision=6)
-            more = f"It failed at position {int(details['position'])}, driven values {driven}, {time}. {worst}"
+            more = f"It failed at position {int(details['position'])}{_driven(details)}, {time}. {worst}"
         case RESULTS.statics_failed | RESULTS.not_held:
-            driven = np.array2string(details["values"], precision=6)
-            more = f"It failed at point {int(details['position'])}, driven values and factors {driven}."
+            more = f"It failed at point {int(details['position'])}{_driven(details)}."
             if len(details.get("free", ())):
                 more = f"What moves freely: {', '.join(map(str, details['free']))}. {more}"
         case RESULTS.steps_exhausted:
@@ -94,6 +91,15 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
         case _:
             more = ""
     return f"{code.message} {more}".strip()
+
+
+def _driven(details: dict[str, Any]) -> str:
+    """The values of drivers and the factors of loads, by name those that are not zero."""
+    values, names = np.atleast_1d(details["values"]), details.get("names")
+    if names is None:
+        return f", driven values {np.array2string(values, precision=6)}"
+    moved = [f"{name} = {value:.6g}" for name, value in zip(names, values) if value != 0.0]
+    return f", driven values {', '.join(moved) or 'all 0'}" if len(names) else ""
 
 
 def _exception(result: int, details: dict[str, Any], names: tuple[str, ...], note: str) -> Exception:
