@@ -3,6 +3,7 @@
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import says
@@ -98,6 +99,10 @@ def test_masses_and_rates_of_packs(load, leaves, full):
     mass = float(sum(body.mass for body in nodes.values()))
     assert mass == pytest.approx(float(leaf.leaf.mass) * 1.2 * (full + leaves) / 2, rel=1e-12)
     assert mass + 1.2 == pytest.approx(float(leaf.own_mass), rel=1e-12)
+    one = 100.0 * leaf.leaf.stress(jnp.array([0.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0]))
+    for count, element in zip(leaf.counts, elements.values()):  # of each leaf by its share of the moment
+        moment = jnp.array([0.0, 100.0 * count, 0.0])
+        np.testing.assert_allclose(element.section.stress(jnp.zeros(3), moment), one, rtol=1e-12)
     shear_free = closed_form(leaf, 0.5, 0.7)[3]
     np.testing.assert_allclose(leaf.rate, 1.2**2 / (0.5 * 0.7) ** 2 / shear_free, rtol=1e-8)
 
@@ -163,6 +168,9 @@ def without(document, key):
         (lambda d: without(d, "solid_axle"), ("key 'leaf_spring'", "solid_axle")),
         (lambda d: d["leaf_spring"].update(seat=[1.0, 0.5, 0.0]), ("leaf_spring.seat", "between the two eyes")),
         (lambda d: d["leaf_spring"].update(shackle=[-0.6, 0.5, 0.0]), ("leaf_spring.shackle", "cannot swing")),
+        (lambda d: d["leaf_spring"].update(seat=[0.0, -0.5, 0.0]), ("leaf_spring.seat", "no further from their line")),
+        (lambda d: d["leaf_spring"].update(shackle=[-0.6, -0.5, 0.1]), ("leaf_spring.shackle", "nor across the car")),
+        (lambda d: d["leaf_spring"].update(width=0.008, thickness=0.06), ("leaf_spring.thickness", "exchanged")),
         (lambda d: d["leaf_spring"].update(thickness=8.0), ("leaf_spring.thickness", "did you mean 0.008")),
         (lambda d: d["leaf_spring"].update(thickness=1e-3), ("leaf_spring.thickness", "would be pressed by")),
         (lambda d: d["leaf_spring"].update(young=2e5), ("leaf_spring.young", "did you mean 2e+11")),

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import GRAVITY, close, factorizations, says, some_quick
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import lgsens as lg
@@ -221,3 +222,48 @@ def test_a_beam_that_is_bent_by_three_radians_at_once(thickness):
     end = np.array([np.sin(3.0), 0.0, np.cos(3.0) - 1.0]) / 3.0
     # exact for any number of elements; of round-off 1e-16 times the condition, EA L²/EI of 1e9
     np.testing.assert_allclose(found.body("beam.8").position[1], end, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("points", [2, 4])
+def test_a_column_does_not_jump_to_a_branch_that_is_unstable(points):
+    """At three times Euler's load, with 2 % of E I aside; against the elastica of a cantilever."""
+    length, bending = 1.0, 4.0
+    section = lg.BeamSection([1e6, 1e6, 1e6, bending, bending, bending], mass=1.0, inertia=(1e-3, 1e-3, 1e-3))
+    beam = lg.Beam("beam", section, [[0.0, 0.0, 0.0], [length, 0.0, 0.0]], elements=10)
+    critical = np.pi**2 * bending / (4.0 * length**2)
+    loads = {
+        "down": lg.AppliedForce("beam.10", at=(length, 0.0, 0.0), force=(-critical, 0.0, 0.0)),
+        "aside": lg.AppliedForce("beam.10", at=(length, 0.0, 0.0), force=(0.0, 0.0, 0.02 * bending)),
+    }
+    joints = {"clamp": lg.FixedJoint(None, "beam.0", at=(0.0, 0.0, 0.0))}
+    model = lg.Model(beam.bodies, joints, beam.forces | loads)
+    way = {"down": np.linspace(0.0, 3.0, points), "aside": np.ones(points)}
+    found = np.asarray(lg.statics(model, loads=way).body("beam.10").position[-1])
+
+    def tip(moment):
+        """The end of E I θ″ = −P sin θ − S cos θ from the clamp, θ = 0, with this moment there."""
+        P, S = 3.0 * critical, 0.02 * bending
+        slope = lambda s, y: [y[1], (-P * np.sin(y[0]) - S * np.cos(y[0])) / bending, np.cos(y[0]), np.sin(y[0])]
+        return solve_ivp(slope, (0.0, length), [0.0, moment / bending, 0.0, 0.0], rtol=1e-10, atol=1e-12).y[:, -1]
+
+    moment = brentq(lambda moment: tip(moment)[1], 10.0, 40.0)
+    # the mesh's error: 1/(12·10²) of the curvature, largest 5 rad/m, over the length
+    np.testing.assert_allclose(found[[0, 2]], tip(moment)[2:], atol=5e-3)
+
+
+def test_lengths_that_cannot_be_closed_are_out_of_reach():
+    """Not something that moves freely, as K is singular where the triangle closes. The path is lost there."""
+    rods = {
+        name: lg.DistanceJoint(None, "point", at_a=at, at_b=(0.0, 0.0, 0.5))
+        for name, at in (("left", (-0.3, 0.0, 0.0)), ("right", (0.3, 0.0, 0.0)))
+    }
+    point = {"point": lg.RigidBody(1.0, None, position=(0.0, 0.0, 0.5), free="x z")}
+    model = lg.Model(point, rods, {"gravity": lg.Gravity((0.0, 0.0, -9.81))})
+    lengths = np.array([0.58, 0.4, 0.31, 0.2, 0.4, 0.45])
+    way = {"left": lengths, "right": lengths}
+    with pytest.raises(lg.SimulationError, match=says("No static equilibrium", "at point 3", "left = 0.2")):
+        lg.statics(model, way)
+    found = lg.statics(model, way, starts=[5], throw=False)
+    height = np.sqrt(lengths**2 - 0.3**2, where=lengths > 0.3, out=np.full(6, np.nan))
+    height[4] = np.nan  # after it, and before the next start
+    np.testing.assert_allclose(found.body("point").position[:, 2], height, rtol=1e-12)

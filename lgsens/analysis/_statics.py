@@ -89,7 +89,8 @@ def statics(
             branch begins, as from the design position upwards and then downwards.
         t0: the time at which signals and time-dependent forces are taken, shape ().
         throw: raise if there is no such equilibrium, or an angle of a spring, a gear or a coupling passes half a turn.
-            With False `result` says so; numbers of a point that is none are NaN.
+            With False `result` says so; numbers of a point that is none are NaN, and those of the points after it up to
+            the next of `starts`.
 
     The first point is found from the reference configuration. Differentiable by every number of the model, by driven
     values, factors and rates, by the implicit function theorem: one factorization per point for all of them, responses
@@ -151,8 +152,7 @@ def _statics_jit(drive: Drive, values, rates, t, starts: tuple[int, ...]):
     several = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], (n, r, *leaf.shape[1:])), found.q)
     responses = State(q=several, v=found.w, vdot=none, lam=found.lam_rate, a=none)
     first = jnp.argmin(found.found)  # the first that was not found, 0 if all were
-    free = found.pivot[first] < 1e3 * jnp.finfo(values.dtype).eps
-    failed = jnp.where(free, RESULTS.not_held, RESULTS.statics_failed)
+    failed = jnp.where(found.free[first], RESULTS.not_held, RESULTS.statics_failed)
     result = jnp.where(jnp.all(found.found), RESULTS.successful, failed)
     first, result = unless_jumped(drive.system, found.q, first, result, starts)
     result = jnp.where(drive.system.is_valid(), result, RESULTS.invalid_numbers).astype(jnp.int32)

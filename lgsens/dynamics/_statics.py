@@ -12,7 +12,10 @@ Path. In one scan each point begins at the one before, moved along its tangent K
 modified Newton, factors renewed when an iteration leaves more than a fifth of the step. Once steps are below √ε, one
 more with new factors ends at round-off, and its factors are those of the tangents: one or two factorizations per point.
 Where that finds nothing, a quarter of the way is tried, from there more, along new tangents: a beam moved along its
-tangent by an angle θ is stretched by θ²/2, and Newton's method is lost where forces of E A θ²/2 make K indefinite.
+tangent by an angle θ is stretched by θ²/2, and Newton's method is lost where forces of E A θ²/2 make K indefinite. So
+it is where a path of stable equilibria, Zᵀ K_t Z positive definite with B Z = 0, comes to one that is not: that is on
+another branch, unless the shortest stage finds it too and the path itself goes through a bifurcation. A path that is
+lost goes on at the next point that is found from the first one.
 
 Responses. To rates s′ along the path (a direction, of which there may be several) the equilibrium answers with
 
@@ -62,7 +65,7 @@ class StaticPath(NamedTuple):
     w: Float[Array, "n r k"]
     lam_rate: Float[Array, "n r m"]
     found: Bool[Array, " n"]
-    pivot: Float[Array, " n"]  # the smallest pivot of the scaled K over the largest: 0 where it is singular
+    free: Bool[Array, " n"]  # K is singular, at an equilibrium or where none was to be found from the first point on
 
 
 class _Begin(NamedTuple):
@@ -73,17 +76,32 @@ class _Begin(NamedTuple):
     lam: Float[Array, " m"]
     w: Float[Array, " k"]
     lam_rate: Float[Array, " m"]
+    stable: Bool[Array, ""]
 
 
 class _Factors(NamedTuple):
     """K in factors, in units in which its unknowns are of order one: lengths of the scene, rad, and `force`."""
 
     lu: Any  # LU or Inverse
+    matrix: Float[Array, "n n"]
     coordinate: Float[Array, " k"]
     force: Float[Array, ""]  # J, the size of K_t in these units
 
     def residual(self, force, violation):
         return jnp.concatenate([force * self.coordinate / self.force, violation])
+
+    @property
+    def stable(self) -> Bool[Array, ""]:
+        """Whether Zᵀ K_t Z is positive definite, with columns of Z that B lets move."""
+        k = self.coordinate.shape[0]
+        stiffness, jacobian = self.matrix[:k, :k], self.matrix[k:, :k]
+        z = (
+            jnp.linalg.qr(jacobian.T, mode="complete")[0][:, jacobian.shape[0] :]
+            if len(jacobian)
+            else jnp.eye(k, dtype=stiffness.dtype)
+        )
+        reduced = z.T @ stiffness @ z
+        return jnp.all(jnp.isfinite(lax.linalg.cholesky((reduced + reduced.T) / 2.0, symmetrize_input=False)))
 
     def parts(self, y) -> tuple[Array, Array]:
         k = self.coordinate.shape[0]
@@ -129,7 +147,7 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
 
     def factorize(s, q, lam):
         matrix, units = _matrix(drive, s, q, lam, t)
-        return _Factors(LU.of(matrix), *units)
+        return _Factors(LU.of(matrix), matrix, *units)
 
     def move(q, lam, w, change):
         return group.retract(q, w), lam + change
@@ -175,17 +193,20 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
             at, share = s - (1.0 - to) * way, to - reached
             q, lam = move(near.q, near.lam, share * near.w, share * near.lam_rate)
             q, lam, factors, done = newton(at, q, lam, factors, stale)
+            stable = factors.stable
+            done = done & (first | stable | ~near.stable | (share * _SHORTER <= _LEAST))
             # The last direction is that onward.
             along = jnp.concatenate([rates, jnp.where(to < 1.0, way, ahead)[None]])
             w, lam_rate = respond(at, along, q, lam, factors)
             keep = lambda new, old: jnp.where(done, new, old)
-            near = jax.tree.map(keep, _Begin(at, q, lam, w[-1], lam_rate[-1]), near)
+            near = jax.tree.map(keep, _Begin(at, q, lam, w[-1], lam_rate[-1], stable), near)
             size = jnp.where(done, _LONGER, _SHORTER) * share
             return near, factors, ~done, keep(to, reached), size, w[:-1], lam_rate[:-1]
 
         def unfinished(carry):
             _, _, _, reached, size, *_ = carry
-            return (reached < 1.0) & (size > jnp.where(first, 0.5, _LEAST))  # the first point has no way to it
+            # The first point has no way to it.
+            return (reached < 1.0) & (size > jnp.where(first, 0.5, _LEAST)) & (begins | held)
 
         none, one = jnp.zeros((), dtype), jnp.ones((), dtype)
         answers = jnp.zeros((len(rates), k), dtype), jnp.zeros((len(rates), m), dtype)
@@ -195,13 +216,14 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
         home = jax.tree.map(lambda new, old: jnp.where(first & done, new, old), near, home)
         home = home._replace(w=jnp.zeros_like(home.w), lam_rate=jnp.zeros_like(home.lam_rate))
         pivots = jnp.abs(jnp.diagonal(factors.lu.lu))
-        ended = done.astype(dtype), jnp.min(pivots) / jnp.max(pivots)
+        free = jnp.min(pivots) < 1e3 * jnp.finfo(dtype).eps * jnp.max(pivots)
+        ended = done.astype(dtype), (free & (done | first)).astype(dtype)
         return (home, near, factors, done), (near.q, near.lam, w, lam_rate, *ended)
 
     whole = jnp.arange(k + m, dtype=jnp.int32)
-    start = _Begin(values[0], home, jnp.zeros(m, dtype), jnp.zeros(k, dtype), jnp.zeros(m, dtype))
+    start = _Begin(values[0], home, jnp.zeros(m, dtype), jnp.zeros(k, dtype), jnp.zeros(m, dtype), jnp.zeros((), bool))
     none = LU(jnp.zeros((k + m, k + m), dtype), whole, whole)
-    factors = _Factors(none, jnp.ones(k, dtype), jnp.ones((), dtype))
+    factors = _Factors(none, none.lu, jnp.ones(k, dtype), jnp.ones((), dtype))
     rows = values, rates, ahead, begins, jnp.arange(n) == 0
     return scan(follow, (start, start, factors, jnp.zeros((), bool)), rows)[1]
 
@@ -214,7 +236,9 @@ def _path_jvp(starts, primals, tangents):
     group, rows = drive.system.group, (q, lam, values)
     every = lambda of, xs: scan(lambda _, row: (None, of(*row)), None, xs)[1]
     matrix, units = jax.vmap(lambda q, lam, s: _matrix(drive, s, q, lam, t))(*rows)
-    factors = jax.vmap(lambda matrix, *units: _Factors(Inverse.of(matrix), *units))(lax.stop_gradient(matrix), *units)
+    factors = jax.vmap(lambda matrix, *units: _Factors(Inverse.of(matrix), matrix, *units))(
+        lax.stop_gradient(matrix), *units
+    )
 
     def solve(force, violation):
         """−K⁻¹ at every point: products, which are one operation for all directions."""
@@ -247,8 +271,8 @@ def static_path(
 ) -> StaticPath:
     """The equilibria at each row of driven values, and their responses to each direction of rates, differentiable by
     the rule above; NaN where none was found."""
-    *found, done, pivot = _path(starts, drive, values, rates, t)
-    held = (done > 0) & (pivot > 1e2 * jnp.finfo(pivot.dtype).eps)
+    *found, done, free = _path(starts, drive, values, rates, t)
+    held = (done > 0) & (free == 0)
     poison = lambda leaf: jnp.where(held.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.nan)
     q, lam, w, lam_rate = jax.tree.map(poison, tuple(found))
-    return StaticPath(q, lam, w, lam_rate, held, pivot)
+    return StaticPath(q, lam, w, lam_rate, held, free > 0)

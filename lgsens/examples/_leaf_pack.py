@@ -34,6 +34,7 @@ FRONT, SEAT, REAR = "front", "seat", "rear"
 POINTS = (FRONT, SEAT, REAR, SHACKLE)
 ELEMENTS = 4  # of either half
 MOST_LEAVES = 30
+MOST_CAMBER, MOST_SPLAY, MOST_SHACKLE = 0.35, 0.4, 0.6  # of the length between eyes, of what is along, of that length
 
 
 class LeafPack(eqx.Module):
@@ -122,7 +123,7 @@ class LeafPack(eqx.Module):
         }
         bodies[own + SHACKLE] = self.shackle().body()
         forces = {
-            name: dataclasses.replace(element, section=_times(element.section, n))
+            name: dataclasses.replace(element, section=element.section.stacked(n))
             for n, (name, element) in zip(self.counts, beam.forces.items())
         }
         return bodies, forces
@@ -137,11 +138,6 @@ class LeafPack(eqx.Module):
         return Part(middle, self.shackle_mass, self.shackle_mass / 12.0 * (across + wide))
 
 
-def _times(section: BeamSection, leaves: float) -> BeamSection:
-    rates = (leaves * of for of in (section.stiffness, section.mass, section.inertia))
-    return eqx.tree_at(lambda section: (section.stiffness, section.mass, section.inertia), section, tuple(rates))
-
-
 def read_leaf_spring(table: Reader, kilogram: float) -> LeafPack:
     """The table `leaf_spring`."""
     table.only(
@@ -150,20 +146,30 @@ def read_leaf_spring(table: Reader, kilogram: float) -> LeafPack:
     ends = {name: table.point(name) for name in POINTS}
     front, seat, rear, shackle = (np.asarray(ends[name]) for name in POINTS)
     chord, arm = rear - front, shackle - rear
-    share = np.dot(seat - front, chord) / max(np.dot(chord, chord), 1e-12)
-    if not (0.1 < share < 0.9 and abs(chord[1]) < 0.3 * abs(chord[0])):
+    length = np.linalg.norm(chord)
+    share = np.dot(seat - front, chord) / max(length**2, 1e-12)
+    off = np.linalg.norm(seat - front - share * chord)
+    if not (0.1 < share < 0.9 and off < MOST_CAMBER * length and abs(chord[1]) < MOST_SPLAY * abs(chord[0])):
         raise table.fail(
             SEAT,
-            "must be between the two eyes, of a spring along the car, not across; got front, seat and rear "
-            f"{np.stack([front, seat, rear]).tolist()} [m].",
+            "must be between the two eyes, and no further from their line than a leaf is bent, of a spring along the "
+            f"car, not across; got front, seat and rear {np.stack([front, seat, rear]).tolist()} [m].",
         )
-    if not np.linalg.norm(np.cross(arm, chord)) > 0.2 * np.linalg.norm(arm) * np.linalg.norm(chord):
+    reach, swings = np.linalg.norm(arm), np.linalg.norm(np.cross(arm, chord)) > 0.2 * np.linalg.norm(arm) * length
+    if not (0 < reach < MOST_SHACKLE * length and swings and abs(arm[1]) < MOST_SPLAY * reach):
         raise table.fail(
             SHACKLE,
-            "is where the shackle, which begins at the rear eye, is pinned to the chassis; it has no length or lies "
-            f"along the spring and cannot swing, got rear and shackle {np.stack([rear, shackle]).tolist()} [m].",
+            "is where the shackle, which begins at the rear eye, is pinned to the chassis: over or under it, not along "
+            "the spring, where it cannot swing, nor across the car, along its pins; got rear and shackle "
+            f"{np.stack([rear, shackle]).tolist()} [m].",
         )
     section = {name: table.metres(name, 0.5) for name in ("width", "thickness")}
+    if not section["thickness"] <= section["width"]:
+        raise table.fail(
+            "thickness",
+            f"{float(section['thickness']):g} m is more than the width, {float(section['width']):g} m, of a leaf that "
+            "lies flat; they are exchanged.",
+        )
     material = read_material(table) | ({"damping": table.number("damping")} if "damping" in table else {})
     leaves = table.count("leaves")
     full = table.count("full_length") if "full_length" in table else 1

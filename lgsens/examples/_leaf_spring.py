@@ -41,8 +41,8 @@ def leaf_spring(
 
         F (L³/48 E I + L/4 k G A),     I = n b t³/12,
 
-    less 1/(4 (elements/2)²) of the first term; camber and shackle change it as they turn. Stress in a leaf is that of
-    the n-th part of `SectionState.moment`. All numbers but counts may be traced.
+    less 1/(4 (elements/2)²) of the first term; camber and shackle change it as they turn. The stress of a
+    `SectionState` is that in a leaf. All numbers but counts may be traced.
 
     Raises `ValueError` for an odd number of elements. Source: SAE HS-788, Manual on Design and Application
     of Leaf Springs; the closed form is that of a beam on two supports.
@@ -52,8 +52,8 @@ def leaf_spring(
     )
     if elements % 2:
         raise ValueError(f"`elements` must be even, got {elements}: the axle is clamped to the node in the middle.")
-    one = BeamSection.rectangle(width, thickness, young=young, poisson=poisson, density=density)
-    pack = BeamSection(leaves * one.stiffness, leaves * one.mass, leaves * one.inertia, damping)
+    material: Any = {"young": young, "poisson": poisson, "density": density, "damping": damping}
+    pack = BeamSection.rectangle(width, thickness, **material).stacked(leaves)
     share = jnp.linspace(-1.0, 1.0, elements + 1)
     points = jnp.stack([0.5 * length * share, jnp.zeros_like(share), camber * share**2], axis=1)
     beam = Beam("leaf", pack, points)

@@ -147,3 +147,29 @@ def _root(square: Float[Array, ""]) -> Float[Array, ""]:
     """√, with the derivative 0 at 0, where that of a size has none."""
     some = square > 0.0
     return jnp.where(some, jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)
+
+
+class Stack(AbstractOutline):
+    """So many outlines [–], shape (), side by side, which slide on each other: each has its share of all."""
+
+    one: AbstractOutline
+    count: Float[Array, ""]
+
+    @property
+    def area(self):
+        return self.count * self.one.area
+
+    @property
+    def second(self):
+        of_2, of_3 = self.one.second
+        return self.count * of_2, self.count * of_3
+
+    @property
+    def torsion(self):
+        return self.count * self.one.torsion
+
+    def shear(self, poisson):
+        return self.one.shear(poisson)
+
+    def stress(self, force, moment):
+        return self.one.stress(force / self.count, moment / self.count)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, require
-from lgsens.model._beam_outlines import AbstractOutline, Rectangle, Ring
+from lgsens.model._beam_outlines import AbstractOutline, Rectangle, Ring, Stack
 
 
 class BeamSection(eqx.Module):
@@ -100,6 +100,20 @@ class BeamSection(eqx.Module):
             if value.ndim == 0 or value.shape[-1] != 3 or value.shape != force.shape:
                 raise ValueError(f"`{name}` must have shape (…, 3), as `force` has, got {value.shape}.")
         return jnp.vectorize(self.outline.stress, signature="(3),(3)->()")(force, moment)
+
+    def stacked(self, count) -> "BeamSection":
+        """So many of it side by side, which slide on each other without friction: leaves of a spring, wires of a rope.
+
+        Arguments:
+            count: n [–], shape (), positive; of a pack that is graduated any number.
+
+        Stiffness, mass and inertia are n times those of one; the `stress` is that of one under the n-th part of forces
+        and moments. Raises `ValueError` for a number that is not positive.
+        """
+        n = as_float(count, (), "BeamSection: `count`")
+        require(lambda n: n > 0, f"BeamSection: `count` must be positive, got {n}.", n)
+        outline = None if self.outline is None else Stack(self.outline, n)
+        return BeamSection(n * self.stiffness, n * self.mass, n * self.inertia, self.damping, outline)
 
     def sheared_at(self, centre) -> "BeamSection":
         """The section with another shear centre: an open one, whose axis goes through its centroid.
