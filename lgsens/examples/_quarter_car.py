@@ -88,7 +88,8 @@ class QuarterCar(eqx.Module):
         Arguments:
             path: a TOML or JSON file in the format of `lgsens/examples/_suspension_file.py`, or the name of one that
                 ships with lgsens, in `lgsens/examples/data`: "five_link_suspension", "double_wishbone", "push_rod",
-                "multi_link", "mcpherson", "semi_trailing_arm", "twist_beam"; None: the first of them.
+                "multi_link", "mcpherson", "semi_trailing_arm", "twist_beam", "solid_axle", "leaf_springs";
+                None: the first of them.
 
         Raises `ValueError` naming the file and the key (or the line) for a file that cannot be read, is incomplete, or
         describes a suspension that does not move as one: another freedom than travel, singular universal joints,

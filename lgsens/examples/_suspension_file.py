@@ -97,8 +97,7 @@ from lgsens.examples._wheel import Wheel
 from lgsens.model import Sampled
 
 LEAST_RADIUS, LARGEST_RADIUS = 0.1, 2.0  # m, loaded radii of tyres
-PARTS = ("chassis", "knuckle", "wheel", *CARRIERS, "anti_roll_bar", "drop_link", "twist_beam", "solid_axle")
-PARTS += (LEAF, SHACKLE)
+PARTS = ("chassis", "knuckle", "wheel", *CARRIERS, "anti_roll_bar", "drop_link", "twist_beam", "solid_axle", LEAF)
 TABLES = ("name", "units", "road", "links", "joints", "chassis", "knuckle", "wheel", "spring", "damper", "tyre")
 TABLES += ("link_section", "bump", "design", LEAF)
 OF_TABLES = {"tyre": ("stiffness",), "bump": ("height", "duration"), "link_section": ("radius",)}
@@ -125,8 +124,9 @@ def members(document: dict, path: str) -> dict[str, Any]:
     """The fields of a `QuarterCar`. Raises `ValueError` naming file and key for what is missing or wrong."""
     root, kilogram = reader(document, path)
     tables = root.tables("links")
-    for name in sorted({*PARTS, *OF_LINK} & set(tables)):
-        raise root.table("links").fail(name, f"is a name of its own; choose another than {[*PARTS, *OF_LINK]}.")
+    own = (*PARTS, *OF_LINK, *((SHACKLE,) if LEAF in root else ()))
+    for name in sorted({*own} & {*tables}):
+        raise root.table("links").fail(name, f"is a name of its own; choose another than {[*own]}.")
     bodies = ("chassis", "knuckle", *(body for body in CARRIERS if body in root), *tables)
     carriers: dict[str, str] = {}
     links = {name: read_link(name, table, bodies, kilogram, carriers) for name, table in tables.items()}

@@ -8,6 +8,8 @@ and shears, and κ = [κ₁, κ₂, κ₃], twist and bendings per length [1/m],
 What follows from a shape, and the stress in it: `_beam_outlines`.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -113,7 +115,8 @@ class BeamSection(eqx.Module):
         n = as_float(count, (), "BeamSection: `count`")
         require(lambda n: n > 0, f"BeamSection: `count` must be positive, got {n}.", n)
         outline = None if self.outline is None else Stack(self.outline, n)
-        return BeamSection(n * self.stiffness, n * self.mass, n * self.inertia, self.damping, outline)
+        damping: Any = self.damping
+        return BeamSection(n * self.stiffness, n * self.mass, n * self.inertia, damping, outline)
 
     def sheared_at(self, centre) -> "BeamSection":
         """The section with another shear centre: an open one, whose axis goes through its centroid.
