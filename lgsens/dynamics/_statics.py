@@ -216,8 +216,9 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
         home = jax.tree.map(lambda new, old: jnp.where(first & done, new, old), near, home)
         home = home._replace(w=jnp.zeros_like(home.w), lam_rate=jnp.zeros_like(home.lam_rate))
         pivots = jnp.abs(jnp.diagonal(factors.lu.lu))
-        free = jnp.min(pivots) < 1e3 * jnp.finfo(dtype).eps * jnp.max(pivots)
-        ended = done.astype(dtype), (free & (done | first)).astype(dtype)
+        round_off = jnp.where(done, 1e2, 1e3) * jnp.finfo(dtype).eps
+        free = (jnp.min(pivots) <= round_off * jnp.max(pivots)) & (done | first)
+        ended = done.astype(dtype), free.astype(dtype)
         return (home, near, factors, done), (near.q, near.lam, w, lam_rate, *ended)
 
     whole = jnp.arange(k + m, dtype=jnp.int32)
