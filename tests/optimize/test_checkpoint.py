@@ -44,7 +44,8 @@ def whole():
 @pytest.mark.parametrize("killed_after", [0, 7])
 def test_a_killed_search_goes_on_bit_by_bit(tmp_path, whole, killed_after):
     path = tmp_path / "new" / "search.npz"
-    assert whole.reason == "converged" and len(whole.history.objective) > 8
+    # it ends by itself, at the limit of precision: which word it has for that is said by the last bits
+    assert whole.reason in ("converged", "stalled") and len(whole.history.objective) > 8
 
     def kill(step, *_):
         if step == killed_after:
