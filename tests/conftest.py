@@ -9,6 +9,7 @@ compiled once in a run: JAX keeps them in a folder that ends with it.
 """
 
 import gc
+import json
 import logging
 import os
 import re
@@ -76,3 +77,16 @@ def compiled(caplog):
         return re.findall(r"Compiling jit\((\w+)\)", caplog.text), found
 
     return of
+
+
+@pytest.fixture
+def load(tmp_path):
+    """A suspension from the file of a document, an `Axle` or of another kind."""
+    from lgsens.examples import Axle
+
+    def load(document, kind=Axle):
+        path = tmp_path / "suspension.json"
+        path.write_text(json.dumps(document), encoding="utf-8")
+        return kind.load(path)
+
+    return load

@@ -1,7 +1,5 @@
 """Axles on leaf springs: rates in closed form, what files may say, half of it and the whole, gradients."""
 
-import json
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +8,7 @@ from helpers import says
 
 import lgsens as lg
 from lgsens import rigs
-from lgsens.examples import Axle, AxleNumbers, QuarterCar, SuspensionDesign, suspension_document
+from lgsens.examples import AxleNumbers, QuarterCar, SuspensionDesign, suspension_document
 
 SEAT, RADIUS = 0.5, 0.35  # m, from the middle of the car, and of the wheels
 NAMES = ("parallel", "opposite", "braking")
@@ -24,16 +22,6 @@ def flat(front=0.6, rear=0.6, **numbers):
     eyes = {"front": [front, SEAT, 0.0], "rear": [-rear, SEAT, 0.0], "shackle": [-rear, SEAT, 0.6]}
     found["leaf_spring"] |= eyes | {"seat": [0.0, SEAT, 0.0]} | numbers
     return found
-
-
-@pytest.fixture
-def load(tmp_path):
-    def load(document, kind=Axle):
-        path = tmp_path / "suspension.json"
-        path.write_text(json.dumps(document), encoding="utf-8")
-        return kind.load(path)
-
-    return load
 
 
 def closed_form(leaf, a, b):

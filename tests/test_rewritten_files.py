@@ -1,7 +1,5 @@
 """From a suspension back to its file: what a design found is a file, and numbers are those in the file's axes."""
 
-import json
-
 import jax
 import numpy as np
 import pytest
@@ -24,16 +22,6 @@ def document_of(name):
             shape = [(-0.2, -0.3), (-0.1, -0.1), (0.0, 0.0), (0.1, 0.1), (0.2, 0.4)]
             document[key]["curve"] = [[x, slope * y] for x, y in shape]
     return document
-
-
-@pytest.fixture
-def load(tmp_path):
-    def load(document, kind):
-        path = tmp_path / "suspension.json"
-        path.write_text(json.dumps(document), encoding="utf-8")
-        return kind.load(path)
-
-    return load
 
 
 def close(found, expected):

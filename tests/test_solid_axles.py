@@ -36,16 +36,6 @@ WATT = {
 }
 
 
-@pytest.fixture
-def load(tmp_path):
-    def load(scene, kind=Axle):
-        path = tmp_path / "mine.json"
-        path.write_text(json.dumps(scene), encoding="utf-8")
-        return kind.load(path)
-
-    return load
-
-
 def scene(own=None, **tables):
     """The document of the file without bushings, with other links of the axle and other tables."""
     found = {**copy.deepcopy(FILE), "bushings": {}, **tables}
