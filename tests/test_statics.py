@@ -267,3 +267,21 @@ def test_lengths_that_cannot_be_closed_are_out_of_reach():
     height = np.sqrt(lengths**2 - 0.3**2, where=lengths > 0.3, out=np.full(6, np.nan))
     height[4] = np.nan  # after it, and before the next start
     np.testing.assert_allclose(found.body("point").position[:, 2], height, rtol=1e-12)
+
+
+@pytest.mark.parametrize("off", [0.0, 0.5])
+def test_what_weight_alone_holds_is_held(off):
+    """A pendulum under a force aside, tan θ = F/mg, from below its pivot or from elsewhere; and by its mass."""
+    at = np.array([np.sin(off), 0.0, -np.cos(off)])
+
+    def angles(mass):
+        body = {"bob": lg.RigidBody(mass, (0.1, 0.1, 0.1), position=at)}
+        hinge = {"hinge": lg.RevoluteJoint(None, "bob", at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))}
+        forces = {"aside": lg.AppliedForce("bob", at=at, force=(9.81, 0.0, 0.0)), "g": lg.Gravity((0.0, 0.0, -9.81))}
+        found = lg.statics(lg.Model(body, hinge, forces), loads={"aside": [0.0, 0.5, 1.0]}).body("bob").position
+        return jnp.arctan2(found[:, 0], -found[:, 2])
+
+    found, by_mass = jax.jvp(angles, (1.0,), (1.0,))
+    tangent = np.array([0.0, 0.5, 1.0])
+    np.testing.assert_allclose(found, np.arctan(tangent), atol=1e-13)  # round-off
+    np.testing.assert_allclose(by_mass, -tangent / (1.0 + tangent**2), atol=1e-12)

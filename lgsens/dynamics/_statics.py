@@ -45,6 +45,7 @@ from lgsens.dynamics._kinematics import AbstractDrive
 from lgsens.linear import LU, Inverse, LinearEquations, linear_solve
 
 _MAX_ITERATIONS = 60
+_SOFT = 1e-3  # of the largest stiffness, where there is none
 _SHORTER, _LONGER, _LEAST = 0.25, 2.0, 1e-3  # stages of the way to a point after one that failed, or not; the least
 _SLOW = 0.2  # what a chord iteration may leave of a step before factors are renewed
 
@@ -84,6 +85,7 @@ class _Factors(NamedTuple):
 
     lu: Any  # LU or Inverse
     matrix: Float[Array, "n n"]
+    pivot: Float[Array, ""]  # the smallest of `matrix` over the largest: 0 where it is singular
     coordinate: Float[Array, " k"]
     force: Float[Array, ""]  # J, the size of K_t in these units
 
@@ -147,7 +149,13 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
 
     def factorize(s, q, lam):
         matrix, units = _matrix(drive, s, q, lam, t)
-        return _Factors(LU.of(matrix), matrix, *units)
+        lu = LU.of(matrix)
+        pivots = jnp.abs(jnp.diagonal(lu.lu))
+        pivot = jnp.min(pivots) / jnp.max(pivots)
+        # What weights alone hold, a pendulum, has a stiffness once the joints carry them, which they do after a step.
+        softened = matrix + jnp.diag(jnp.concatenate([jnp.full(k, _SOFT, dtype), jnp.zeros(m, dtype)]))
+        lu = lax.cond(pivot > 1e3 * jnp.finfo(dtype).eps, lambda: lu, lambda: LU.of(softened))
+        return _Factors(lu, matrix, pivot, *units)
 
     def move(q, lam, w, change):
         return group.retract(q, w), lam + change
@@ -215,16 +223,16 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
         done = reached == 1.0
         home = jax.tree.map(lambda new, old: jnp.where(first & done, new, old), near, home)
         home = home._replace(w=jnp.zeros_like(home.w), lam_rate=jnp.zeros_like(home.lam_rate))
-        pivots = jnp.abs(jnp.diagonal(factors.lu.lu))
         round_off = jnp.where(done, 1e2, 1e3) * jnp.finfo(dtype).eps
-        free = (jnp.min(pivots) <= round_off * jnp.max(pivots)) & (done | first)
+        free = (factors.pivot <= round_off) & (done | first)
         ended = done.astype(dtype), free.astype(dtype)
         return (home, near, factors, done), (near.q, near.lam, w, lam_rate, *ended)
 
     whole = jnp.arange(k + m, dtype=jnp.int32)
     start = _Begin(values[0], home, jnp.zeros(m, dtype), jnp.zeros(k, dtype), jnp.zeros(m, dtype), jnp.zeros((), bool))
     none = LU(jnp.zeros((k + m, k + m), dtype), whole, whole)
-    factors = _Factors(none, none.lu, jnp.ones(k, dtype), jnp.ones((), dtype))
+    one = jnp.ones((), dtype)
+    factors = _Factors(none, none.lu, one, jnp.ones(k, dtype), one)
     rows = values, rates, ahead, begins, jnp.arange(n) == 0
     return scan(follow, (start, start, factors, jnp.zeros((), bool)), rows)[1]
 
@@ -237,7 +245,7 @@ def _path_jvp(starts, primals, tangents):
     group, rows = drive.system.group, (q, lam, values)
     every = lambda of, xs: scan(lambda _, row: (None, of(*row)), None, xs)[1]
     matrix, units = jax.vmap(lambda q, lam, s: _matrix(drive, s, q, lam, t))(*rows)
-    factors = jax.vmap(lambda matrix, *units: _Factors(Inverse.of(matrix), matrix, *units))(
+    factors = jax.vmap(lambda matrix, *units: _Factors(Inverse.of(matrix), matrix, jnp.ones(()), *units))(
         lax.stop_gradient(matrix), *units
     )
 

@@ -94,11 +94,11 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
 
 
 def _driven(details: dict[str, Any]) -> str:
-    """The values of drivers and the factors of loads, by name those that are not zero."""
+    """The values of drivers and the factors of loads by name; of many those that are not zero."""
     values, names = np.atleast_1d(details["values"]), details.get("names")
     if names is None:
         return f", driven values {np.array2string(values, precision=6)}"
-    moved = [f"{name} = {value:.6g}" for name, value in zip(names, values) if value != 0.0]
+    moved = [f"{name} = {value:.6g}" for name, value in zip(names, values) if value != 0.0 or len(names) < 5]
     return f", driven values {', '.join(moved) or 'all 0'}" if len(names) else ""
 
 
