@@ -12,7 +12,7 @@ from lgsens.examples import AxleNumbers, QuarterCar, SuspensionDesign, suspensio
 
 SEAT, RADIUS = 0.5, 0.35  # m, from the middle of the car, and of the wheels
 NAMES = ("parallel", "opposite", "braking")
-SWEEPS = {name: sweep for name, sweep in rigs.standard_sweeps(travel=1e-3, roll=1e-3, braking=10.0).items()}
+SWEEPS = rigs.standard_sweeps(travel=1e-3, roll=1e-3, braking=10.0)
 
 
 def flat(front=0.6, rear=0.6, **numbers):
@@ -37,7 +37,7 @@ def closed_form(leaf, a, b):
     free = 1.0 / (at_seat(cantilever) + at_seat(through) / shear)
     held = sum(1.0 / (cantilever(length) + through(length) / shear) for length in (a, b))
     twist = torsion * (1.0 / through(a) + 1.0 / through(b))
-    return free, held, twist, at_seat(lambda length: cantilever(length)) * (a + b) ** 2 / (a * b) ** 2
+    return free, held, twist, at_seat(cantilever) * (a + b) ** 2 / (a * b) ** 2
 
 
 def check_rates(axle, a, b, left):

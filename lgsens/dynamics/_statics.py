@@ -84,10 +84,10 @@ class _Factors(NamedTuple):
     """K in factors, in units in which its unknowns are of order one: lengths of the scene, rad, and `force`."""
 
     lu: Any  # LU or Inverse
-    matrix: Float[Array, "n n"]
-    pivot: Float[Array, ""]  # the smallest of `matrix` over the largest: 0 where it is singular
     coordinate: Float[Array, " k"]
     force: Float[Array, ""]  # J, the size of K_t in these units
+    matrix: Any = None  # K, of points of a path
+    pivot: Any = None  # its smallest over its largest, shape (): 0 where it is singular
 
     def residual(self, force, violation):
         return jnp.concatenate([force * self.coordinate / self.force, violation])
@@ -97,13 +97,10 @@ class _Factors(NamedTuple):
         """Whether Zᵀ K_t Z is positive definite, with columns of Z that B lets move."""
         k = self.coordinate.shape[0]
         stiffness, jacobian = self.matrix[:k, :k], self.matrix[k:, :k]
-        z = (
-            jnp.linalg.qr(jacobian.T, mode="complete")[0][:, jacobian.shape[0] :]
-            if len(jacobian)
-            else jnp.eye(k, dtype=stiffness.dtype)
-        )
-        reduced = z.T @ stiffness @ z
-        return jnp.all(jnp.isfinite(lax.linalg.cholesky((reduced + reduced.T) / 2.0, symmetrize_input=False)))
+        if len(jacobian):
+            z = jnp.linalg.qr(jacobian.T, mode="complete")[0][:, len(jacobian) :]
+            stiffness = z.T @ stiffness @ z
+        return jnp.all(jnp.isfinite(lax.linalg.cholesky((stiffness + stiffness.T) / 2.0, symmetrize_input=False)))
 
     def parts(self, y) -> tuple[Array, Array]:
         k = self.coordinate.shape[0]
@@ -155,7 +152,7 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
         # What weights alone hold, a pendulum, has a stiffness once the joints carry them, which they do after a step.
         softened = matrix + jnp.diag(jnp.concatenate([jnp.full(k, _SOFT, dtype), jnp.zeros(m, dtype)]))
         lu = lax.cond(pivot > 1e3 * jnp.finfo(dtype).eps, lambda: lu, lambda: LU.of(softened))
-        return _Factors(lu, matrix, pivot, *units)
+        return _Factors(lu, *units, matrix, pivot)
 
     def move(q, lam, w, change):
         return group.retract(q, w), lam + change
@@ -232,7 +229,7 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
     start = _Begin(values[0], home, jnp.zeros(m, dtype), jnp.zeros(k, dtype), jnp.zeros(m, dtype), jnp.zeros((), bool))
     none = LU(jnp.zeros((k + m, k + m), dtype), whole, whole)
     one = jnp.ones((), dtype)
-    factors = _Factors(none, none.lu, one, jnp.ones(k, dtype), one)
+    factors = _Factors(none, jnp.ones(k, dtype), one, none.lu, one)
     rows = values, rates, ahead, begins, jnp.arange(n) == 0
     return scan(follow, (start, start, factors, jnp.zeros((), bool)), rows)[1]
 
@@ -245,9 +242,7 @@ def _path_jvp(starts, primals, tangents):
     group, rows = drive.system.group, (q, lam, values)
     every = lambda of, xs: scan(lambda _, row: (None, of(*row)), None, xs)[1]
     matrix, units = jax.vmap(lambda q, lam, s: _matrix(drive, s, q, lam, t))(*rows)
-    factors = jax.vmap(lambda matrix, *units: _Factors(Inverse.of(matrix), matrix, jnp.ones(()), *units))(
-        lax.stop_gradient(matrix), *units
-    )
+    factors = jax.vmap(lambda matrix, *units: _Factors(Inverse.of(matrix), *units))(lax.stop_gradient(matrix), *units)
 
     def solve(force, violation):
         """−K⁻¹ at every point: products, which are one operation for all directions."""

@@ -182,16 +182,17 @@ class QuarterCar(eqx.Module):
         """
         if self.spring is None and stiffness is not None:
             raise ValueError("`stiffness`: the car is on leaf springs; what they are made of is in `leaf_spring`.")
-        rate = lambda car: car.bump_duration if car.spring is None else car.spring.rate  # stands for one
-        where = lambda car: [rate(car), car.damper.rate, car.bump_height, *car.on_chassis.values()]
+        numbers = [damping, bump_height] if self.spring is None else [stiffness, damping, bump_height]
+        rates = lambda car: [strut.rate for strut in (car.spring, car.damper) if strut is not None]
+        where = lambda car: [*rates(car), car.bump_height, *car.on_chassis.values()]
         olds = where(self)
-        points: list[Any] = [None] * (len(olds) - 3)
+        points: list[Any] = [None] * (len(olds) - len(numbers))
         if hardpoints is not None:
             rows = as_float(hardpoints, (len(self.hardpoint_names), 3), "`hardpoints`")
-            points = regrouped(rows, olds[3:])
+            points = regrouped(rows, olds[len(numbers) :])
         values = [
             old if new is None else as_float(new, old.shape, "`stiffness`, `damping` or `bump_height`")
-            for old, new in zip(olds, (stiffness, damping, bump_height, *points))
+            for old, new in zip(olds, (*numbers, *points))
         ]
         return eqx.tree_at(where, self, values)
 

@@ -339,6 +339,7 @@ def test_sections():
         (lambda: lg.BeamSection([1.0] * 5, 1.0, [1.0] * 3), r"`stiffness` must have shape \(6,\) or \(6, 6\)"),
         (lambda: lg.BeamSection([-1.0] + [1.0] * 5, 1.0, [1.0] * 3), "must be positive; what does not bend"),
         (lambda: lg.BeamSection([1.0] * 6, 0.0, [1.0] * 3), "`mass` must be positive"),
+        (lambda: lg.BeamSection.round(0.02, **STEEL).stacked(0), "`count` must be positive"),
         (lambda: lg.BeamSection([1.0] * 6, 1.0, [1.0] * 3, damping=-1.0), "`damping` must not be negative"),
         (lambda: lg.BeamSection.tube(0.02, 0.02, **STEEL), "`thickness` is more than the radius"),
         (lambda: lg.BeamSection.round(0.02, **(STEEL | {"poisson": 0.7})), "`poisson` must be above -1"),
