@@ -167,11 +167,11 @@ def while_loop(unfinished: Callable[[Carry], Any], body: Callable[[Carry], Carry
     return lax.while_loop(unfinished, body, init)
 
 
-def fori_loop(first: int, after: Any, body: Callable[[Any, Carry], Carry], init: Carry) -> Carry:
+def fori_loop(first: int, after: Any, body: Callable[[Any, Carry], Carry], init: Carry, **options: Any) -> Carry:
     if jax.sharding.get_abstract_mesh().manual_axes:
         init = alike(init, jax.eval_shape(body, first, init))
-        return lax.fori_loop(first, after, lambda i, carry: alike(body(i, carry), carry), init)
-    return lax.fori_loop(first, after, body, init)
+        return lax.fori_loop(first, after, lambda i, carry: alike(body(i, carry), carry), init, **options)
+    return lax.fori_loop(first, after, body, init, **options)
 
 
 def scan(body: Callable[[Carry, Any], tuple[Carry, Y]], init: Carry, xs: Any, **options: Any) -> tuple[Carry, Y]:

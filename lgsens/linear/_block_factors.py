@@ -177,13 +177,10 @@ def inverses(blocks: Float[Array, "c p p"]) -> Float[Array, "c p p"]:
         rest = jnp.where((here[:, None] | here[None, :])[:, :, None], jnp.zeros_like(matrix), matrix)
         return rest - column[:, None, :] * row[None, :, :]
 
-    def in_turn(matrix):  # elsewhere: what is written out is fused, and no turn of a loop waits for the host
-        for j in range(size):
-            matrix = eliminate(j, matrix)
-        return matrix
-
     looped = partial(fori_loop, 0, size, eliminate)
-    found = lax.platform_dependent(jnp.moveaxis(blocks, 0, 2), cpu=looped, default=in_turn)
+    # elsewhere: what is written out is fused, and no turn of a loop waits for the host
+    written_out = partial(fori_loop, 0, size, eliminate, unroll=True)
+    found = lax.platform_dependent(jnp.moveaxis(blocks, 0, 2), cpu=looped, default=written_out)
     return jnp.moveaxis(found, 2, 0)
 
 
