@@ -110,7 +110,7 @@ def test_every_choice_of_parameters_at_full_resolution(parameters, tmp_path, cap
     out = tmp_path / "out"
     status, text, err = run(capsys, "optimize", "quarter-car", "--out", out, "--parameters", parameters)
     result = json.loads((out / "result.json").read_text(encoding="utf-8"))
-    assert status == 0 and "/300" in err and err.startswith("compiling the gradient … ")
+    assert status == 0 and "/300" in err and err.startswith("compiling the simulation … ")
     assert result["objective"]["reduction"] >= 0.20
     assert all(row["after"]["violation_over_scale"] <= 1e-3 for row in result["constraints"])
     # What holds the optimum back: the travel where only k and c are free, else the box.

@@ -16,7 +16,7 @@ from lgsens.cli._report import versions
 from lgsens.criteria import Criterion, differentiate, differentiate_to
 from lgsens.dynamics import RESULTS
 from lgsens.integrate import GeneralizedAlpha
-from lgsens.optimize import GradientCheck, OptimizationResult, check_gradient, minimize
+from lgsens.optimize import GradientCheck, Minimization, OptimizationResult, check_gradient
 from lgsens.simulation import Reached, check_accuracy
 
 TOLERANCE = 1e-3  # of the scale of a constraint
@@ -100,41 +100,39 @@ def search(job: Any, steps: int, checkpoint: Path, progress: bool) -> Search:
     """
 
     problem = job.problem
-
-    def objective(x):
-        value, *response = job.criteria(x)
-        return value, response
-
+    lower, upper = problem.bounds
+    log_scale = getattr(problem, "log_scale", False)
     started = time.perf_counter()
-    with compiling("the gradient", progress):
-        evaluate = jax.jit(jax.value_and_grad(objective, has_aux=True)).lower(problem.start).compile()
+    with compiling("the simulation", progress):
+        evaluate = jax.jit(job.criteria).lower(problem.start).compile()
     compiled = time.perf_counter()
 
-    def objective_and_gradient(x):
-        (value, _), gradient = evaluate(x)
-        return value, gradient
-
-    def respond(x) -> tuple[float, Any, GradientCheck]:
-        (value, (response, result)), _ = evaluate(x)
+    def simulated(x):
+        value, response, result = evaluate(x)
         if int(result) != RESULTS.successful:
             raise ValueError(f"the suspension cannot be simulated: {RESULTS(int(result)).message}")
-        checked = {"step": CHECK_STEP, "max_directions": CHECKED_DIRECTIONS, "value_and_grad": objective_and_gradient}
-        check = check_gradient(lambda x: evaluate(x)[0][0], x, scale=job.scale, **checked)
-        return float(value), jax.tree.map(np.asarray, response), check
+        return value, response
 
-    at_start, before, check_before = respond(problem.start)
-    lower, upper = problem.bounds
-    settings = {"log_scale": getattr(problem, "log_scale", False), "constraint_tolerance": TOLERANCE}
-    result = minimize(
+    simulated(problem.start)  # before more is compiled
+    program = Minimization(
         problem,
         problem.start,
         lower=lower,
         upper=upper,
-        num_steps=steps,
+        log_scale=log_scale,
+        constraint_tolerance=TOLERANCE,
         progress=progress,
-        checkpoint=checkpoint,
-        **settings,
     )
+
+    def respond(x) -> tuple[float, Any, GradientCheck]:
+        value, response = simulated(x)
+        _, gradient = program.value_and_grad(x)  # that by which the search goes; of its neighbours values do
+        settings = {"scale": job.scale, "step": CHECK_STEP, "max_directions": CHECKED_DIRECTIONS}
+        check = check_gradient(problem, x, value_and_grad=lambda x: (evaluate(x)[0], gradient), **settings)
+        return float(value), jax.tree.map(np.asarray, response), check
+
+    at_start, before, check_before = respond(problem.start)
+    result = program(steps, progress=progress, checkpoint=checkpoint)
     _, after, check_after = respond(result.x)
     seconds = {
         "compilation": compiled - started + result.compile_seconds,
@@ -161,7 +159,7 @@ def search_document(found: Search, settings: dict[str, Any]) -> dict[str, Any]:
         "feasible": result.feasible,
         "gradient_check": {
             where: {
-                "what": f"d{_symbol(goal.name)} per change of the design by its scale: adjoint method and differences",
+                "what": f"d{_symbol(goal.name)} per change of the design by its scale: the search's, and differences",
                 "directions": list(check.directions),
                 "gradient": check.exact.tolist(),
                 "central_differences": check.difference.tolist(),

@@ -12,6 +12,7 @@ from lgsens.optimize._least_squares import (
 from lgsens.optimize._load_cases import load_cases as load_cases
 from lgsens.optimize._minimize import (
     History as History,
+    Minimization as Minimization,
     OptimizationResult as OptimizationResult,
     minimize as minimize,
 )

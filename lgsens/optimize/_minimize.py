@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from lgsens._brief import brief
@@ -123,58 +124,116 @@ def minimize(
     0, `num_steps` < 1, a tolerance that is out of range, an f or g that is not finite at x0, and a checkpoint of
     another problem. Derivations and sources: `lgsens/optimize/_slsqp.py` and `_augmented_lagrangian.py`.
     """
-    num_steps = as_count(num_steps, "num_steps")
-    x, unravel, box = checked_box(x0, lower, upper, log_scale)
-    tolerances = checked_tolerances(tolerance, constraint_tolerance)
-    started = time.perf_counter()
-    method, shape = prepared(fun, x, unravel, box, tolerances, forward)
-    with compiling("objective, constraints and their derivatives", progress):
-        method.compile(x)
-    compiled = time.perf_counter()
-
-    start = method.begin(x)
-    first = start[1]
-    if not (np.isfinite(first.objective) and np.isfinite(first.gradient_norm) and not np.isnan(first.worst)):
-        raise ValueError(
-            f"The objective, a constraint or the gradient is not finite at `x0` (objective {float(first.objective)}); "
-            "start from a design that can be simulated."
-        )
-    store = None if checkpoint is None else Checkpoint(checkpoint, box, x, tolerances)
-    course, reason = Course(start, num_steps, store), "interrupted"
-    with progress_bar(num_steps, "step", progress, initial=len(course.rows)) as bar:
-
-        def shown(step: int, f: float, worst: float) -> None:
-            bar.set_postfix({"objective": f"{f:.4g}", "worst constraint": f"{worst:+.1e}"}, refresh=False)
-            bar.update()
-            if callback is not None:
-                callback(step, f, worst)
-
-        course.shown = shown
-        try:
-            if not course.rows:
-                course.add(*start)
-            reason = method.go_on(course)
-        except KeyboardInterrupt:
-            if not course.rows:
-                raise
-            course.keep()
-    finished = time.perf_counter()
-
-    found = method.found(course)
-    x, *numbers = (np.stack([getattr(row, name) for row in course.rows]) for name in Row._fields)
-    history = History(*numbers, design=jax.tree.map(np.asarray, jax.vmap(unravel)(jnp.asarray(x))))
-    return OptimizationResult(
-        x=unravel(jnp.asarray(x[found.step])),
-        objective=float(history.objective[found.step]),
-        constraints=found.constraints.reshape(shape),
-        feasible=bool(history.worst_constraint[found.step] <= constraint_tolerance),
-        reason=reason,
-        step=found.step,
-        history=history,
-        multipliers=found.multipliers.reshape(shape),
-        compile_seconds=compiled - started,
-        run_seconds=finished - compiled,
+    as_count(num_steps, "num_steps")  # before anything is compiled
+    search = Minimization(
+        fun,
+        x0,
+        lower=lower,
+        upper=upper,
+        log_scale=log_scale,
+        tolerance=tolerance,
+        constraint_tolerance=constraint_tolerance,
+        forward=forward,
+        progress=progress,
     )
+    return search(num_steps, progress=progress, callback=callback, checkpoint=checkpoint)
+
+
+class Minimization:
+    """The program of `minimize`, compiled once: gradients wherever they are wanted, and the search.
+
+        program = Minimization(fun, x0, lower=…, upper=…)
+        f, gradient = program.value_and_grad(x0)
+        found = program(num_steps=100)
+
+    Arguments are those of `minimize`, and so are errors.
+
+    Attributes:
+        compile_seconds: wall time of the compilation [s].
+    """
+
+    def __init__(
+        self,
+        fun: Problem,
+        x0: PyTree,
+        *,
+        lower: PyTree = None,
+        upper: PyTree = None,
+        log_scale: PyTree = False,
+        tolerance: float = 1e-5,
+        constraint_tolerance: float = 1e-3,
+        forward: bool | None = None,
+        progress: bool = True,
+    ):
+        self._x, self._unravel, self._box = checked_box(x0, lower, upper, log_scale)
+        self._tolerances = checked_tolerances(tolerance, constraint_tolerance)
+        started = time.perf_counter()
+        prepare = prepared(fun, self._x, self._unravel, self._box, self._tolerances, forward)
+        self._method, self._shape = prepare
+        with compiling("objective, constraints and their derivatives", progress):
+            self._method.compile(self._x)
+        self.compile_seconds = time.perf_counter() - started
+
+    def value_and_grad(self, x: PyTree) -> tuple[float, PyTree]:
+        """f and ∇f at a design like x0, within the bounds."""
+        flat = ravel_pytree(x)[0].astype(self._x.dtype)
+        f, slope = self._method.slope(flat)
+        return float(f), self._unravel(slope / self._box.rate(self._box.scaled(flat)))
+
+    def __call__(
+        self,
+        num_steps: int,
+        *,
+        progress: bool = True,
+        callback: Callable[[int, float, float], None] | None = None,
+        checkpoint: str | os.PathLike | None = None,
+    ) -> OptimizationResult:
+        """The search from x0."""
+        num_steps = as_count(num_steps, "num_steps")
+        method, began = self._method, time.perf_counter()
+        start = method.begin(self._x)
+        first = start[1]
+        if not (np.isfinite(first.objective) and np.isfinite(first.gradient_norm) and not np.isnan(first.worst)):
+            raise ValueError(
+                "The objective, a constraint or the gradient is not finite at `x0` (objective "
+                f"{float(first.objective)}); start from a design that can be simulated."
+            )
+        store = None if checkpoint is None else Checkpoint(checkpoint, self._box, self._x, self._tolerances)
+        course, reason = Course(start, num_steps, store), "interrupted"
+        with progress_bar(num_steps, "step", progress, initial=len(course.rows)) as bar:
+
+            def shown(step: int, f: float, worst: float) -> None:
+                bar.set_postfix({"objective": f"{f:.4g}", "worst constraint": f"{worst:+.1e}"}, refresh=False)
+                bar.update()
+                if callback is not None:
+                    callback(step, f, worst)
+
+            course.shown = shown
+            try:
+                if not course.rows:
+                    course.add(*start)
+                reason = method.go_on(course)
+            except KeyboardInterrupt:
+                if not course.rows:
+                    raise
+                course.keep()
+        run_seconds = time.perf_counter() - began
+
+        found = method.found(course)
+        x, *numbers = (np.stack([getattr(row, name) for row in course.rows]) for name in Row._fields)
+        history = History(*numbers, design=jax.tree.map(np.asarray, jax.vmap(self._unravel)(jnp.asarray(x))))
+        return OptimizationResult(
+            x=self._unravel(jnp.asarray(x[found.step])),
+            objective=float(history.objective[found.step]),
+            constraints=found.constraints.reshape(self._shape),
+            feasible=bool(history.worst_constraint[found.step] <= self._tolerances[1]),
+            reason=reason,
+            step=found.step,
+            history=history,
+            multipliers=found.multipliers.reshape(self._shape),
+            compile_seconds=self.compile_seconds,
+            run_seconds=run_seconds,
+        )
 
 
 def checked_tolerances(tolerance: float, constraint_tolerance: float) -> tuple[float, float]:

@@ -85,6 +85,11 @@ class Method:
         """The evaluation at x₀."""
         return None, self.evaluated(np.asarray(self.box.scaled(x), np.float64), None)
 
+    def slope(self, x: Array) -> tuple[np.ndarray, np.ndarray]:
+        """f at x, and its gradient by z."""
+        row = self.begin(x)[1]
+        return row.objective, row.slope * scale_of(row.objective)
+
     def evaluated(self, z: np.ndarray, scale: float | None) -> Evaluation:
         """The evaluation at z; `scale`: |f(x₀)|, None at x₀."""
         (slope, jacobian), (x, f, g) = jax.tree.map(np.asarray, self.program(jnp.asarray(z, self.box.lower.dtype)))

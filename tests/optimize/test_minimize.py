@@ -9,7 +9,7 @@ import pytest
 import scipy.optimize
 
 from lgsens import soft_maximum
-from lgsens.optimize import minimize
+from lgsens.optimize import Minimization, minimize
 
 NO_CONSTRAINTS = jnp.zeros(0)
 
@@ -35,6 +35,32 @@ def test_the_optimum_on_an_active_constraint():
     # ∇f + |f(x₀)| μ ∇g = 0: (√5 − 1)/10
     assert float(result.multipliers[0]) == pytest.approx((np.sqrt(5) - 1) / 10, rel=1e-3)
     assert result.history.gradient_norm[-1] <= 1e-5 and result.history.complementarity[-1] <= 1e-5
+
+
+@pytest.mark.parametrize("forward", [True, False])
+@pytest.mark.parametrize(
+    "x",
+    [{"a": 0.5, "b": 1.7}, {"a": 0.25, "b": -2.0}, {"a": 2.0, "b": 2.0}],
+    ids=["inside, constraint violated", "at two lower bounds", "at two upper bounds"],
+)
+def test_its_program_gives_the_gradient_of_the_objective_at_any_design(forward, x):
+    """a by its logarithm."""
+    bounds = {"lower": {"a": 0.25, "b": -2.0}, "upper": {"a": 2.0, "b": 2.0}}
+    log = {"a": True, "b": False}
+    program = Minimization(disc, {"a": 1.0, "b": 0.0}, **bounds, log_scale=log, forward=forward, progress=False)
+    f, gradient = program.value_and_grad(x)
+    # Some ten roundings in numbers up to 16.
+    assert f == pytest.approx((x["a"] - 2) ** 2 + (x["b"] - 1) ** 2, abs=4e-14)
+    assert float(gradient["a"]) == pytest.approx(2 * (x["a"] - 2), abs=4e-14)
+    assert float(gradient["b"]) == pytest.approx(2 * (x["b"] - 1), abs=4e-14)
+    assert program(num_steps=100, progress=False).reason == "converged"
+
+
+@pytest.mark.parametrize("forward", [True, False])
+def test_a_search_from_a_bound_begins_with_the_whole_slope(forward):
+    """f = (x − 1)² by z = x/0.1 at 0: −0.2, and not half of that, as the derivative of a clip has it."""
+    found = quiet(lambda x: (x - 1.0) ** 2, jnp.asarray(0.0), 0.0, 0.1, num_steps=1, forward=forward)
+    assert found.history.gradient_norm[0] == pytest.approx(0.2, rel=1e-15)  # rounding of 0.1 and of the slope
 
 
 def test_a_tight_tolerance_is_reached():
