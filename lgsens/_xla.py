@@ -52,6 +52,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.experimental.compilation_cache import compilation_cache as jax_cache
@@ -167,6 +168,12 @@ def while_loop(unfinished: Callable[[Carry], Any], body: Callable[[Carry], Carry
     return lax.while_loop(unfinished, body, init)
 
 
+def renewed_where(due, new: Callable[[], Carry], earlier: Carry) -> Carry:
+    """`new()` where it is due. A loop of no or one turn, because `cond` would copy what is large."""
+    renewed = lambda carry: (jnp.zeros((), bool), new())
+    return while_loop(lambda carry: carry[0], renewed, (due, earlier))[1]
+
+
 def fori_loop(first: int, after: Any, body: Callable[[Any, Carry], Carry], init: Carry, **options: Any) -> Carry:
     if jax.sharding.get_abstract_mesh().manual_axes:
         init = alike(init, jax.eval_shape(body, first, init))
@@ -183,6 +190,34 @@ def scan(body: Callable[[Carry, Any], tuple[Carry, Y]], init: Carry, xs: Any, **
         init = alike(init, jax.eval_shape(body, init, jax.tree.map(lambda leaf: leaf[0], xs))[0])
         return lax.scan(same, init, xs, **options)
     return lax.scan(body, init, xs, **options)
+
+
+# JAX batches a `while_loop` whose predicate differs between lanes by a selection between old and new of all that the
+# loop carries, in every turn: of the inverse of a matrix too, which costs as much as an iteration with it. And of a
+# `cond` it computes both. So predicates are the same in all lanes, where bodies leave lanes alone that are done.
+
+
+@jax.custom_batching.custom_vmap
+def in_any_lane(flag):
+    """A flag that is the same in all lanes of a batch: whether it is raised in any. The predicate of a loop whose body
+    leaves lanes alone that are done."""
+    return flag
+
+
+@in_any_lane.def_vmap
+def _of_all_lanes(axis_size, in_batched, flag):
+    return in_any_lane(jnp.any(flag)), False  # a batch of batches comes here again
+
+
+@jax.custom_batching.custom_vmap
+def most_of_lanes(count):
+    """The largest of all lanes of a batch: the turns of a loop whose body leaves lanes alone that are done."""
+    return count
+
+
+@most_of_lanes.def_vmap
+def _most_of_all(axis_size, in_batched, count):
+    return most_of_lanes(jnp.max(count)), False
 
 
 def compilation_cache(folder: str | os.PathLike | None = None) -> Path:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import GRAVITY, close, factorizations, says, some_quick
 from scipy.integrate import solve_ivp
-from scipy.optimize import brentq
+from scipy.optimize import brentq, minimize_scalar
 
 import lgsens as lg
 from lgsens.analysis._driven import Drive, drivers
@@ -263,6 +263,9 @@ def test_lengths_that_cannot_be_closed_are_out_of_reach():
     way = {"left": lengths, "right": lengths}
     with pytest.raises(lg.SimulationError, match=says("No static equilibrium", "at point 3", "left = 0.2")):
         lg.statics(model, way)
+    for moved in (lg.statics, lg.kinematics):
+        with pytest.raises(ValueError, match=says("`driven['left']` is the distance", "must be positive, got -0.1 m")):
+            moved(model, {"left": [0.58, -0.1], "right": [0.58, 0.58]})
     found = lg.statics(model, way, starts=[5], throw=False)
     height = np.sqrt(lengths**2 - 0.3**2, where=lengths > 0.3, out=np.full(6, np.nan))
     height[4] = np.nan  # after it, and before the next start
@@ -285,3 +288,57 @@ def test_what_weight_alone_holds_is_held(off):
     tangent = np.array([0.0, 0.5, 1.0])
     np.testing.assert_allclose(found, np.arctan(tangent), atol=1e-13)  # round-off
     np.testing.assert_allclose(by_mass, -tangent / (1.0 + tangent**2), atol=1e-12)
+
+
+RISE, HALF, RATE = 0.2, 1.0, 1e4  # m, m, N/m
+
+
+def shallow_truss() -> lg.Model:
+    """A point over the middle of two springs that lean against each other, under a load downwards."""
+    top = (0.0, 0.0, RISE)
+    springs = {
+        name: lg.SpringDamper(None, "top", at_a=(x, 0.0, 0.0), at_b=top, stiffness=RATE)
+        for name, x in (("left", -HALF), ("right", HALF))
+    }
+    load = {"load": lg.AppliedForce("top", at=top, force=(0.0, 0.0, -1.0))}
+    return lg.Model({"top": lg.RigidBody(1.0, None, position=top, free="z")}, {}, springs | load)
+
+
+def truss_load(z):
+    """The load that it carries at a height, from the lengths of its springs."""
+    length = np.hypot(HALF, z)
+    return 2.0 * RATE * (np.hypot(HALF, RISE) - length) * z / length
+
+
+@pytest.mark.parametrize("points", [3, 5, 20])
+def test_a_truss_snaps_through_and_back_where_its_load_has_its_extremes(points):
+    """Whatever the number of points, and it is said of the point behind the limit."""
+    peak = minimize_scalar(lambda z: -truss_load(z), bounds=(0.0, RISE), method="bounded", options={"xatol": 1e-12})
+    limit, loads = -peak.fun, np.linspace(0.0, 1.5 * -peak.fun, points)
+    loads = np.concatenate([loads, -loads[1:]]) if points > 3 else loads
+    found = lg.statics(shallow_truss(), loads={"load": loads})
+    below = np.maximum.accumulate(loads > limit) & ~np.maximum.accumulate(loads < -limit)
+    far = 2.0 * RISE
+    height = [
+        brentq(lambda z, load=load: truss_load(z) - load, *((-far, -peak.x) if low else (peak.x, far)), xtol=1e-14)
+        for load, low in zip(loads, below)
+    ]
+    np.testing.assert_allclose(found.body("top").position[:, 2], height, atol=1e-12)  # round-off over the slope
+    np.testing.assert_array_equal(found.snapped, np.diff(below, prepend=False))
+    assert found.stable.all()
+
+
+def test_a_perfect_column_stays_straight_and_is_said_to_be_unstable():
+    """Above its critical load, that of a chain of `elements` with a hinge's stiffness E I/h and rigid in shear."""
+    elements, bending = 6, 4.0
+    section = lg.BeamSection([1e8, 1e8, 1e8, bending, bending, bending], mass=1.0, inertia=(1e-3, 1e-3, 1e-3))
+    beam = lg.Beam("beam", section, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], elements=elements)
+    load = {"down": lg.AppliedForce(f"beam.{elements}", at=(1.0, 0.0, 0.0), force=(-1.0, 0.0, 0.0))}
+    clamp = {"clamp": lg.FixedJoint(None, "beam.0", at=(0.0, 0.0, 0.0))}
+    critical = np.pi**2 * bending / 4.0
+    loads = critical * np.array([0.0, 0.97, 1.03, 1.2])
+    found = lg.statics(lg.Model(beam.bodies, clamp, beam.forces | load), loads={"down": loads})
+    # the mesh's load is another by (π/2)²/(12·6²) = 0.6 %
+    np.testing.assert_array_equal(found.stable, [True, True, False, False])
+    assert not found.snapped.any()
+    np.testing.assert_allclose(found.body(f"beam.{elements}").position[:, [1, 2]], 0.0, atol=1e-12)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lgsens._validate import as_float, suggestion
+from lgsens._validate import as_float, require, suggestion
 from lgsens.dynamics import RESULTS, AbstractDrive, jumped
 from lgsens.model import AbstractJoint, AbstractSignal, Model, MultibodySystem
 
@@ -74,6 +74,19 @@ def columns(argument: str, given: Mapping[str, Any], known: Collection[str], wha
         if name not in known:
             raise ValueError(f"`{argument}`: {suggestion(name, known)}, {what}.")
     return {name: as_float(given[name], None, f"`{argument}[{name!r}]`") for name in sorted(given)}
+
+
+def require_distances(joints: Mapping[str, AbstractJoint], values: Mapping[str, jax.Array]) -> None:
+    """Raise `ValueError` for a driven distance that is not positive."""
+    for name, value in values.items():
+        if name in joints and joints[name].distance:
+            require(
+                lambda value: np.all(value > 0),
+                lambda name=name, value=value: (
+                    f"`driven[{name!r}]` is the distance of two points and must be positive, got {value.min()} m."
+                ),
+                value,
+            )
 
 
 def of_one_length(given: Mapping[str, jax.Array], more: str = "") -> tuple[int, ...]:

@@ -17,6 +17,7 @@ from lgsens.analysis._driven import (
     drivers,
     of_one_length,
     refuse_history,
+    require_distances,
     speeds,
     table,
     unless_jumped,
@@ -98,6 +99,7 @@ def kinematics(
             "which their signals are taken."
         )
     values = columns("driven", driven, where, "the drivers and distance joints of the model")
+    require_distances(model.joints, values)
     columns("driven", rates or {}, where, "the drivers and distance joints of the model")
     names, times = list(values), {} if t is None else {"t": as_float(t, None, "`t`")}
     shape = of_one_length(times | values, ", and `t` be one")

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._validate import as_float
 from lgsens._xla import alike
@@ -18,6 +18,7 @@ from lgsens.analysis._driven import (
     drivers,
     of_one_length,
     refuse_history,
+    require_distances,
     speeds,
     table,
     unless_jumped,
@@ -36,6 +37,11 @@ class Statics(AbstractRun):
         t: the time at which signals are taken [s], shape (n,).
         states: q and λ, at rest, stacked along a leading axis n.
         responses: for each direction of `rates` dq/ds as v and dλ/ds as λ, along axes n and r; see `along`.
+        stable: whether an equilibrium is stable, shape (n,): whether the potential energy of springs and weights has a
+            minimum there, as far as joints let move. A perfect column above its critical load stays straight, and is
+            not.
+        snapped: whether there is a jump on the way to it from the point before, shape (n,): behind a limit point a
+            mechanism snaps through. It is an equilibrium; dynamics may end at another one (`simulate`).
         result: a value of `RESULTS`, shape (), int32; 0 is success.
         system: the equations of motion, driven values and factors those of the reference.
         joints: the joints of the model by name.
@@ -45,6 +51,8 @@ class Statics(AbstractRun):
     t: Float[Array, " n"]
     states: State
     responses: State
+    stable: Bool[Array, " n"]
+    snapped: Bool[Array, " n"]
     result: Int[Array, ""]
     system: MultibodySystem
     joints: dict[str, AbstractJoint] | None
@@ -104,6 +112,7 @@ def statics(
     start = as_float(t0, (), "`t0`")
     known = drivers(with_numbers(model, start).system())
     values = columns("driven", driven or {}, known, "the drivers and distance joints of the model")
+    require_distances(model.joints, values)
     factored = {name: force.with_factor(jnp.zeros_like(start)) for name, force in model.forces.items()}
     factored = {name: force for name, force in factored.items() if force is not None}
     factors = columns("loads", loads or {}, factored, "the force elements of the model with a factor (AppliedForce)")
@@ -130,7 +139,7 @@ def statics(
     drive = Drive(system, tuple(where[name] for name in names))
     path = table(given.values(), shape, start.dtype)
     drive, path, slopes, start = alike((drive, path, slopes, start))
-    (states, responses, result), details = _statics_jit(drive, path, slopes, start, tuple(starts))
+    (states, responses, result), flags, details = _statics_jit(drive, path, slopes, start, tuple(starts))
     if throw:
         if not isinstance(result, Tracer):
             details = details | {"names": names}
@@ -138,8 +147,8 @@ def statics(
                 details = details | {"free": _free_bodies(drive, details)}
         states, responses = throw_if_failed((states, responses), result, details, system.constraint_names)
     time = jnp.broadcast_to(start, shape)
-    own = {"states": states, "responses": responses, "result": result}
-    return Statics(values=given, t=time, **own, system=system, joints=model.joints)
+    found: dict[str, Any] = {"t": time, "states": states, "responses": responses, "result": result} | flags
+    return Statics(values=given, **found, system=system, joints=model.joints)
 
 
 @eqx.filter_jit
@@ -158,7 +167,8 @@ def _statics_jit(drive: Drive, values, rates, t, starts: tuple[int, ...]):
     result = jnp.where(drive.system.is_valid(), result, RESULTS.invalid_numbers).astype(jnp.int32)
     before = jax.tree.map(lambda leaf: leaf[jnp.maximum(first - 1, 0)], (found.q, found.lam))
     details = {"values": values[first], "time": t, "position": first, "before": before}
-    return (states, responses, result), jax.lax.stop_gradient(details)
+    flags = {"stable": found.stable, "snapped": found.snapped}
+    return (states, responses, result), flags, jax.lax.stop_gradient(details)
 
 
 def _free_bodies(drive: Drive, details: dict[str, Any]) -> list[str]:

@@ -14,8 +14,14 @@ more with new factors ends at round-off, and its factors are those of the tangen
 Where that finds nothing, a quarter of the way is tried, from there more, along new tangents: a beam moved along its
 tangent by an angle θ is stretched by θ²/2, and Newton's method is lost where forces of E A θ²/2 make K indefinite. So
 it is where a path of stable equilibria, Zᵀ K_t Z positive definite with B Z = 0, comes to one that is not: that is on
-another branch, unless the shortest stage finds it too and the path itself goes through a bifurcation. A path that is
-lost goes on at the next point that is found from the first one.
+another branch, unless the shortest stage finds it too and the path itself goes through a bifurcation. And so it is
+where Newton's method leaves more than half of what the tangent said: a smooth path leaves the square of a stage.
+
+What even the shortest stage does not reach is behind a limit point, where the mechanism snaps through. From the last
+point (and from the reference, where Newton's method finds no first point) it settles: Zᵀ K_t Z gets −1.5 times its
+lowest eigenvalue on its diagonal as long as that is negative, implicit steps of a motion without inertia down the
+potential energy, and Newton's at last. That is said (`snapped`). A path that is lost goes on at the next point that is
+found from the first one.
 
 Responses. To rates s′ along the path (a direction, of which there may be several) the equilibrium answers with
 
@@ -40,13 +46,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from lgsens._xla import scan, while_loop
+from lgsens._xla import in_any_lane, scan, while_loop
 from lgsens.dynamics._kinematics import AbstractDrive
 from lgsens.linear import LU, Inverse, LinearEquations, linear_solve
 
 _MAX_ITERATIONS = 60
 _SOFT = 1e-3  # of the largest stiffness, where there is none
+_DAMPED = 1.5  # of a negative stiffness, added where a mechanism settles
 _SHORTER, _LONGER, _LEAST = 0.25, 2.0, 1e-3  # stages of the way to a point after one that failed, or not; the least
+_LEFT, _NEAR = 0.5, 0.02  # what Newton may leave of a stage, and in any case: rad, of the size of the scene
 _SLOW = 0.2  # what a chord iteration may leave of a step before factors are renewed
 
 
@@ -67,6 +75,8 @@ class StaticPath(NamedTuple):
     lam_rate: Float[Array, "n r m"]
     found: Bool[Array, " n"]
     free: Bool[Array, " n"]  # K is singular, at an equilibrium or where none was to be found from the first point on
+    stable: Bool[Array, " n"]
+    snapped: Bool[Array, " n"]  # there is a jump on the way to it
 
 
 class _Begin(NamedTuple):
@@ -94,17 +104,23 @@ class _Factors(NamedTuple):
 
     @property
     def stable(self) -> Bool[Array, ""]:
-        """Whether Zᵀ K_t Z is positive definite, with columns of Z that B lets move."""
-        k = self.coordinate.shape[0]
-        stiffness, jacobian = self.matrix[:k, :k], self.matrix[k:, :k]
-        if len(jacobian):
-            z = jnp.linalg.qr(jacobian.T, mode="complete")[0][:, len(jacobian) :]
-            stiffness = z.T @ stiffness @ z
-        return jnp.all(jnp.isfinite(lax.linalg.cholesky((stiffness + stiffness.T) / 2.0, symmetrize_input=False)))
+        """Whether Zᵀ K_t Z is positive definite."""
+        return jnp.all(
+            jnp.isfinite(lax.linalg.cholesky(_free(self.matrix, len(self.coordinate)), symmetrize_input=False))
+        )
 
     def parts(self, y) -> tuple[Array, Array]:
         k = self.coordinate.shape[0]
         return y[:k] * self.coordinate, y[k:] * self.force
+
+
+def _free(matrix, k: int):
+    """Zᵀ K_t Z, symmetric, with columns of Z that B lets move."""
+    stiffness, jacobian = matrix[:k, :k], matrix[k:, :k]
+    if len(jacobian):
+        z = jnp.linalg.qr(jacobian.T, mode="complete")[0][:, len(jacobian) :]
+        stiffness = z.T @ stiffness @ z
+    return (stiffness + stiffness.T) / 2.0
 
 
 def _matrix(drive: AbstractDrive, values, q, lam, t):
@@ -144,38 +160,46 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
     ahead = jnp.concatenate([values[1:] - values[:-1], jnp.zeros_like(values[:1])])
     ahead = jnp.where(jnp.roll(begins, -1)[:, None], 0.0, ahead)
 
-    def factorize(s, q, lam):
+    def factorize(s, q, lam, settles):
         matrix, units = _matrix(drive, s, q, lam, t)
         lu = LU.of(matrix)
         pivots = jnp.abs(jnp.diagonal(lu.lu))
         pivot = jnp.min(pivots) / jnp.max(pivots)
         # What weights alone hold, a pendulum, has a stiffness once the joints carry them, which they do after a step.
-        softened = matrix + jnp.diag(jnp.concatenate([jnp.full(k, _SOFT, dtype), jnp.zeros(m, dtype)]))
-        lu = lax.cond(pivot > 1e3 * jnp.finfo(dtype).eps, lambda: lu, lambda: LU.of(softened))
+        soft = jnp.where(pivot > 1e3 * jnp.finfo(dtype).eps, jnp.zeros((), dtype), _SOFT)
+        if k > m:
+            lowest = lambda: jnp.linalg.eigvalsh(_free(matrix, k), symmetrize_input=False)[0]
+            lowest = lax.cond(in_any_lane(settles), lowest, lambda: jnp.zeros((), dtype))
+            soft = jnp.where(settles, jnp.maximum(soft, -_DAMPED * lowest), soft)
+        softened = lambda: matrix + soft * jnp.diag((jnp.arange(k + m) < k).astype(dtype))
+        softer = lax.cond(in_any_lane(soft > 0.0), lambda: LU.of(softened()), lambda: lu)
+        lu = jax.tree.map(lambda new, old: jnp.where(soft > 0.0, new, old), softer, lu)
         return _Factors(lu, *units, matrix, pivot)
 
     def move(q, lam, w, change):
         return group.retract(q, w), lam + change
 
-    def newton(s, q, lam, factors, stale):
+    def newton(s, q, lam, factors, stale, settles):
         def body(carry):
-            q, lam, factors, stale, size, iteration, _ = carry
-            factors = lax.cond(stale, lambda: factorize(s, q, lam), lambda: factors)
+            q, lam, factors, stale, moved, size, iteration, _ = carry
+            new = lax.cond(in_any_lane(stale), lambda: factorize(s, q, lam, settles), lambda: factors)
+            factors = jax.tree.map(lambda new, old: jnp.where(stale, new, old), new, factors)
             step = -factors.lu.solve(factors.residual(*_residual(drive, s, q, lam, t)))
             left = jnp.max(jnp.abs(step))
             # Far from the solution a full step may leave the branch: at most 0.2 rad or a fifth of the scene at a time.
             step = step * jnp.minimum(1.0, 0.2 / jnp.maximum(jnp.max(jnp.abs(step[:k])), 0.2))
             q, lam = move(q, lam, *factors.parts(step))
             small = left <= precise
-            return q, lam, factors, small | (left > _SLOW * size), left, iteration + 1, small & stale
+            renew = settles | small | (left > _SLOW * size)
+            return q, lam, factors, renew, moved + step[:k], left, iteration + 1, small & stale
 
         def unfinished(carry):
             *_, left, iteration, done = carry
             return ~done & (iteration < _MAX_ITERATIONS) & ~jnp.isnan(left)
 
-        start = (q, lam, factors, stale, jnp.full((), jnp.inf, dtype), jnp.zeros((), jnp.int32), jnp.zeros((), bool))
-        q, lam, factors, *_, done = while_loop(unfinished, body, start)
-        return q, lam, factors, done
+        still = jnp.zeros(k, dtype), jnp.full((), jnp.inf, dtype), jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+        q, lam, factors, _, moved, *_, done = while_loop(unfinished, body, (q, lam, factors, stale, *still))
+        return q, lam, factors, jnp.max(jnp.abs(moved)), done
 
     def respond(s, rates, q, lam, factors):
         def refine(z, _):
@@ -193,36 +217,42 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
         way = s - near.s
 
         def stage(carry):
-            near, factors, stale, reached, size, *_ = carry
+            near, factors, stale, reached, size, settles, snapped, *_ = carry
             to = jnp.minimum(reached + size, 1.0)
             at, share = s - (1.0 - to) * way, to - reached
-            q, lam = move(near.q, near.lam, share * near.w, share * near.lam_rate)
-            q, lam, factors, done = newton(at, q, lam, factors, stale)
-            stable = factors.stable
-            done = done & (first | stable | ~near.stable | (share * _SHORTER <= _LEAST))
+            ahead_of = jnp.where(settles, 0.0, share)
+            q, lam = move(near.q, near.lam, ahead_of * near.w, ahead_of * near.lam_rate)
+            q, lam, factors, moved, done = newton(at, q, lam, factors, stale, settles)
+            stable, shortest = factors.stable, first | (share * _SHORTER <= _LEAST)
+            said = share * jnp.max(jnp.abs(near.w / factors.coordinate))
+            jumped = ~first & (moved > jnp.maximum(_LEFT * said, _NEAR))
+            through = first | stable | ~near.stable | shortest  # a bifurcation, if not before it
+            done = done & jnp.where(settles, stable, through & ~jumped)
             # The last direction is that onward.
             along = jnp.concatenate([rates, jnp.where(to < 1.0, way, ahead)[None]])
             w, lam_rate = respond(at, along, q, lam, factors)
             keep = lambda new, old: jnp.where(done, new, old)
             near = jax.tree.map(keep, _Begin(at, q, lam, w[-1], lam_rate[-1], stable), near)
-            size = jnp.where(done, _LONGER, _SHORTER) * share
-            return near, factors, ~done, keep(to, reached), size, w[:-1], lam_rate[:-1]
+            snapped = snapped | (done & settles & ~first)
+            lost, settles = settles & ~done, ~settles & ~done & shortest
+            size = jnp.where(done, _LONGER, jnp.where(settles, 1.0, jnp.where(lost, 0.0, _SHORTER))) * share
+            return near, factors, ~done, keep(to, reached), size, settles, snapped, w[:-1], lam_rate[:-1]
 
         def unfinished(carry):
             _, _, _, reached, size, *_ = carry
-            # The first point has no way to it.
-            return (reached < 1.0) & (size > jnp.where(first, 0.5, _LEAST)) & (begins | held)
+            return (reached < 1.0) & (size > 0.0) & (begins | held)
 
         none, one = jnp.zeros((), dtype), jnp.ones((), dtype)
         answers = jnp.zeros((len(rates), k), dtype), jnp.zeros((len(rates), m), dtype)
-        stages = near, factors, begins | ~held, none, one, *answers
-        near, factors, _, reached, _, w, lam_rate = while_loop(unfinished, stage, stages)
+        no = jnp.zeros((), bool)
+        stages = near, factors, begins | ~held, none, one, no, no, *answers
+        near, factors, _, reached, _, _, snapped, w, lam_rate = while_loop(unfinished, stage, stages)
         done = reached == 1.0
         home = jax.tree.map(lambda new, old: jnp.where(first & done, new, old), near, home)
         home = home._replace(w=jnp.zeros_like(home.w), lam_rate=jnp.zeros_like(home.lam_rate))
         round_off = jnp.where(done, 1e2, 1e3) * jnp.finfo(dtype).eps
         free = (factors.pivot <= round_off) & (done | first)
-        ended = done.astype(dtype), free.astype(dtype)
+        ended = (flag.astype(dtype) for flag in (done, free, near.stable, snapped))
         return (home, near, factors, done), (near.q, near.lam, w, lam_rate, *ended)
 
     whole = jnp.arange(k + m, dtype=jnp.int32)
@@ -275,8 +305,9 @@ def static_path(
 ) -> StaticPath:
     """The equilibria at each row of driven values, and their responses to each direction of rates, differentiable by
     the rule above; NaN where none was found."""
-    *found, done, free = _path(starts, drive, values, rates, t)
-    held = (done > 0) & (free == 0)
+    q, lam, w, lam_rate, *ended = _path(starts, drive, values, rates, t)
+    done, free, stable, snapped = (flag > 0 for flag in ended)
+    held = done & ~free
     poison = lambda leaf: jnp.where(held.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.nan)
-    q, lam, w, lam_rate = jax.tree.map(poison, tuple(found))
-    return StaticPath(q, lam, w, lam_rate, held, free > 0)
+    q, lam, w, lam_rate = jax.tree.map(poison, (q, lam, w, lam_rate))
+    return StaticPath(q, lam, w, lam_rate, held, free, held & stable, held & snapped)

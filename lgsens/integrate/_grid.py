@@ -26,9 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from lgsens._xla import alike
+from lgsens._xla import alike, in_any_lane, most_of_lanes
 from lgsens.dynamics import AbstractSystem, State
-from lgsens.integrate._lanes import in_any_lane, most_of_lanes
 from lgsens.integrate._linearized import Node
 
 Tree = TypeVar("Tree")

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from lgsens._xla import renewed_where
 from lgsens.dynamics import State
-from lgsens.integrate._lanes import renewed_where
 
 _SAME = 2.0  # the change of h up to which modified Newton keeps its matrix
 

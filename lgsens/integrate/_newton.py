@@ -21,11 +21,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from lgsens._xla import fori_loop, while_loop
+from lgsens._xla import fori_loop, in_any_lane, renewed_where, while_loop
 from lgsens.dynamics import State
 from lgsens.integrate._alpha import AbstractStep, Matrix, at_least
 from lgsens.integrate._guess import Guess
-from lgsens.integrate._lanes import in_any_lane, renewed_where
 from lgsens.integrate._scheme import Stats
 from lgsens.linear import LU, tuned
 

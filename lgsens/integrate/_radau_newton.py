@@ -18,9 +18,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from lgsens._xla import while_loop
+from lgsens._xla import in_any_lane, renewed_where, while_loop
 from lgsens.dynamics import AbstractSystem, State
-from lgsens.integrate._lanes import in_any_lane, renewed_where
 from lgsens.integrate._linearized import Node
 from lgsens.integrate._radau_stages import A, C, RadauStages, StageFactors, advanced, left
 from lgsens.integrate._scheme import Memory, Stats

@@ -40,11 +40,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._validate import as_float, is_concrete, require, require_setting
-from lgsens._xla import alike, scan, while_loop
+from lgsens._xla import alike, in_any_lane, scan, while_loop
 from lgsens.dynamics import RESULTS, AbstractSystem, State, acceleration_and_jerk, unsteady_rate
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
 from lgsens.integrate._grid import UnevenGrid, with_first, without_round_off
-from lgsens.integrate._lanes import in_any_lane
 from lgsens.integrate._linearized import Node
 from lgsens.integrate._march import Progress, Walk, selected
 from lgsens.integrate._scheme import AbstractIntegrator, AbstractScheme, Laid, Start, Stats, scheme_of

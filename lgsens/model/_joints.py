@@ -49,7 +49,8 @@ class AbstractJoint(eqx.Module):
     A joint of one's own has these two names, leaves for its numbers, and `constraints`. It is `assembled` if the
     reference configuration satisfies it by construction, and `rigid` if its bodies move as one. `coordinates` are those
     that it leaves them, or `drives`: functions of the pose of its frame on b in that on a (`lgsens.model.Coordinate`);
-    `slips` the velocities [ẋ, ω] of that pose that rub, 0 … 5, and 6 … 8 those of ω about the axes of b's frame.
+    what drives it must be positive where it is a `distance`; `slips` the velocities [ẋ, ω] of that pose that rub,
+    0 … 5, and 6 … 8 those of ω about the axes of b's frame.
     """
 
     a: eqx.AbstractVar[str | None]
@@ -57,6 +58,7 @@ class AbstractJoint(eqx.Module):
     assembled: ClassVar[Any] = False
     rigid: ClassVar[bool] = False
     drives: ClassVar[bool] = False
+    distance: ClassVar[bool] = False
     coordinates: ClassVar[tuple[Coordinate, ...]] = ()
     slips: ClassVar[tuple[int, ...]] = ()
 
@@ -279,6 +281,7 @@ class DistanceJoint(AbstractJoint):
         return self.length is None
 
     coordinates = (LENGTH,)
+    distance = True
 
     @property
     def frames(self):

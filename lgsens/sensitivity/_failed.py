@@ -3,7 +3,7 @@
 Its states are those of the numerical trajectory up to the step that failed, and NaN from there on. The derivative of
 the first ones is theirs whatever follows. But back substitution meets the rows of the others first, and 0 × NaN is NaN:
 one lane of a batch that failed, masked or not, would make NaN of a gradient by what all lanes share. So rules linearize
-the last state before instead, at each later time, and what they find there is
+the last state before instead, at each later time, that of the reference where there is none, and what they find is
 
     forwards:     δ_n → NaN,
     backwards:    c_n = 0 → 0,  else NaN:
@@ -19,27 +19,31 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool
 
-from lgsens.dynamics import State
+from lgsens.dynamics import AbstractSystem, State
 from lgsens.linear import LinearEquations, linear_solve
 
 
 class Sound(NamedTuple):
-    """The states of a run, the last one before it failed in place of those after it; and which those are."""
+    """The states of a run, the last one before it failed in place of those after it, or the reference where it did not
+    begin; and which those are."""
 
     states: State
     failed: Bool[Array, " n+1"]
 
     @classmethod
-    def of(cls, states: State) -> "Sound":
+    def of(cls, states: State, system: AbstractSystem) -> "Sound":
         known = jnp.all(jnp.isfinite(states.v), axis=1) & jnp.all(jnp.isfinite(states.a), axis=1)
         first = jnp.where(jnp.all(known), known.size, jnp.argmin(known))
         failed, last = jnp.arange(known.size) >= first, jnp.maximum(first - 1, 0)
 
-        def filled(leaf):
-            one = lax.dynamic_index_in_dim(leaf, last, keepdims=True)
+        q, v = lax.stop_gradient(system.reference())
+        none, lam = jnp.zeros_like(v), jnp.zeros(states.lam.shape[1:], v.dtype)
+
+        def filled(leaf, home):
+            one = jnp.where(first > 0, lax.dynamic_index_in_dim(leaf, last, keepdims=True), home)
             return jnp.where(_along(failed, leaf), one, leaf)
 
-        return cls(jax.tree.map(filled, states), failed)
+        return cls(jax.tree.map(filled, states, State(q=q, v=v, vdot=none, lam=lam, a=none)), failed)
 
     def lost(self, rows: Any) -> Any:
         """Rows of floats, NaN where the run has failed: one by one, so that what nobody asks for has no derivative."""

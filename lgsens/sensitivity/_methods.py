@@ -283,7 +283,7 @@ def _direct_rule(equations, primals, tangents):
     scheme, state0, parameters, _ = primals
     _, d_state0, d_parameters, _ = tangents
     states, stats = _direct_trajectory(equations, *primals)
-    group, sound = parameters.system.group, Sound.of(states)
+    group, sound = parameters.system.group, Sound.of(states, parameters.system)
     b = with_first(to_algebra(group, state0, d_state0), earlier(Variation.none(states)))
     delta = linearized_trajectory(scheme, sound.states, parameters, b, d_parameters, equations)
     d_states = sound.lost(jax.vmap(partial(to_ambient, group))(sound.states, delta))
@@ -328,7 +328,7 @@ def _adjoint_forward(scheme, state0, parameters, found):
 
 def _adjoint_backward(kept, cotangents):
     scheme, found, parameters = kept
-    group, sound = parameters.system.group, Sound.of(found)
+    group, sound = parameters.system.group, Sound.of(found, parameters.system)
     states = sound.states
     c = jax.vmap(partial(cotangent_to_algebra, group))(states, sound.asked(cotangents[0]))
     mu, bar = adjoint_sweep(scheme, states, parameters, c, jax.tree.map(jnp.zeros_like, parameters))

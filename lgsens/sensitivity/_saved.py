@@ -79,7 +79,7 @@ def _from_states(
     method: AbstractSensitivity, output: Output, scheme, numbers: Any, state0, parameters: Parameters
 ) -> SavedRun:
     states, stats = method.trajectory(scheme, state0, parameters)
-    sound = Sound.of(states)
+    sound = Sound.of(states, parameters.system)
     at = lambda state, t: output(parameters.system, state, t, numbers)
     asked, others = eqx.partition(jax.vmap(at)(sound.states, parameters.grid.times()), eqx.is_inexact_array)
     outputs = eqx.combine(sound.lost(asked), others)

@@ -65,7 +65,7 @@ def _of_each(question: Callable) -> Callable:
         if not motion._axes_of_time or is_concrete(states.v):
             return question(motion, *about, **more)
         # of rows before a step that failed there are derivatives, backwards too
-        sound, where = Sound.of(states), lambda motion: motion.states
+        sound, where = Sound.of(states, motion.system), lambda motion: motion.states
         found = question(eqx.tree_at(where, motion, sound.states), *about, **more)
         over_time = lambda leaf: eqx.is_inexact_array(leaf) and leaf.shape[:1] == t.shape
         rows, others = eqx.partition(found, over_time)
