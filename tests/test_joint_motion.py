@@ -352,6 +352,9 @@ def test_messages():
         trajectory.point("arm", (0.0, 1.0))
     with pytest.raises(ValueError, match=says("do not know their joints", "give `simulate` the Model", "`multiplier`")):
         dataclasses.replace(trajectory, joints=None).joint("hinge")  # of `simulate(model.system(), …)`
+    instant = lg.Instant(trajectory.t[-1], trajectory.state(-1), trajectory.system)  # as an integrand sees it
+    with pytest.raises(ValueError, match=says("nor does an instant", "`jax.grad` what `joint` says")):
+        instant.joint("hinge")
 
 
 def test_a_batch_is_asked_one_by_one():

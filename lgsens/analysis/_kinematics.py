@@ -82,7 +82,8 @@ def kinematics(
             time. None: signals are held at t0.
         t0: the time at which signals and time-dependent forces are taken where `t` is None [s], shape ().
         throw: raise if there is no such position, or an angle of a spring, a gear or a coupling passes half a turn,
-            which positions do not tell. With False `result` says so; numbers of a position that is none are NaN.
+            which positions do not tell. With False `result` says so; numbers of a position that is none are NaN, and
+            those of the positions after it.
 
     Differentiable by every number of the model and by the driven values, by the implicit function theorem: one
     factorization per position for all of them. Raises `ValueError` for names that are not drivers, values of different

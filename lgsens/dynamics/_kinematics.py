@@ -106,13 +106,20 @@ def _small(size):
 
 @jax.custom_jvp
 def _configurations(drive: AbstractDrive, values: Float[Array, "n d"], t: Float[Array, " n"]):
-    """q(s, t) for each row of `values`, found one from the other, the first from the reference; and Newton's step."""
+    """q(s, t) for each row of `values`, found one from the other, the first from the reference; and Newton's step.
 
-    def follow(start, row):
+    Where the way ends it is lost, its step infinite: what follows may be assembled otherwise.
+    """
+
+    def follow(carry, row):
+        start, begun, lost = carry
         q, size = _newton(drive, start, *row)
-        return jax.tree.map(lambda new, old: jnp.where(_small(size), new, old), q, start), (q, size)
+        found = _small(size) & ~lost
+        after = jax.tree.map(lambda new, old: jnp.where(found, new, old), q, start)
+        return (after, begun | found, lost | (begun & ~found)), (q, jnp.where(lost, jnp.inf, size))
 
-    return scan(follow, drive.system.reference()[0], (values, t))[1]
+    no = jnp.zeros((), bool)
+    return scan(follow, (drive.system.reference()[0], no, no), (values, t))[1]
 
 
 @_configurations.defjvp

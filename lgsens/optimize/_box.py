@@ -45,8 +45,9 @@ class Box(NamedTuple):
     def value(self, z):
         y = (1.0 - z) * self.zero + z * self.one  # exact at both ends
         x = jnp.where(self.log, jnp.exp(jnp.where(self.log, y, 0.0)), y)
-        # The clip keeps round-off of the logarithm from leaving the bounds. Its own derivative is ½ at them.
-        return x + jax.lax.stop_gradient(jnp.clip(x, self.lower, self.upper) - x)
+        # Round-off of the logarithm does not leave the bounds. The derivative of a clip is ½ at them.
+        off = jax.lax.stop_gradient(jnp.clip(x, self.lower, self.upper) - x)
+        return x + jnp.where(jnp.abs(off) <= 1e2 * jnp.finfo(x.dtype).eps * jnp.abs(x), off, 0.0)
 
     def rate(self, z):
         """dx/dz, entry by entry."""
@@ -71,7 +72,8 @@ def checked_box(x0, lower, upper, log_scale) -> tuple[Array, Callable[[Array], P
             tree = jax.tree.map(everywhere, tree, x0, is_leaf=lambda bound: bound is None)
         if jax.tree.structure(tree) != jax.tree.structure(x0):
             raise ValueError(
-                f"`{what}` must be a pytree like `x0`, {jax.tree.structure(x0)}, got {jax.tree.structure(tree)}."
+                f"`{what}` must be a pytree like `x0`, whose entries are {', '.join(entry_names(x0)[:9])}, with a "
+                f"number (for all of an array) or an array in place of each array; got {tree!r}."
             )
 
         def leaf(path, x, value):
@@ -97,7 +99,8 @@ def checked_box(x0, lower, upper, log_scale) -> tuple[Array, Callable[[Array], P
         if not np.isfinite(value):
             raise ValueError(f"`x0` must be finite, got {value} for {name}.")
         if not a < b:
-            raise ValueError(f"`lower` must be below `upper`, got {a} and {b} for {name}.")
+            fixed = "; leave what is fixed out of `x0`" if a == b else ""
+            raise ValueError(f"`lower` must be below `upper`, got {a} and {b} for {name}{fixed}.")
         if not a <= value <= b:
             raise ValueError(f"`x0` must lie within the bounds: {name} = {value} is outside [{a}, {b}].")
         if logarithmic and not (a > 0 or (np.isneginf(a) and value > 0)):

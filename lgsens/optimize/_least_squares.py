@@ -9,6 +9,7 @@ as noise falls: x − x_true ≈ −(JᵀJ)⁻¹ Jᵀ r(x_true), where r(x_true)
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax
@@ -86,13 +87,14 @@ def least_squares(
         max_steps: the most steps, of which rejected ones are some: close to the optimum they drown in the round-off of
             |r|², and how many are rejected before the last one is chance.
 
-    It can be traced: `jax.jit` it for many data sets, `jax.vmap` or `lgsens.sweep` it over them. Not converging is
-    data, `LeastSquaresResult.converged`. Raises `ValueError` as `variables`, and for fewer residuals than parameters.
+    Compiled once for one `residual` and shapes; a function that is written anew is another one. It can be traced:
+    `jax.jit` it for many data sets, `jax.vmap` or `lgsens.sweep` it over them. Not converging is data,
+    `LeastSquaresResult.converged`. Raises `ValueError` as `variables`, and for fewer residuals than parameters.
     Sources: Nocedal & Wright 2006, §10.3; Kay, Fundamentals of Statistical Signal Processing I (1993), §3.
     """
     z0, design = variables(parametrization, x0)
-    flat_residual = lambda x: ravel_pytree(residual(x))[0]
-    count = jax.eval_shape(lambda z: flat_residual(design(z)), z0).shape[0]
+    flat_residual = _Residual(residual, design)
+    count = jax.eval_shape(flat_residual, z0).shape[0]
     if count < z0.size:
         raise ValueError(
             f"`residual` has {count} entries, fewer than the {z0.size} parameters: measure more, or free less."
@@ -100,26 +102,36 @@ def least_squares(
     solver = LineSearchGaussNewton() if solver is None else solver
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # optimistix is less strict
         found = optimistix.least_squares(
-            lambda z, _: flat_residual(design(z)),
+            flat_residual,
             solver,
             z0,
             max_steps=as_count(max_steps, "max_steps"),
             throw=False,
         )
-    x = design(found.value)
+    converged = found.result == optimistix.RESULTS.successful
+    return LeastSquaresResult(**_at(flat_residual, found.value), converged=converged, steps=found.stats["num_steps"])
+
+
+class _Residual(eqx.Module):
+    """z ↦ r, flat: of the same function the same, so that programs of it are found again."""
+
+    residual: Callable[[PyTree], PyTree]
+    design: Callable[[Array], PyTree]
+
+    def __call__(self, z, _=None):
+        return ravel_pytree(self.residual(self.design(z)))[0]
+
+
+@eqx.filter_jit
+def _at(of: _Residual, z: Array) -> dict[str, Any]:
+    """What is said of a point."""
+    x = of.design(z)
     flat, unravel = ravel_pytree(x)
-    twice = lambda x: (flat_residual(unravel(x)),) * 2
+    twice = lambda x: (ravel_pytree(of.residual(unravel(x)))[0],) * 2
     jacobian, left = jax.jacfwd(twice, has_aux=True)(flat)
     bound = covariance(jacobian)
-    return LeastSquaresResult(
-        x=x,
-        residual=left,
-        jacobian=jacobian,
-        covariance=bound,
-        deviation=unravel(jnp.sqrt(jnp.diagonal(bound))),
-        converged=found.result == optimistix.RESULTS.successful,
-        steps=found.stats["num_steps"],
-    )
+    deviation = unravel(jnp.sqrt(jnp.diagonal(bound)))
+    return {"x": x, "residual": left, "jacobian": jacobian, "covariance": bound, "deviation": deviation}
 
 
 def covariance(jacobian: Float[Array, "m n"]) -> Float[Array, "n n"]:

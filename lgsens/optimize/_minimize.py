@@ -54,8 +54,10 @@ class OptimizationResult(NamedTuple):
         constraints: g(x), in the shape `fun` gave them.
         feasible: whether max g(x) ≤ constraint_tolerance.
         reason: why the search ended: "converged"; "steps", all of them were taken; "stalled", no step along −∇L
-            lowers L any more: round-off, or a gradient that is wrong; "infeasible", the violation has a minimum here;
-            "interrupted" from the keyboard (Ctrl-C) after the first evaluation: nothing that was found is lost.
+            lowers L any more: round-off, a gradient that is wrong, or designs ahead that cannot be simulated
+            (`history.objective` is not finite there: keep away from them by a constraint, of a linkage that it can be
+            closed); "infeasible", the violation has a minimum here; "interrupted" from the keyboard (Ctrl-C) after the
+            first evaluation: nothing that was found is lost.
         step: the evaluation at which x was found.
         history: the course of the minimization.
         multipliers: μ at the end, shaped as the constraints: the gain in f/|f(x₀)| per unit by which a constraint is
@@ -144,7 +146,7 @@ class Minimization:
 
         program = Minimization(fun, x0, lower=…, upper=…)
         f, gradient = program.value_and_grad(x0)
-        found = program(num_steps=100)
+        found, another = program(num_steps=100), program(num_steps=100, x0=x1)
 
     Arguments are those of `minimize`, and so are errors.
 
@@ -174,8 +176,18 @@ class Minimization:
             self._method.compile(self._x)
         self.compile_seconds = time.perf_counter() - started
 
+    def _within(self, x0: PyTree) -> Array:
+        """Another start, as a vector. Raises `ValueError` where it is none."""
+        x = ravel_pytree(x0)[0].astype(self._x.dtype)
+        like = jax.tree.structure(self._unravel(self._x))
+        if jax.tree.structure(x0) != like or x.shape != self._x.shape:
+            raise ValueError(f"`x0` must be like that of the program, {like} with {self._x.size} numbers, got {x0!r}.")
+        if not bool(jnp.all((self._box.lower <= x) & (x <= self._box.upper))):
+            raise ValueError(f"`x0` must lie within the bounds of the program, got {x0!r}.")
+        return x
+
     def value_and_grad(self, x: PyTree) -> tuple[float, PyTree]:
-        """f and ∇f at a design like x0, within the bounds."""
+        """f and ∇f at a design like x0."""
         flat = ravel_pytree(x)[0].astype(self._x.dtype)
         f, slope = self._method.slope(flat)
         return float(f), self._unravel(slope / self._box.rate(self._box.scaled(flat)))
@@ -184,21 +196,23 @@ class Minimization:
         self,
         num_steps: int,
         *,
+        x0: PyTree = None,
         progress: bool = True,
         callback: Callable[[int, float, float], None] | None = None,
         checkpoint: str | os.PathLike | None = None,
     ) -> OptimizationResult:
-        """The search from x0."""
+        """The search, from x0 or another start within the bounds, on the same scale."""
         num_steps = as_count(num_steps, "num_steps")
         method, began = self._method, time.perf_counter()
-        start = method.begin(self._x)
+        x = self._x if x0 is None else self._within(x0)
+        start = method.begin(x)
         first = start[1]
         if not (np.isfinite(first.objective) and np.isfinite(first.gradient_norm) and not np.isnan(first.worst)):
             raise ValueError(
                 "The objective, a constraint or the gradient is not finite at `x0` (objective "
                 f"{float(first.objective)}); start from a design that can be simulated."
             )
-        store = None if checkpoint is None else Checkpoint(checkpoint, self._box, self._x, self._tolerances)
+        store = None if checkpoint is None else Checkpoint(checkpoint, self._box, x, self._tolerances)
         course, reason = Course(start, num_steps, store), "interrupted"
         with progress_bar(num_steps, "step", progress, initial=len(course.rows)) as bar:
 

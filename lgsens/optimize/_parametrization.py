@@ -125,12 +125,25 @@ def variables(parametrization: PyTree, x0: PyTree) -> tuple[Float[Array, " n"], 
         maps = jax.tree.map(spread, parametrization, x0, is_leaf=single)
     except ValueError as error:
         raise ValueError(f"`parametrization` must be one for all, or a pytree like `x0`: {error}") from error
-    each = lambda name: lambda node, leaf: getattr(node, name)(leaf)
-    z = jax.tree.map(each("variable"), maps, x0, is_leaf=single)
+    z = jax.tree.map(lambda node, leaf: node.variable(leaf), maps, x0, is_leaf=_is_one)
     flat, unravel = ravel_pytree(z)
     require(
         lambda flat: np.all(np.isfinite(flat)),
         "`x0` is out of the range of its parametrization: Log needs x > 0, Interval lower < x < upper.",
         flat,
     )
-    return flat, lambda z: jax.tree.map(each("value"), maps, unravel(z), is_leaf=single)
+    return flat, _Design(maps, unravel)
+
+
+def _is_one(node: Any) -> bool:
+    return isinstance(node, AbstractParametrization)
+
+
+class _Design(eqx.Module):
+    """z ↦ x. The same for the same numbers, so that what is compiled with it is found again."""
+
+    maps: PyTree
+    unravel: Callable[[Array], PyTree]
+
+    def __call__(self, z: Array) -> PyTree:
+        return jax.tree.map(lambda node, leaf: node.value(leaf), self.maps, self.unravel(z), is_leaf=_is_one)

@@ -82,8 +82,11 @@ class Method:
         self.program = self.program.lower(self.box.scaled(x)).compile()
 
     def begin(self, x: Array) -> tuple[None, Evaluation]:
-        """The evaluation at x₀."""
-        return None, self.evaluated(np.asarray(self.box.scaled(x), np.float64), None)
+        """The evaluation at x₀. Raises `ValueError` for a constraint that is −∞ there."""
+        row = self.evaluated(np.asarray(self.box.scaled(x), np.float64), None)
+        if np.any(np.isneginf(row.constraints)):
+            raise ValueError("A constraint is −∞ at `x0`; leave out what can never be active.")
+        return None, row
 
     def slope(self, x: Array) -> tuple[np.ndarray, np.ndarray]:
         """f at x, and its gradient by z."""

@@ -188,9 +188,9 @@ def allocate_tolerances(
     Arguments:
         stack: of the nominal design, whose Jacobian is used; tolerances of 0 in it stay 0.
         bands: by output b > 0, in its unit, of as many standard deviations as the tolerances are to be.
-        costs: c > 0 of the inputs, shape (n,); None: as the stack's own tolerances, so that the same relative change of
-            each of them costs the same.
-        largest: bounds of t from above, shape (n,); None: 100 times the stack's own.
+        costs: c > 0 of the inputs, by name or shape (n,); None: as the stack's own tolerances, so that the same
+            relative change of each of them costs the same.
+        largest: bounds of t from above, by name or shape (n,); None: 100 times the stack's own.
 
     Returns t by input. Raises `ValueError` for unknown outputs, bands or costs that are not positive, and without any
     input to choose.
@@ -205,8 +205,8 @@ def allocate_tolerances(
     if not bands or not chosen.any():
         raise ValueError("`bands` is empty, or all tolerances of the stack are 0; there is nothing to allocate.")
     b = np.asarray([float(bands[name]) for name in bands])
-    c = own if costs is None else np.broadcast_to(np.asarray(costs, float), own.shape)
-    most = 100.0 * own if largest is None else np.broadcast_to(np.asarray(largest, float), own.shape)
+    c = own if costs is None else _of_inputs("costs", costs, stack)
+    most = 100.0 * own if largest is None else _of_inputs("largest", largest, stack)
     for name, numbers in (("bands", b), ("costs", c[chosen]), ("largest", most[chosen])):
         if not np.all(numbers > 0.0):
             raise ValueError(f"`{name}` must be positive, got {numbers}.")
@@ -234,3 +234,13 @@ def allocate_tolerances(
     t = np.zeros_like(own)
     t[chosen] = own[chosen] * np.exp(found.x)
     return dict(zip(stack.inputs, t.tolist()))
+
+
+def _of_inputs(argument: str, given: Any, stack: ToleranceStack) -> np.ndarray:
+    """A number for each input; of those that are given by name, for each of them that has a tolerance."""
+    if isinstance(given, Mapping):
+        chosen = {name for name, tolerance in zip(stack.inputs, np.asarray(stack.tolerances)) if tolerance > 0}
+        if wrong := sorted(set(given) - set(stack.inputs)) + sorted(chosen - set(given)):
+            raise ValueError(f"`{argument}` must name the inputs that have a tolerance, {sorted(chosen)}; see {wrong}.")
+        given = [given.get(name, 1.0) for name in stack.inputs]
+    return np.broadcast_to(np.asarray(given, float), (len(stack.inputs),))

@@ -69,12 +69,14 @@ def time_histories(t, panels: Sequence[Panel], title: str = "") -> "Figure":
     return fig
 
 
-def convergence(history: Any, *, tolerance: float, best: int | None = None, objective: str = "objective") -> "Figure":
+def convergence(
+    history: Any, *, tolerance: float = 1e-3, best: int | None = None, objective: str = "objective"
+) -> "Figure":
     """The objective, the worst constraint and the projected gradient over the steps of a minimization.
 
     Arguments:
         history: `OptimizationResult.history`.
-        tolerance: up to which the constraints count as satisfied; the region beyond is shaded.
+        tolerance: up to which the constraints count as satisfied, as of `minimize`; the region beyond is shaded.
         best: the step whose design was kept, to be marked.
         objective: label of the objective, with its unit.
 

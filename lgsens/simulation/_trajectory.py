@@ -81,6 +81,7 @@ class AbstractMotion(eqx.Module):
     batch of motions its axes before."""
 
     system: eqx.AbstractVar[AbstractSystem]
+    joints: eqx.AbstractVar[dict[str, AbstractJoint] | None]
     _axes_of_time: ClassVar[int] = 0
 
     @abc.abstractmethod
@@ -196,15 +197,6 @@ class AbstractMotion(eqx.Module):
             return jax.tree.map(lambda leaf: leaf[0], stacked)
         return measure(*at)
 
-
-class AbstractRun(AbstractMotion):
-    """What motions over time answer besides, those of `simulate` and of `kinematics`."""
-
-    t: eqx.AbstractVar[Float[Array, " n+1"]]
-    result: eqx.AbstractVar[Int[Array, ""]]
-    joints: eqx.AbstractVar[dict[str, AbstractJoint] | None]
-    _axes_of_time: ClassVar[int] = 1
-
     @_of_each
     def joint(self, name: str) -> JointMotion:
         """The motion of the joint `name`: angle, displacement, their rates, force and moment on its body b.
@@ -223,8 +215,8 @@ class AbstractRun(AbstractMotion):
         joints = self.joints
         if joints is None:
             raise ValueError(
-                "`joint`: this is the motion of equations, which do not know their joints; give `simulate` the Model "
-                "itself and not its `system()`, or use `multiplier`."
+                "`joint`: this is the motion of equations, which do not know their joints, nor does an instant; give "
+                "`simulate` the Model and not its `system()`, and `jax.grad` what `joint` says, or use `multiplier`."
             )
         for name in names:
             if name not in joints:
@@ -233,6 +225,14 @@ class AbstractRun(AbstractMotion):
         return {
             name: joint_motion(joints[name], self.body, self._reference, wrench, t) for name, wrench in wrenches.items()
         }
+
+
+class AbstractRun(AbstractMotion):
+    """What motions over time answer besides, those of `simulate` and of `kinematics`."""
+
+    t: eqx.AbstractVar[Float[Array, " n+1"]]
+    result: eqx.AbstractVar[Int[Array, ""]]
+    _axes_of_time: ClassVar[int] = 1
 
     def to_xarray(self) -> Any:
         """An `xarray.Dataset` over the dimension "time": all bodies, joints and states of force elements.
@@ -344,6 +344,7 @@ class Instant(AbstractMotion):
     t: Float[Array, ""]
     state: State
     system: AbstractSystem
+    joints: dict[str, AbstractJoint] | None = None
 
     def _kinematics(self):
         return self.state, self.t

@@ -184,3 +184,17 @@ def test_a_four_bar_is_identified_from_noisy_accelerations():
     left = sum(float(jnp.sum(each.residual**2)) for each in found)
     low, high = scipy.stats.chi2.ppf([5e-5, 1 - 5e-5], 16 * (found[0].residual.size - 6))
     assert low < left < high
+
+
+def test_the_same_residual_is_traced_once_whatever_the_start():
+    traces = []
+
+    def residual(p):
+        traces.append(p)
+        return oscillator(p) - oscillator(TRUTH)
+
+    first = least_squares(residual, GUESS)
+    count = len(traces)
+    second = least_squares(residual, {"c": 0.7, "k": 31.0, "m": 1.8})
+    assert first.converged and second.converged
+    assert count < len(traces) <= count + 1  # that of the number of residuals

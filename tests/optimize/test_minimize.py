@@ -19,6 +19,9 @@ def disc(x):
     return (x["a"] - 2.0) ** 2 + (x["b"] - 1.0) ** 2, jnp.stack([x["a"] ** 2 + x["b"] ** 2 - 1.0])
 
 
+BOX = {"a": -2.0, "b": -2.0}, {"a": 2.0, "b": 2.0}
+
+
 def quiet(fun, x0, lower, upper, num_steps=200, **options):
     return minimize(fun, x0, lower=lower, upper=upper, num_steps=num_steps, progress=False, **options)
 
@@ -40,8 +43,8 @@ def test_the_optimum_on_an_active_constraint():
 @pytest.mark.parametrize("forward", [True, False])
 @pytest.mark.parametrize(
     "x",
-    [{"a": 0.5, "b": 1.7}, {"a": 0.25, "b": -2.0}, {"a": 2.0, "b": 2.0}],
-    ids=["inside, constraint violated", "at two lower bounds", "at two upper bounds"],
+    [{"a": 0.5, "b": 1.7}, {"a": 0.25, "b": -2.0}, {"a": 2.0, "b": 2.0}, {"a": 3.0, "b": -2.5}],
+    ids=["inside, constraint violated", "at two lower bounds", "at two upper bounds", "outside"],
 )
 def test_its_program_gives_the_gradient_of_the_objective_at_any_design(forward, x):
     """a by its logarithm."""
@@ -49,11 +52,27 @@ def test_its_program_gives_the_gradient_of_the_objective_at_any_design(forward, 
     log = {"a": True, "b": False}
     program = Minimization(disc, {"a": 1.0, "b": 0.0}, **bounds, log_scale=log, forward=forward, progress=False)
     f, gradient = program.value_and_grad(x)
-    # Some ten roundings in numbers up to 16.
+    # Some twenty roundings in numbers up to 16.
     assert f == pytest.approx((x["a"] - 2) ** 2 + (x["b"] - 1) ** 2, abs=4e-14)
     assert float(gradient["a"]) == pytest.approx(2 * (x["a"] - 2), abs=4e-14)
     assert float(gradient["b"]) == pytest.approx(2 * (x["b"] - 1), abs=4e-14)
     assert program(num_steps=100, progress=False).reason == "converged"
+
+
+def test_a_program_searches_from_any_start():
+    program = Minimization(disc, {"a": -1.0, "b": 0.0}, lower=BOX[0], upper=BOX[1], progress=False)
+    found = program(num_steps=100, x0={"a": 0.5, "b": 1.5}, progress=False)
+    again = quiet(disc, {"a": 0.5, "b": 1.5}, *BOX, num_steps=100)
+    np.testing.assert_array_equal(found.history.objective, again.history.objective)
+    with pytest.raises(ValueError, match="must lie within the bounds of the program"):
+        program(num_steps=1, x0={"a": 0.5, "b": 2.5}, progress=False)
+    with pytest.raises(ValueError, match="must be like that of the program"):
+        program(num_steps=1, x0={"a": 0.5}, progress=False)
+
+
+def test_a_constraint_that_can_never_be_active_is_refused():
+    with pytest.raises(ValueError, match="A constraint is −∞ at `x0`"):
+        quiet(lambda x: (x**2, jnp.stack([-jnp.inf, x - 3.0])), jnp.asarray(1.0), -1.0, 2.0)
 
 
 @pytest.mark.parametrize("forward", [True, False])

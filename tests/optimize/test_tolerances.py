@@ -69,6 +69,8 @@ def test_one_band_is_allocated_as_the_closed_form(stack):
     t = t * 5e-5 / np.linalg.norm(slopes * t)
     np.testing.assert_allclose([found["crank"], found["rod[0]"]], t, rtol=1e-6)
     assert found["rod[1]"] == 0.0
+    named = dict(zip(["crank", "rod[0]"], costs))
+    assert allocate_tolerances(stack, {"x": 5e-5}, costs=named, largest={"crank": 1.0, "rod[0]": 1.0}) == found
 
 
 def test_several_bands():
@@ -118,6 +120,7 @@ def test_of_a_simulation():
         (lambda s: s.ranked("z"), says("`output`", "'z'")),
         (lambda s: allocate_tolerances(s, {"z": 1.0}), says("`bands`", "'z'")),
         (lambda s: allocate_tolerances(s, {"x": -1.0}), says("`bands` must be positive")),
+        (lambda s: allocate_tolerances(s, {"x": 1.0}, costs={"crank": 1.0}), says("`costs` must name", "['rod[0]']")),
     ],
 )
 def test_bad_input(stack, call, message):
