@@ -14,6 +14,7 @@ who asks for nothing of the states that there are not has a derivative, and who 
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -36,14 +37,14 @@ class Sound(NamedTuple):
         first = jnp.where(jnp.all(known), known.size, jnp.argmin(known))
         failed, last = jnp.arange(known.size) >= first, jnp.maximum(first - 1, 0)
 
-        q, v = lax.stop_gradient(system.reference())
-        none, lam = jnp.zeros_like(v), jnp.zeros(states.lam.shape[1:], v.dtype)
+        zero = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]), states)
+        home = eqx.tree_at(lambda state: (state.q, state.v), zero, lax.stop_gradient(system.reference()))
 
         def filled(leaf, home):
             one = jnp.where(first > 0, lax.dynamic_index_in_dim(leaf, last, keepdims=True), home)
             return jnp.where(_along(failed, leaf), one, leaf)
 
-        return cls(jax.tree.map(filled, states, State(q=q, v=v, vdot=none, lam=lam, a=none)), failed)
+        return cls(jax.tree.map(filled, states, home), failed)
 
     def lost(self, rows: Any) -> Any:
         """Rows of floats, NaN where the run has failed: one by one, so that what nobody asks for has no derivative."""
