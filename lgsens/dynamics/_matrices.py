@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from lgsens.dynamics._constraints import full_jacobian
 from lgsens.dynamics._redundant import refined, softness
 from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem, Tangents
-from lgsens.linear import LU, Factors, LinearEquations, Matrix, SparseMatrix, linear_solve, tuned
+from lgsens.linear import LU, Factors, Inverse, LinearEquations, Matrix, SparseMatrix, linear_solve, tuned
 
 
 def _sparse(system: AbstractSystem) -> AbstractSparseSystem | None:
@@ -139,7 +139,9 @@ class ConstrainedMass(eqx.Module):
         if factors is not None or (_sparse(system) is None and soft is None):
             return cls(mass, jacobian, factors, soft is not None)
         fixed, border = for_once(*lax.stop_gradient((mass, jacobian)))
-        factors = factorized(system, fixed, border.T, border, mass_scale(mass), softness=soft, once=True)
+        # by blocks what is left is small, and a product with its inverse compiles sooner than two loops for each solution
+        kind = Inverse if isinstance(fixed, SparseMatrix) else LU
+        factors = factorized(system, fixed, border.T, border, mass_scale(mass), kind, soft, once=True, exact=True)
         return cls(mass, jacobian, factors, soft is not None)
 
     @classmethod
