@@ -139,7 +139,7 @@ class ConstrainedMass(eqx.Module):
         if factors is not None or (_sparse(system) is None and soft is None):
             return cls(mass, jacobian, factors, soft is not None)
         fixed, border = for_once(*lax.stop_gradient((mass, jacobian)))
-        # by blocks what is left is small, and a product with its inverse compiles sooner than two loops for each solution
+        # what blocks leave is small, and a product with its inverse compiles sooner than two loops for each solution
         kind = Inverse if isinstance(fixed, SparseMatrix) else LU
         factors = factorized(system, fixed, border.T, border, mass_scale(mass), kind, soft, once=True, exact=True)
         return cls(mass, jacobian, factors, soft is not None)
