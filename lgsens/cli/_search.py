@@ -113,7 +113,7 @@ def search(job: Any, steps: int, checkpoint: Path, progress: bool) -> Search:
             raise ValueError(f"the suspension cannot be simulated: {RESULTS(int(result)).message}")
         return value, response
 
-    simulated(problem.start)  # before more is compiled
+    first = simulated(problem.start)  # before more is compiled
     program = Minimization(
         problem,
         problem.start,
@@ -124,16 +124,15 @@ def search(job: Any, steps: int, checkpoint: Path, progress: bool) -> Search:
         progress=progress,
     )
 
-    def respond(x) -> tuple[float, Any, GradientCheck]:
-        value, response = simulated(x)
+    def respond(x, value, response) -> tuple[float, Any, GradientCheck]:
         _, gradient = program.value_and_grad(x)  # that by which the search goes; of its neighbours values do
         settings = {"scale": job.scale, "step": CHECK_STEP, "max_directions": CHECKED_DIRECTIONS}
         check = check_gradient(problem, x, value_and_grad=lambda x: (evaluate(x)[0], gradient), **settings)
         return float(value), jax.tree.map(np.asarray, response), check
 
-    at_start, before, check_before = respond(problem.start)
+    at_start, before, check_before = respond(problem.start, *first)
     result = program(steps, progress=progress, checkpoint=checkpoint)
-    _, after, check_after = respond(result.x)
+    _, after, check_after = respond(result.x, *simulated(result.x))
     seconds = {
         "compilation": compiled - started + result.compile_seconds,
         "optimization": result.run_seconds,

@@ -38,6 +38,7 @@ transposed factors, as many per output. δD is a directional derivative of D, no
 Nothing is differentiated along the iteration, nor by the point where it began (Haug, Choi & Komkov 1986, §1.2.2).
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -114,6 +115,12 @@ class _Factors(NamedTuple):
         return y[:k] * self.coordinate, y[k:] * self.force
 
 
+def _where_due(due, new: Callable[[], Any], earlier: Any) -> Any:
+    """`new()` where it is due; of a batch computed if it is due in any lane, where `cond` alone always computes it."""
+    found = lax.cond(in_any_lane(due), new, lambda: earlier)
+    return jax.tree.map(lambda new, old: jnp.where(due, new, old), found, earlier)
+
+
 def _free(matrix, k: int):
     """Zᵀ K_t Z, symmetric, with columns of Z that B lets move."""
     stiffness, jacobian = matrix[:k, :k], matrix[k:, :k]
@@ -169,12 +176,9 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
         soft = jnp.where(pivot > 1e3 * jnp.finfo(dtype).eps, jnp.zeros((), dtype), _SOFT)
         if k > m:
             lowest = lambda: jnp.linalg.eigvalsh(_free(matrix, k), symmetrize_input=False)[0]
-            lowest = lax.cond(in_any_lane(settles), lowest, lambda: jnp.zeros((), dtype))
-            soft = jnp.where(settles, jnp.maximum(soft, -_DAMPED * lowest), soft)
+            soft = _where_due(settles, lambda: jnp.maximum(soft, -_DAMPED * lowest()), soft)
         softened = lambda: matrix + soft * jnp.diag((jnp.arange(k + m) < k).astype(dtype))
-        softer = lax.cond(in_any_lane(soft > 0.0), lambda: LU.of(softened()), lambda: lu)
-        lu = jax.tree.map(lambda new, old: jnp.where(soft > 0.0, new, old), softer, lu)
-        return _Factors(lu, *units, matrix, pivot)
+        return _Factors(_where_due(soft > 0.0, lambda: LU.of(softened()), lu), *units, matrix, pivot)
 
     def move(q, lam, w, change):
         return group.retract(q, w), lam + change
@@ -182,8 +186,7 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
     def newton(s, q, lam, factors, stale, settles):
         def body(carry):
             q, lam, factors, stale, moved, size, iteration, _ = carry
-            new = lax.cond(in_any_lane(stale), lambda: factorize(s, q, lam, settles), lambda: factors)
-            factors = jax.tree.map(lambda new, old: jnp.where(stale, new, old), new, factors)
+            factors = _where_due(stale, lambda: factorize(s, q, lam, settles), factors)
             step = -factors.lu.solve(factors.residual(*_residual(drive, s, q, lam, t)))
             left = jnp.max(jnp.abs(step))
             # Far from the solution a full step may leave the branch: at most 0.2 rad or a fifth of the scene at a time.

@@ -167,28 +167,25 @@ class Minimization:
         forward: bool | None = None,
         progress: bool = True,
     ):
-        self._x, self._unravel, self._box = checked_box(x0, lower, upper, log_scale)
+        self._bounds = lower, upper, log_scale
+        self._x, self._unravel, self._box = checked_box(x0, *self._bounds)
         self._tolerances = checked_tolerances(tolerance, constraint_tolerance)
         started = time.perf_counter()
-        prepare = prepared(fun, self._x, self._unravel, self._box, self._tolerances, forward)
-        self._method, self._shape = prepare
+        self._method, self._shape = prepared(fun, self._x, self._unravel, self._box, self._tolerances, forward)
         with compiling("objective, constraints and their derivatives", progress):
             self._method.compile(self._x)
         self.compile_seconds = time.perf_counter() - started
 
-    def _within(self, x0: PyTree) -> Array:
-        """Another start, as a vector. Raises `ValueError` where it is none."""
-        x = ravel_pytree(x0)[0].astype(self._x.dtype)
-        like = jax.tree.structure(self._unravel(self._x))
-        if jax.tree.structure(x0) != like or x.shape != self._x.shape:
-            raise ValueError(f"`x0` must be like that of the program, {like} with {self._x.size} numbers, got {x0!r}.")
-        if not bool(jnp.all((self._box.lower <= x) & (x <= self._box.upper))):
-            raise ValueError(f"`x0` must lie within the bounds of the program, got {x0!r}.")
-        return x
+    def _flat(self, x: PyTree, name: str) -> Array:
+        """A design as a vector. Raises `ValueError` where it is none like x0."""
+        like, kind = self._unravel(self._x), lambda x: (jax.tree.structure(x), [*map(np.shape, jax.tree.leaves(x))])
+        if kind(x) != kind(like):
+            raise ValueError(f"`{name}` must be like that of the program, {like!r}, got {x!r}.")
+        return ravel_pytree(x)[0].astype(self._x.dtype)
 
     def value_and_grad(self, x: PyTree) -> tuple[float, PyTree]:
-        """f and ∇f at a design like x0."""
-        flat = ravel_pytree(x)[0].astype(self._x.dtype)
+        """f and ∇f at a design like x0. Raises `ValueError` for another structure."""
+        flat = self._flat(x, "x")
         f, slope = self._method.slope(flat)
         return float(f), self._unravel(slope / self._box.rate(self._box.scaled(flat)))
 
@@ -204,7 +201,10 @@ class Minimization:
         """The search, from x0 or another start within the bounds, on the same scale."""
         num_steps = as_count(num_steps, "num_steps")
         method, began = self._method, time.perf_counter()
-        x = self._x if x0 is None else self._within(x0)
+        x = self._x
+        if x0 is not None:
+            x = self._flat(x0, "x0")
+            checked_box(x0, *self._bounds)
         start = method.begin(x)
         first = start[1]
         if not (np.isfinite(first.objective) and np.isfinite(first.gradient_norm) and not np.isnan(first.worst)):

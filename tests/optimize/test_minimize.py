@@ -64,10 +64,12 @@ def test_a_program_searches_from_any_start():
     found = program(num_steps=100, x0={"a": 0.5, "b": 1.5}, progress=False)
     again = quiet(disc, {"a": 0.5, "b": 1.5}, *BOX, num_steps=100)
     np.testing.assert_array_equal(found.history.objective, again.history.objective)
-    with pytest.raises(ValueError, match="must lie within the bounds of the program"):
+    with pytest.raises(ValueError, match=r"`x0` must lie within the bounds: b = 2\.5 is outside"):
         program(num_steps=1, x0={"a": 0.5, "b": 2.5}, progress=False)
     with pytest.raises(ValueError, match="must be like that of the program"):
         program(num_steps=1, x0={"a": 0.5}, progress=False)
+    with pytest.raises(ValueError, match="`x` must be like that of the program"):
+        program.value_and_grad({"a": 0.5})
 
 
 def test_a_constraint_that_can_never_be_active_is_refused():
