@@ -28,7 +28,7 @@ def trajectory(model, result=0, batch=()) -> lg.Trajectory:
     system, t = model.system(), jnp.broadcast_to(jnp.linspace(0.5, 2.0, 101), (*batch, 101))
     state = lg.State(system.pose, *(jnp.zeros((*t.shape, n)) for n in (system.group.dim,) * 2), jnp.zeros(9), None)
     result = jnp.broadcast_to(jnp.asarray(result, jnp.int32), batch)
-    return lg.Trajectory(t=t, states=state, result=result, stats=None, system=system, joints=model.joints)
+    return lg.Trajectory(t=t, states=state, result=result, stats=None, system=system)
 
 
 VECTORS = dict.fromkeys(("position", "velocity", "acceleration"), WIDE)

@@ -1,7 +1,6 @@
 """`Trajectory.joint` and `Trajectory.point`: against Newton and Euler by hand, SciPy's rotations, closed forms."""
 
-import dataclasses
-
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -315,7 +314,7 @@ def anywhere(model) -> lg.Trajectory:
     rng, system = np.random.default_rng(1), model.system()
     states = [lg.State(q, v, vdot, lam, vdot) for q, v, vdot, lam, _ in (random_point(system, rng) for _ in range(3))]
     stacked, t = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states), jnp.arange(3.0)
-    return lg.Trajectory(t=t, states=stacked, result=jnp.asarray(0), stats=None, system=system, joints=model.joints)
+    return lg.Trajectory(t=t, states=stacked, result=jnp.asarray(0), stats=None, system=system)
 
 
 def test_derivatives_by_a_hardpoint_of_one_motion():
@@ -323,7 +322,7 @@ def test_derivatives_by_a_hardpoint_of_one_motion():
     run = anywhere(pendulum({"at": np.zeros(3), "axis": Y}))
 
     def what(p):
-        found = dataclasses.replace(run, joints=pendulum(p).joints).joint("hinge")
+        found = eqx.tree_at(lambda run: run.system.given, run, pendulum(p).system().given).joint("hinge")
         one = [found.angle, found.rate, found.acceleration]
         return jnp.concatenate([*one, found.moment.ravel(), found.local_moment.ravel(), found.local_force.ravel()])
 
@@ -350,11 +349,73 @@ def test_messages():
         trajectory.point("arms", ORIGIN)
     with pytest.raises(ValueError, match=says("`at` must have shape (3,), got shape (2,)")):
         trajectory.point("arm", (0.0, 1.0))
-    with pytest.raises(ValueError, match=says("do not know their joints", "give `simulate` the Model", "`multiplier`")):
-        dataclasses.replace(trajectory, joints=None).joint("hinge")  # of `simulate(model.system(), …)`
-    instant = lg.Instant(trajectory.t[-1], trajectory.state(-1), trajectory.system)  # as an integrand sees it
-    with pytest.raises(ValueError, match=says("nor does an instant", "`jax.grad` what `joint` says")):
-        instant.joint("hinge")
+
+
+def joint_criterion(s, p):
+    """Of everything that a joint says, at an instant."""
+    hinge = s.joint("hinge")
+    return hinge.angle**2 + 1e-2 * hinge.rate * hinge.acceleration + 1e-4 * hinge.force @ hinge.local_moment
+
+
+def of_scene(**options):
+    """The pendulum with a part welded to it, p as there."""
+
+    def build(p):
+        scene = pendulum(p)
+        part = lg.RigidBody(0.5, (0.01, 0.01, 0.01), position=(0.6, 0.0, 0.2))
+        weld = lg.FixedJoint("body", "part", at=(0.5, 0.0, 0.1))
+        return lg.Model(scene.bodies | {"part": part}, scene.joints | {"weld": weld}, scene.forces, **options)
+
+    return build
+
+
+@pytest.mark.slow  # three programs each; small version: test_joints_of_an_instant
+@pytest.mark.parametrize("options", [{}, {"merge_fixed": True}, {"formulation": "SE3"}])
+def test_a_criterion_of_joints(options):
+    """An instant knows the joints of its scene: on the fly, backwards, and through a trajectory, whose `joint` is
+    tested against differences above; by the hardpoint and the axis, on which its frames depend directly."""
+    p, build = {"at": jnp.array([0.0, 0.05, 0.1]), "axis": jnp.array([0.1, 1.0, 0.2])}, of_scene(**options)
+    criterion = lg.Criterion(integrand=joint_criterion, terminal=lambda s, p: s.joint("hinge").angle * p["at"][2])
+
+    def through_trajectory(p):
+        run = lg.simulate(build(p), t1=0.2, num_steps=20)
+        hinge = run.joint("hinge")
+        product = jnp.sum(hinge.force * hinge.local_moment, axis=1)
+        rate = hinge.angle**2 + 1e-2 * hinge.rate * hinge.acceleration + 1e-4 * product
+        return lg.time_integral(run.t, rate) + hinge.angle[-1] * p["at"][2]
+
+    value, expected = jax.jit(jax.value_and_grad(through_trajectory))(p)
+    for method in (lg.DirectDifferentiation(), lg.AdjointVariable()):
+        found = lg.differentiate(criterion, build, p, t1=0.2, num_steps=20, method=method)
+        np.testing.assert_allclose(found.value, value, rtol=1e-8)  # Newton's tolerance, 1e-10, in accelerations
+        for name in p:
+            scale = np.abs(expected[name]).max()
+            np.testing.assert_allclose(found.gradient[name], expected[name], rtol=0, atol=1e-8 * scale)
+            assert scale > 1e-2
+
+
+def test_joints_of_an_instant():
+    """As those of the trajectory, and of `save`."""
+    model, at = pendulum({"at": np.zeros(3), "axis": Y}), 7
+    run = lg.simulate(model, t1=0.2, num_steps=20)
+    instant = lg.Instant(t=run.t[at], state=run.state(at), system=run.system)
+    for one, every in zip(jax.tree.leaves(instant.joint("hinge")), jax.tree.leaves(run.joint("hinge")), strict=True):
+        np.testing.assert_allclose(one, every[at], rtol=1e-14, atol=1e-14)
+    saved = lg.simulate(model, t1=0.2, num_steps=20, save=lambda s: s.joint("hinge").coordinates)
+    np.testing.assert_allclose(saved.values["angle"], run.joint("hinge").angle, rtol=0, atol=1e-14)
+    with pytest.raises(ValueError, match=says("`joint`: 'hing' is not one of ['hinge']")):
+        instant.joint("hing")
+
+
+@pytest.mark.slow
+def test_joints_are_outputs_of_a_linearization():
+    """The angle by the one coordinate of a pendulum, whose rate is that of the angle."""
+    model = pendulum({"at": np.zeros(3), "axis": Y})
+    outputs = {"angle": lambda s: s.joint("hinge").angle, "rate": lambda s: s.joint("hinge").rate}
+    linear = lg.linearize(lg.Model(model.bodies, model.joints), outputs=outputs)
+    c = np.asarray(linear.C)
+    np.testing.assert_allclose(c[0, 0], c[1, 1], rtol=1e-12)
+    assert c[0, 1] == c[1, 0] == 0.0 and abs(c[0, 0]) > 0.1
 
 
 def test_a_batch_is_asked_one_by_one():

@@ -1,7 +1,6 @@
 """A motion as tables: `to_csv` read back by Python's csv, `to_xarray` and `to_pandas` by their own packages."""
 
 import csv
-import dataclasses
 import sys
 
 import jax
@@ -88,13 +87,6 @@ def test_pandas(trajectory):
         assert units[name] == (unit.rstrip("]") or None)
         if name != "time":
             np.testing.assert_array_equal(found[name], values, err_msg=name)
-
-
-def test_of_equations_that_do_not_know_their_joints(trajectory, tmp_path):
-    run = dataclasses.replace(trajectory, joints=None)
-    run.to_csv(tmp_path / "run.csv")
-    heads = (tmp_path / "run.csv").read_text(encoding="utf-8").splitlines()[0].split(",")
-    assert {"hinge.multiplier.5", "ball.position.x [m]"} <= set(heads) and "hinge.angle [rad]" not in heads
 
 
 def test_messages(trajectory, monkeypatch, tmp_path):

@@ -24,7 +24,7 @@ from lgsens.analysis._driven import (
     with_numbers,
 )
 from lgsens.dynamics import RESULTS, State, forces_of_motion, positions
-from lgsens.model import AbstractJoint, Model, MultibodySystem
+from lgsens.model import Model, MultibodySystem
 from lgsens.simulation import AbstractRun, throw_if_failed
 
 
@@ -37,7 +37,6 @@ class Kinematics(AbstractRun):
         states: q; v and v̇ with respect to the rates; λ of that motion. Stacked along a leading axis n.
         result: a value of `RESULTS`, shape (), int32; 0 is success.
         system: the equations of motion, the driven values those of the reference.
-        joints: the joints of the model by name.
     """
 
     values: dict[str, Float[Array, " n"]]
@@ -45,7 +44,6 @@ class Kinematics(AbstractRun):
     states: State
     result: Int[Array, ""]
     system: MultibodySystem
-    joints: dict[str, AbstractJoint] | None
 
     def _kinematics(self):
         return self.states, self.t
@@ -127,7 +125,7 @@ def kinematics(
     if throw:
         details = details if isinstance(result, Tracer) else details | {"names": names}
         states = throw_if_failed(states, result, details, system.constraint_names)
-    return Kinematics(values=values, t=time, states=states, result=result, system=system, joints=model.joints)
+    return Kinematics(values=values, t=time, states=states, result=result, system=system)
 
 
 @eqx.filter_jit

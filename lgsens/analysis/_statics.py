@@ -25,7 +25,7 @@ from lgsens.analysis._driven import (
     with_numbers,
 )
 from lgsens.dynamics import RESULTS, State, require_independent, static_path
-from lgsens.model import AbstractJoint, Model, MultibodySystem
+from lgsens.model import Model, MultibodySystem
 from lgsens.simulation import AbstractRun, throw_if_failed
 
 
@@ -44,7 +44,6 @@ class Statics(AbstractRun):
             mechanism snaps through. It is an equilibrium; dynamics may end at another one (`simulate`).
         result: a value of `RESULTS`, shape (), int32; 0 is success.
         system: the equations of motion, driven values and factors those of the reference.
-        joints: the joints of the model by name.
     """
 
     values: dict[str, Float[Array, " n"]]
@@ -55,7 +54,6 @@ class Statics(AbstractRun):
     snapped: Bool[Array, " n"]
     result: Int[Array, ""]
     system: MultibodySystem
-    joints: dict[str, AbstractJoint] | None
 
     def _kinematics(self):
         return self.states, self.t
@@ -148,7 +146,7 @@ def statics(
         states, responses = throw_if_failed((states, responses), result, details, system.constraint_names)
     time = jnp.broadcast_to(start, shape)
     found: dict[str, Any] = {"t": time, "states": states, "responses": responses, "result": result} | flags
-    return Statics(values=given, **found, system=system, joints=model.joints)
+    return Statics(values=given, **found, system=system)
 
 
 @eqx.filter_jit

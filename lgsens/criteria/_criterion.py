@@ -25,7 +25,8 @@ class Criterion(eqx.Module):
 
     Arguments:
         integrand: F(s, p) → scalar; `s` is an `Instant` (`s.body(name)`, `s.point(body, at)`,
-            `s.multiplier(joint)`, `s.force(name)`, `s.state`, `s.t`), `p` the design parameters. None: no integral.
+            `s.joint(name)`, `s.multiplier(joint)`, `s.force(name)`, `s.state`, `s.t`), `p` the design parameters. None:
+            no integral.
         terminal: G(s, p) → scalar, of the instant t1. None: no terminal term.
 
     `criterion(trajectory, p)` is Ψ, by `time_integral` of the order of the trajectory or, where this has `stages`, by

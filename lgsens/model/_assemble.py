@@ -16,6 +16,7 @@ from lgsens.model._body import RigidBody
 from lgsens.model._evaluate_by_kind import StackRow, evaluated, joined, stacked
 from lgsens.model._forces import AbstractConnection, AbstractForce
 from lgsens.model._frames import Frame, ground_frame
+from lgsens.model._given_joints import given_joints, numbers_of
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._loads import carriers, num_states
 from lgsens.model._merge import Group, Placement, Placements, merged
@@ -95,8 +96,10 @@ def _assemble(
         for _, joint in between
     ]
     kinds = [(_kind(joint), *(end is None for end in ends)) for joint, *ends in members]
-    constraints = []
-    for (name, joint), row in zip(between, evaluated(_constraints, members, kinds)):
+    constraints, given = [], []
+    for (name, joint), found in zip(between, evaluated(_constraints, members, kinds)):
+        row, numbers = (StackRow(of, found.index) for of in found.of)
+        given.append(numbers)
         a, b, *others = (number[places[end].body] for end in ends_of(joint))
         if None in others or len({a, b, *others}) < 2 + len(others):
             raise ValueError(f"Joint {name!r} couples bodies that `merge_fixed` makes one, or ground; leave it out.")
@@ -153,6 +156,7 @@ def _assemble(
         centre=centre if any(body.pivot is not None for body in ordered) else None,
         constraints=stack(constraints),
         loads=stack(loads),
+        given=given_joints(between, given) if parts is None else (),
         parts=parts,
         body_names=names,
         free=tuple(free),
@@ -170,9 +174,11 @@ def _kind(member: AbstractJoint | AbstractConnection) -> Hashable:
 
 
 def _constraints(joint: AbstractJoint, *frames_and_parts: Frame | None):
-    """The constraints of a joint between its bodies: their frames, and the poses of merged parts there."""
+    """The constraints of a joint between its bodies, their frames, and the poses of merged parts there; its numbers."""
     frames, parts = frames_and_parts[: len(frames_and_parts) // 2], frames_and_parts[len(frames_and_parts) // 2 :]
-    return tuple(carried(element, *parts) for element in joint.constraints(*_or_ground(frames)))
+    ends = list(_or_ground(frames))
+    constraints = tuple(carried(element, *parts) for element in joint.constraints(*ends))
+    return constraints, numbers_of(joint, ends[0].position.dtype)
 
 
 def _load(force: AbstractConnection, a: Frame | None, b: Frame | None, *parts: Frame | None):

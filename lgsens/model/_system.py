@@ -17,6 +17,7 @@ from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, cho
 from lgsens.model._checks import are_bodies, far_from_rotation
 from lgsens.model._constraints import AbstractRows
 from lgsens.model._frames import BODY_DIM, ROTATION, motion_at
+from lgsens.model._given_joints import GivenJoints, JointsOf
 from lgsens.model._loads import AbstractDynamicLoad, AbstractLoad, generalized_force
 from lgsens.model._merged_parts import Parts
 from lgsens.model._sizes import compliance, coordinate_scale
@@ -60,6 +61,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     centre: Float[Array, "N 3"] | None  # centre of mass in the body frame; None: its origin, for all bodies
     constraints: tuple[Stack[AbstractRows], ...]  # those of velocity level last
     loads: tuple[Stack[AbstractLoad | AbstractDynamicLoad], ...]
+    given: tuple[GivenJoints, ...]  # the joints; of merged bodies their parts have them
     parts: "Parts[MultibodySystem] | None"  # of merged bodies
     body_names: tuple[str, ...] = eqx.field(static=True)
     free: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # the coordinates, 0 to 5, of each body
@@ -161,6 +163,11 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         if self.parts is None or joint not in self.parts.joints:
             return lam[..., self.multiplier_rows(joint)]
         return self.parts.multiplier(joint, self.multiplier_rows, q, v, vdot, lam, t)
+
+    @property
+    def joints(self) -> JointsOf:
+        """The joints of the bodies as they are named, as they were given."""
+        return JointsOf((self if self.parts is None else self.parts.system).given)
 
     def is_valid(self):
         known = finite(self.pose, self.velocity, self.constraints, self.loads)

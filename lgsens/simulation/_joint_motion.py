@@ -1,13 +1,13 @@
 """The motion of a joint: its relative coordinates, and the force and moment that it transmits."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens._brief import brief
-from lgsens.model import AbstractJoint, Frame, continued, relative_motion
+from lgsens.model import AbstractJoint, Frame, MultibodySystem, continued, joint_wrenches, relative_motion
 
 
 class JointMotion(NamedTuple):
@@ -16,7 +16,8 @@ class JointMotion(NamedTuple):
     A joint has a frame on each of its bodies, at its hardpoint: x along its `axis`, y and z as its equations have them;
     of a `UniversalJoint` x along `axis_a`, y along `axis_b`; of a `DistanceJoint` x along the rod; of `Rolling` z along
     the normal, x forward; of others the axes of the inertial frame. Both are so in the reference configuration, and
-    fixed to a and b. "The joint's frame" is that on a.
+    fixed to a and b. "The joint's frame" is that on a. Of an `Instant` arrays have no leading axis, and angles are
+    between −π and π: an instant does not know of turns before it.
 
     Attributes:
         coordinates: the relative coordinates by name, shape (n+1,): "angle" [rad] of b about the axis, over any number
@@ -76,9 +77,22 @@ class JointMotion(NamedTuple):
         return values[name or next(iter(values))]
 
 
-def joint_motion(
+def joint_motions(
+    system: MultibodySystem, names: Iterable[str], q, v, vdot, lam, t: Float[Array, " n"]
+) -> dict[str, JointMotion]:
+    """The motions of joints of a scene, along the leading axis of a motion."""
+    wrenches = joint_wrenches(system, names, q, v, vdot, lam, t)
+    whole, *motion = system.of_parts(q, v, vdot)
+    still = jnp.zeros_like(whole.velocity)
+    number = whole.body_names.index
+    reference = lambda name: Frame(*whole.motion(number(name), whole.pose, still, still)[:2])
+    moving = lambda name: whole.motion(number(name), *motion)
+    return {name: _joint_motion(system.joints[name], moving, reference, wrench, t) for name, wrench in wrenches.items()}
+
+
+def _joint_motion(
     joint: AbstractJoint,
-    body: Callable[[str], Any],
+    body: Callable[[str], tuple[Array, ...]],
     reference: Callable[[str], Frame],
     wrench: Float[Array, "n 6"],
     t: Float[Array, " n"],
@@ -93,7 +107,7 @@ def joint_motion(
     still, upright = jnp.zeros((n, 3), dtype), jnp.broadcast_to(jnp.eye(3, dtype=dtype), (n, 3, 3))
     ground = Frame(still[0], upright[0])
     references = [ground if name is None else reference(name) for name in (joint.a, joint.b)]
-    motions = [(still, upright, *[still] * 4) if name is None else tuple(body(name)) for name in (joint.a, joint.b)]
+    motions = [(still, upright, *[still] * 4) if name is None else body(name) for name in (joint.a, joint.b)]
     centre = Frame(references[1].position, ground.orientation)
     frames = joint.frames or (centre, centre)
     found = relative_motion(joint.coordinates, frames, references, motions)

@@ -167,8 +167,6 @@ def simulate(
         motion = {name: getattr(found, name) for name in fields}
         motion = throw_if_failed(motion, found.result, details, system.constraint_names)
         found = dataclasses.replace(found, **motion)
-    if isinstance(found, Trajectory) and isinstance(model, Model):
-        found = dataclasses.replace(found, joints=model.joints)
     return found
 
 

@@ -62,9 +62,8 @@ def quantities(run: Any, what: str) -> dict[str, Quantity]:
     for name in whole.body_names:
         for field, values in run.body(name)._asdict().items():
             add(f"{name}.{field}", values, _UNITS[field], vector | {"body_axis": _AXES} if values.ndim == 3 else vector)
-    joints = run.joints or {}
-    for name, joint in (run._joint_motions(joints) if joints else {}).items():
-        for s in joints[name].coordinates:
+    for name, joint in run._joint_motions(system.joints).items():
+        for s in system.joints[name].coordinates:
             add(f"{name}.{s.name}", joint.coordinates[s.name], s.unit, {})
             add(f"{name}.{s.name}_rate", joint.rates[s.name], f"{s.unit}/s", {})
             add(f"{name}.{s.name}_acceleration", joint.accelerations[s.name], f"{s.unit}/s²", {})

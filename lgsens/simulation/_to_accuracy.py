@@ -33,7 +33,6 @@ import numpy as np
 from jax.core import Tracer
 
 from lgsens.dynamics import RESULTS, AbstractSystem, State
-from lgsens.model import Model
 from lgsens.simulation._errors import SimulationError, primal_value
 from lgsens.simulation._reached import Reached
 from lgsens.simulation._richardson import Richardson, extrapolate_runs
@@ -142,8 +141,7 @@ def simulate_to(simulate: Callable[..., Any], accuracy, model, num_steps: int | 
         two = {"integrator": Richardson(settings["integrator"]), "num_steps": reached.num_steps // 2}
         one = {"num_steps": reached.num_steps}
         found = simulate(model, **(settings | (two if reached.extrapolated else one)))
-    joints = model.joints if isinstance(model, Model) else None
-    return dataclasses.replace(found, reached=reached, joints=joints)
+    return dataclasses.replace(found, reached=reached)
 
 
 @eqx.filter_jit

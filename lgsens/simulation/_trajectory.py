@@ -3,7 +3,7 @@
 import abc
 import os
 from collections.abc import Callable, Iterable
-from functools import partial, wraps
+from functools import wraps
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -16,10 +16,10 @@ from lgsens._brief import brief, listed, roster, shown
 from lgsens._validate import as_float, is_concrete, suggestion
 from lgsens.dynamics import RESULTS, AbstractSystem, State
 from lgsens.integrate import Stages
-from lgsens.model import AbstractJoint, Frame, MultibodySystem, SE3System, joint_wrenches, measured, motion_at, scene_of
+from lgsens.model import Frame, MultibodySystem, SE3System, measured, motion_at, scene_of
 from lgsens.sensitivity import Sound
 from lgsens.simulation._body_motion import BodyMotion, PointMotion
-from lgsens.simulation._joint_motion import JointMotion, joint_motion
+from lgsens.simulation._joint_motion import JointMotion, joint_motions
 from lgsens.simulation._reached import Reached
 from lgsens.simulation._tables import to_csv, to_pandas, to_xarray
 
@@ -81,7 +81,6 @@ class AbstractMotion(eqx.Module):
     batch of motions its axes before."""
 
     system: eqx.AbstractVar[AbstractSystem]
-    joints: eqx.AbstractVar[dict[str, AbstractJoint] | None]
     _axes_of_time: ClassVar[int] = 0
 
     @abc.abstractmethod
@@ -90,7 +89,7 @@ class AbstractMotion(eqx.Module):
 
     def __repr__(self) -> str:
         states, t = self._kinematics()
-        system, joints, result = self.system, getattr(self, "joints", None), getattr(self, "result", None)
+        system, result = self.system, getattr(self, "result", None)
         sizes = [getattr(array, "shape", (None,))[-1] for array in (getattr(states, of, None) for of in ("v", "lam"))]
         if not hasattr(t, "shape") or None in sizes:  # a tree of something else than arrays
             return super().__repr__()
@@ -104,8 +103,7 @@ class AbstractMotion(eqx.Module):
             fields["reached"] = reached.brief
         if (scene := scene_of(system)) is not None:
             whole = scene if scene.parts is None else scene.parts.system
-            own = dict.fromkeys(whole.constraint_names) if joints is None else joints
-            fields |= {"bodies": roster(whole.body_names), "joints": roster(own)}
+            fields |= {"bodies": roster(whole.body_names), "joints": roster(scene.joints)}
             fields["forces"] = roster(dict.fromkeys(owner for stack in whole.loads for owner in stack.owners))
         unknowns = f"{sizes[0]} coordinates, {sizes[1]} multipliers of"
         return listed(type(self).__name__, fields | {"states": f"{unknowns} {type(system).__name__}"})
@@ -189,13 +187,7 @@ class AbstractMotion(eqx.Module):
         other elements the generalized force [F_a, M_a, F_b, M_b] that they apply.
         Raises `ValueError` for an unknown name, or one of several loads (gravity).
         """
-        system, states, t = self.of_bodies()
-        at = states.q, states.v, states.vdot, states.lam, t
-        measure = partial(measured, system, name)
-        if jnp.ndim(t) == 0:
-            stacked = measure(*jax.tree.map(lambda leaf: leaf[None], at))
-            return jax.tree.map(lambda leaf: leaf[0], stacked)
-        return measure(*at)
+        return self._asked(measured, name)
 
     @_of_each
     def joint(self, name: str) -> JointMotion:
@@ -205,26 +197,25 @@ class AbstractMotion(eqx.Module):
         bodies cannot violate (`RigidBody.free`) transmit nothing here: what holds such bodies in the coordinates that
         they do not have is no joint.
 
-        Raises `ValueError` for an unknown name, and for a motion of equations that do not know their joints. Source:
-        Haug (1989), §11.4 (reaction forces).
+        Raises `ValueError` for an unknown name. Source: Haug (1989), §11.4 (reaction forces).
         """
         return self._joint_motions((name,))[name]
 
     def _joint_motions(self, names: Iterable[str]) -> dict[str, JointMotion]:
-        system, states, t = self.of_bodies()
-        joints = self.joints
-        if joints is None:
-            raise ValueError(
-                "`joint`: this is the motion of equations, which do not know their joints, nor does an instant; give "
-                "`simulate` the Model and not its `system()`, and `jax.grad` what `joint` says, or use `multiplier`."
-            )
+        known = self.of_bodies()[0].joints
         for name in names:
-            if name not in joints:
-                raise ValueError(f"`joint`: {suggestion(name, joints)}.")
-        wrenches = joint_wrenches(system, names, states.q, states.v, states.vdot, states.lam, t)
-        return {
-            name: joint_motion(joints[name], self.body, self._reference, wrench, t) for name, wrench in wrenches.items()
-        }
+            if name not in known:
+                raise ValueError(f"`joint`: {suggestion(name, known)}.")
+        return self._asked(joint_motions, tuple(names))
+
+    def _asked(self, question: Callable, about: Any) -> Any:
+        """`question(system, about, q, v, v̇, λ, t)` of a motion, and of an instant as of a motion of one."""
+        system, states, t = self.of_bodies()
+        at = states.q, states.v, states.vdot, states.lam, t
+        if jnp.ndim(t):
+            return question(system, about, *at)
+        found = question(system, about, *jax.tree.map(lambda leaf: leaf[None], at))
+        return jax.tree.map(lambda leaf: leaf[0], found)
 
 
 class AbstractRun(AbstractMotion):
@@ -240,7 +231,7 @@ class AbstractRun(AbstractMotion):
         Variables are "top.position" (time, axis), "top.orientation" (time, axis, body_axis), … as in `BodyMotion`;
         "hinge.angle", "hinge.angle_rate", …, "hinge.force", "hinge.moment" as in `JointMotion`, "hinge.multiplier";
         "motor.output" as in `states_of`. Each has its unit as attribute `units`, but for multipliers and states, whose
-        meaning their elements say. Of a motion of equations that do not know their joints: multipliers alone.
+        meaning their elements say.
 
         Raises `ImportError` without xarray (`pip install "lgsens[data]"`), and `ValueError` for a motion that is traced
         or a batch.
@@ -275,7 +266,6 @@ class Trajectory(AbstractRun):
         result: a value of `RESULTS`, shape (), int32; 0 is success.
         stats: Newton's iterations, increments and residuals; what the integrator says of its steps.
         system: the equations that were integrated.
-        joints: the joints of the model by name, for `joint`; None if equations were given.
         error: an estimate of the errors of the states, from integrators that have one (`Richardson`); else None.
         order: 2, or 4 where the states deserve a rule of fourth order: what to give `time_integral`, static.
         stages: those of `IndexReducedODE` without `rtol`, by which a `Criterion` integrates; else None.
@@ -290,7 +280,6 @@ class Trajectory(AbstractRun):
     error: StateError | None = None
     order: int = eqx.field(static=True, default=2)
     stages: Stages | None = None
-    joints: dict[str, AbstractJoint] | None = None
     reached: Reached | None = eqx.field(static=True, default=None)
 
     def _kinematics(self):
@@ -344,7 +333,6 @@ class Instant(AbstractMotion):
     t: Float[Array, ""]
     state: State
     system: AbstractSystem
-    joints: dict[str, AbstractJoint] | None = None
 
     def _kinematics(self):
         return self.state, self.t

@@ -232,7 +232,7 @@ def test_what_a_joint_of_ones_own_does(kind):
     system = model.system()
     q, v, vdot, lam, t = random_point(system, rng)
     states = jax.tree.map(lambda leaf: leaf[None], lg.State(q, v, vdot, lam, vdot))
-    run = lg.Trajectory(t=t[None], states=states, result=jnp.asarray(0), stats=None, system=system, joints=model.joints)
+    run = lg.Trajectory(t=t[None], states=states, result=jnp.asarray(0), stats=None, system=system)
     found = run.joint("table")
     power, point = 0.0, np.asarray(found.point[0])
     for name, sign in (("a", -1.0), ("b", 1.0)):
