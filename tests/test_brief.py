@@ -9,6 +9,7 @@ import lgsens as lg
 from lgsens.accuracy import Reference, Setting
 from lgsens.accuracy._table import Row
 from lgsens.analysis import Growth
+from lgsens.integrate import Stats
 from lgsens.model import Summary
 from lgsens.optimize import GradientCheck, LeastSquaresResult, MultiStartResult, OptimizationResult
 from lgsens.optimize._minimize import History
@@ -50,6 +51,10 @@ RESULTS = {
     "point": lambda: lg.PointMotion(**VECTORS),
     "joint": lambda: lg.JointMotion(TREE, TREE, TREE, *[WIDE] * 7),
     "error": lambda: lg.StateError(*[WIDE] * 4),
+    "stats": lambda: Stats(*[MANY] * 5),
+    "linearization": lambda: lg.Linearization(
+        *[WIDE] * 7, MANY * 1j, WIDE, MANY > 0, None, jnp.asarray(0.5), jnp.asarray(0), None, ("push",), tuple(TREE)
+    ),
     "saved": lambda: lg.Saved(jnp.asarray(MANY), TREE, None, jnp.asarray(0), None),
     "model": chain,
     "trajectory": lambda: trajectory(chain()),

@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 
+from lgsens import rigs
 from lgsens.cli import _kc
 from lgsens.cli._main import main
 from lgsens.examples import Axle
@@ -50,6 +51,19 @@ def test_ideal_joints_give_the_curves_of_kinematics(written):
         ("roll_centre_height", sweep["roll_centre_height"]),
     ):
         np.testing.assert_allclose(found, getattr(curves, name), rtol=0, atol=1e-10, err_msg=name)
+
+
+def test_largest_derivatives_come_first():
+    """On the terminal, three of each characteristic, in its unit per mm."""
+    axle = Axle.load(FILE)
+    found = np.zeros((len(axle.hardpoint_names), 3))
+    found[0, 1], found[1, 2], found[1, 0] = 1.0, -2.0, 0.5  # rad/m per m
+    factor, unit = rigs.CHARACTERISTICS["bump_steer"].shown
+    line = _kc._of_gradients(axle, {"bump_steer": found}).splitlines()[-1]
+    first, second, third = (1e-3 * factor * value for value in (-2.0, 1.0, 0.5))
+    names = axle.hardpoint_names
+    shares = f"{names[1]} z {first:+.3g}, {names[0]} y {second:+.3g}, {names[1]} x {third:+.3g}"
+    assert line.startswith(f"{rigs.CHARACTERISTICS['bump_steer'].label} [{unit}]") and line.endswith(shares)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from lgsens._brief import listed, roster, shown
 from lgsens._validate import as_count, as_float
 from lgsens.analysis._eigen import eigen, near, scaled
 from lgsens.analysis._inputs import check_inputs, with_inputs
@@ -86,6 +87,11 @@ class Linearization(eqx.Module):
     system: AbstractSystem
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        sizes = {name: shown(getattr(self, name)) for name in ("A", "B", "C", "D", "eigenvalues")}
+        names = {"inputs": roster(self.inputs), "outputs": roster(self.outputs)}
+        return listed("Linearization", {"t": f"{shown(self.t)} s", "result": shown(self.result)} | sizes | names)
 
     @property
     def frequencies(self) -> Float[Array, " n"]:

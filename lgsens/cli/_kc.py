@@ -79,7 +79,8 @@ def run(arguments: argparse.Namespace) -> int:
         if status := write_all("kc", files, out):
             return status
         if not arguments.quiet:
-            print(table(numbers), written(out, files), sep="\n")
+            shown = [table(numbers), *([_of_gradients(axle, gradients)] if gradients else []), written(out, files)]
+            print(*shown, sep="\n")
     return 0
 
 
@@ -240,14 +241,24 @@ def _row(one: rigs.Characteristic, value: float) -> str:
     return f'<tr><td>{html.escape(one.label)}</td><td class="n">{_cell(value, factor)}</td><td>{unit}</td></tr>'
 
 
-def _gradient_table(axle: Axle, gradients: dict[str, np.ndarray]) -> str:
-    """The five largest of each characteristic, largest first."""
+def _largest(axle: Axle, gradients: dict[str, np.ndarray], count: int):
+    """Of each characteristic what it is, with the unit, and its largest derivatives per mm with their coordinates."""
     places = [f"{name} {axis}" for name in axle.hardpoint_names for axis in "xyz"]
-    lines = []
     for name, found in gradients.items():
         factor, unit = rigs.CHARACTERISTICS[name].shown
         flat = found.ravel()
-        most = np.argsort(-np.abs(np.nan_to_num(flat)))[:5]
-        cells = "".join(f"<td>{html.escape(places[i])} {1e-3 * factor * flat[i]:+.3g}</td>" for i in most)
-        lines.append(f"<tr><td>{html.escape(_label(name))} [{unit}]</td>{cells}</tr>")
-    return f"<table>{''.join(lines)}</table>"
+        most = np.argsort(-np.abs(np.nan_to_num(flat)))[:count]
+        yield f"{_label(name)} [{unit}]", [f"{places[i]} {1e-3 * factor * flat[i]:+.3g}" for i in most]
+
+
+def _gradient_table(axle: Axle, gradients: dict[str, np.ndarray]) -> str:
+    """The five largest of each characteristic, largest first."""
+    cell = lambda text: f"<td>{html.escape(text)}</td>"
+    rows = _largest(axle, gradients, 5)
+    return "<table>" + "".join(f"<tr>{''.join(map(cell, (label, *most)))}</tr>" for label, most in rows) + "</table>"
+
+
+def _of_gradients(axle: Axle, gradients: dict[str, np.ndarray]) -> str:
+    """The three largest of each characteristic, as lines."""
+    lines = [f"{label:<58}{', '.join(most)}" for label, most in _largest(axle, gradients, 3)]
+    return "\n".join(["", "largest derivatives by hardpoints, per mm, both sides alike:", *lines])

@@ -43,6 +43,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from lgsens._brief import brief
 from lgsens._validate import as_count, require_setting
 from lgsens._xla import scan
 from lgsens.dynamics import (
@@ -73,6 +74,8 @@ class StepStats(NamedTuple):
     steps: Int[Array, " n"]
     drift: Float[Array, " n"]
     converged: Bool[Array, " n"]
+
+    __repr__ = brief
 
 
 class Coefficients(NamedTuple):

@@ -17,6 +17,7 @@ import jax.scipy.linalg as jsl
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
+from lgsens._brief import brief
 from lgsens._xla import while_loop
 from lgsens.dynamics import RESULTS, AbstractSystem, Initial, State, finite
 from lgsens.integrate._grid import AbstractGrid, EqualGrid, Start
@@ -40,6 +41,8 @@ class Stats(NamedTuple):
     residual: Float[Array, " n"]
     converged: Bool[Array, " n"]
     margin: Float[Array, " n"]
+
+    __repr__ = brief
 
     @classmethod
     def none(cls, like) -> "Stats":

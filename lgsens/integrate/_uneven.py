@@ -39,6 +39,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from lgsens._brief import brief
 from lgsens._validate import as_float, is_concrete, require, require_setting
 from lgsens._xla import alike, in_any_lane, scan, while_loop
 from lgsens.dynamics import RESULTS, AbstractSystem, State, acceleration_and_jerk, unsteady_rate
@@ -216,6 +217,8 @@ class ControlledStats(NamedTuple):
     error: Float[Array, " n"]
     rejected: Int[Array, " n"]
     steps: Int[Array, ""]
+
+    __repr__ = brief
 
 
 class _Trial(NamedTuple):
