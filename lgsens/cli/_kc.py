@@ -135,8 +135,8 @@ def _gradients(axle: Axle, names: list[str], sweeps: dict[str, rigs.Sweep], vehi
         )
         return {name: value for name, value in found.items() if name in names}
 
-    signs = axle.hardpoint_signs
-    return {name: signs * np.asarray(found) for name, found in jax.jit(jax.jacfwd(of))(axle.hardpoints).items()}
+    slopes = jax.jit(jax.jacfwd(of))(axle.hardpoints)
+    return {name: axle.hardpoint_signs * np.asarray(slopes[name]) for name in names}
 
 
 def _members(curves: rigs.AxleCurves) -> dict[str, np.ndarray]:
