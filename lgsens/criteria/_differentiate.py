@@ -21,7 +21,7 @@ from lgsens.criteria._criterion import Criterion, stacked
 from lgsens.criteria._criterion_use import Use, checked_for
 from lgsens.criteria._reference_methods import STENCIL, FiniteDifferences, IndexReduced
 from lgsens.criteria._to_accuracy import differentiate_to
-from lgsens.dynamics import AbstractSystem, State, Turns
+from lgsens.dynamics import RESULTS, AbstractSystem, State, Turns
 from lgsens.integrate import AbstractIntegrator, AdaptiveSteps, EqualGrid, GeneralizedAlpha, UnevenGrid
 from lgsens.model import Model
 from lgsens.sensitivity import (
@@ -100,15 +100,15 @@ def differentiate(
             stages, as those of `IndexReducedODE`). `AdjointVariable()`: one forward
             and one backward sweep. `ContinuousDirect()`, `ContinuousAdjoint()`: the equations of motion
             differentiated, then integrated. For comparison: `Autodiff()`, `FiniteDifferences()`, `IndexReduced()`.
-            None: direct or adjoint, as `direct_or_adjoint` advises for these numbers of parameters and criteria.
+            None: as `direct_or_adjoint` advises for these numbers, or the adjoint gradient that a certificate has.
         state0: p ↦ the state at t0 (one of `equilibrium`, say). None: the consistent initial state.
         accuracy: take as many steps as the criteria take to have this error, outside of `jit`, and extrapolate where
             that is less work: the largest relative error of a value and of a gradient, of this by its norm, as far as
             runs in n, 2n, 4n, … steps tell. `reached` says what was reached and how. `num_steps` is then the first
             number of steps, 64 by default: enough of them to see the shortest event (the bump of a road).
         certificate: also say what value and gradient are worth, outside of `jit`: their errors, what may spoil them,
-            and whether they are good to `accuracy`, or to 1e-3 (`certify`, a run of its own). Runs are not extrapolated
-            then.
+            and whether they are good to `accuracy`, or to 1e-3 (`certify`; a run of its own where a `method` is given
+            or an `accuracy`). Runs are not extrapolated then.
         throw: raise if the simulation fails. With False, and inside `jit`, `result` says so, and values and gradients
             are NaN.
 
@@ -150,6 +150,12 @@ def differentiate(
     t0, t1 = interval(t0, t1)
     p = as_parameters(p)
     size = sum(leaf.size for leaf in jax.tree.leaves(p))
+    if certificate and method is None:  # whose own value and gradient these are
+        found = worth(num_steps=num_steps, throw=False)
+        each = structure.flatten_up_to(found)
+        own = lambda name: structure.unflatten([getattr(one, name) for one in each])
+        if not throw or each[0].result == RESULTS.successful:  # else a run below says which step failed
+            return Sensitivities(own("value"), own("gradient"), AdjointVariable(), each[0].result, certificate=found)
     if method is None:
         method = direct_or_adjoint(size, len(leaves)).method
     if isinstance(method, ContinuousAdjoint) and num_steps < ContinuousAdjoint.LEAST_STEPS:

@@ -47,7 +47,13 @@ def test_it_says_how_many_digits_and_what_to_do(oscillator):
 
 @pytest.mark.slow  # programs of two runs; `certify` is in the quick run
 def test_differentiate_has_a_certificate_of_each_criterion(oscillator):
-    found = lg.differentiate(BOTH, build, P, t1=T1, num_steps=100, certificate=True)
+    settings = {"t1": T1, "num_steps": 100, "certificate": True}
+    found = lg.differentiate(BOTH, build, P, method=lg.DirectDifferentiation(), **settings)
+    alone = lg.differentiate(BOTH, build, P, **settings)  # what the certificate has anyway
+    assert alone.method == lg.AdjointVariable() and int(alone.result) == lg.RESULTS.successful
+    for name, certificate in alone.certificate.items():
+        assert certificate.value is alone.value[name] and certificate.gradient is alone.gradient[name]
+        np.testing.assert_array_equal(certificate.value, found.certificate[name].value)
     for name, certificate in found.certificate.items():
         np.testing.assert_allclose(certificate.value, found.value[name], rtol=1e-12)  # round-off of a hundred steps
         for key in P:
