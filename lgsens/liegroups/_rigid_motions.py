@@ -58,13 +58,14 @@ class RigidMotions(AbstractDirectProduct):
         return argument[self.index]
 
     def _each(self, method, *args):
-        """What `Poses` says of all bodies, and in it what SE(3) says of the whole ones; both, of matrices."""
+        """What `Poses` says of all bodies, and in it what SE(3) says of the whole ones; both, of matrices. JAX transposes
+        only what writes to places that it is told to be different."""
         both = [each if type(each) is tuple else (self._own(each), each) for each in args]
         own = jax.vmap(getattr(_ONE, method))(*(first for first, _ in both))
         every = getattr(self._poses, method)(*(second for _, second in both))
         if isinstance(every, Pose):
-            return Pose(*(leaf.at[self.whole].set(part) for leaf, part in zip(every, own)))
-        return (own, every) if every.ndim == 2 else every.at[self.index].set(own)
+            return Pose(*(leaf.at[self.whole].set(part, unique_indices=True) for leaf, part in zip(every, own)))
+        return (own, every) if every.ndim == 2 else every.at[self.index].set(own, unique_indices=True)
 
     def _split(self, x):
         return x

@@ -221,6 +221,28 @@ def test_ambient_and_algebra_coordinates_are_inverse(group):
     close(tangent, group.matrix(q) @ group.wedge(w))
 
 
+def test_conversions_can_be_transposed(group):
+    """What reverse mode does with a cotangent: ⟨c, D w⟩ = ⟨Dᵀ c, w⟩ for either conversion, along each coordinate."""
+    q = group.exp(coordinates(group))
+    to = lambda w: group.group.to_ambient(q, w)
+    back = lambda dq: group.group.from_ambient(q, dq)
+    units = jnp.eye(group.dim)
+
+    @jax.jit
+    def both(cotangent, w):
+        dq = jax.vmap(to)(units)
+        pair = lambda c, rows: sum(jnp.tensordot(row, x, x.ndim) for x, row in zip(*map(jax.tree.leaves, (c, rows))))
+        return (
+            (jax.linear_transpose(to, w)(cotangent)[0], pair(cotangent, dq)),
+            (jax.vmap(lambda row: pair(jax.linear_transpose(back, q)(w)[0], row))(dq), jax.vmap(back)(dq) @ w),
+        )
+
+    random = np.random.default_rng(3)
+    cotangent = jax.tree.map(lambda leaf: jnp.asarray(random.normal(size=leaf.shape)), q)
+    for found, expected in jax.tree.map(np.asarray, both(cotangent, coordinates(group, seed=4))):
+        close(found, expected)
+
+
 def test_from_ambient_projects_on_the_tangent_space():
     group = JITTED["SO3"]
     q = group.exp(np.array([0.3, -0.5, 0.8]))

@@ -153,6 +153,24 @@ def test_derivatives():
         assert abs(difference - size[i]) < 1e-6 * np.abs(size).max()
 
 
+@pytest.mark.slow  # programs of two gradients; small version: transposes in test_groups
+def test_derivatives_of_partly_free_bodies_with_states():
+    """DDM and AVM by mass, friction and lag, to round-off over h²."""
+    whole = controlled()
+
+    def value(p, sensitivity):
+        leaves = lambda m: (m.bodies["arm"].mass, m.forces["friction"].coefficient, m.forces["motor"].time_constant)
+        model = on_se3(eqx.tree_at(leaves, whole, tuple(p)))
+        run = lg.simulate(model, t1=0.05, num_steps=10, integrator=DAMPED, sensitivity=sensitivity)
+        return jnp.sum(run.states.v[-1]) + 1e-2 * jnp.sum(run.joint("hinge").force[-1])
+
+    p = jnp.asarray([2.0, 0.3, 0.1])
+    direct = jax.jit(jax.jacfwd(lambda p: value(p, lg.DirectDifferentiation())))(p)
+    adjoint = jax.jit(jax.grad(lambda p: value(p, lg.AdjointVariable())))(p)
+    np.testing.assert_allclose(adjoint, direct, rtol=0, atol=1e-10 * np.abs(direct).max())
+    assert np.abs(direct).min() > 1e-6
+
+
 def test_states_of_both_say_the_same():
     """`Trajectory.of_bodies` of a motion, and of a start: consistent in velocities and accelerations."""
     model = four_bar()
