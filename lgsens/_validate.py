@@ -1,5 +1,6 @@
 """Checks of arguments: conversion to float leaves once, at construction, and clear errors."""
 
+import dataclasses
 import importlib
 import operator
 from collections.abc import Callable
@@ -20,6 +21,10 @@ _OF_FUNCTIONS = (
     "eqx.is_inexact_array), keep `static: Any = eqx.field(static=True)` beside the leaves `params`, and call "
     "eqx.combine(params, static)."
 )
+_OF_CLASSES = (
+    " JAX does not look into a dataclass: register it (jax.tree_util.register_dataclass), make it an eqx.Module, or "
+    "give a dict."
+)
 
 
 def as_float(value: Any, shape: tuple[int, ...] | None, what: str) -> Array:
@@ -36,7 +41,7 @@ def as_float(value: Any, shape: tuple[int, ...] | None, what: str) -> Array:
                 raise TypeError("text, truth values or complex numbers, of which JAX would make others")
             array = jnp.asarray(value, dtype=_float_type())
         except (TypeError, ValueError) as error:
-            remedy = _OF_FUNCTIONS if callable(value) else ""
+            remedy = _OF_FUNCTIONS if callable(value) else _OF_CLASSES if dataclasses.is_dataclass(value) else ""
             raise ValueError(f"{what} must be a number or an array of numbers, got {value!r}.{remedy}") from error
     if shape is not None and array.shape != shape:
         raise ValueError(f"{what} must have shape {shape}, got shape {array.shape}.")

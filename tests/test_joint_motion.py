@@ -398,9 +398,12 @@ def test_joints_of_an_instant():
     """As those of the trajectory, and of `save`."""
     model, at = pendulum({"at": np.zeros(3), "axis": Y}), 7
     run = lg.simulate(model, t1=0.2, num_steps=20)
-    instant = lg.Instant(t=run.t[at], state=run.state(at), system=run.system)
+    instant = run.instant(at)
+    assert float(instant.t) == float(run.t[at])
     for one, every in zip(jax.tree.leaves(instant.joint("hinge")), jax.tree.leaves(run.joint("hinge")), strict=True):
         np.testing.assert_allclose(one, every[at], rtol=1e-14, atol=1e-14)
+    np.testing.assert_array_equal(instant.joint("hinge").axial_moment, instant.joint("hinge").local_moment[0])
+    np.testing.assert_array_equal(run.joint("hinge").axial_force, run.joint("hinge").force @ Y)  # about a fixed axis
     saved = lg.simulate(model, t1=0.2, num_steps=20, save=lambda s: s.joint("hinge").coordinates)
     np.testing.assert_allclose(saved.values["angle"], run.joint("hinge").angle, rtol=0, atol=1e-14)
     with pytest.raises(ValueError, match=says("`joint`: 'hing' is not one of ['hinge']")):

@@ -20,9 +20,20 @@ def blocks(text, language="python"):
 
 PAGES = [path for path in sorted((ROOT / "notebooks").rglob("*.md")) if blocks(path.read_text(encoding="utf-8"))]
 # Not in the quick run, whose small versions are `test_fidelity.py`, `test_step_jacobians.py`, `test_linearize.py`,
-# `test_certify.py`, `test_flexible.py`, `test_suspension_files.py`, `test_own_elements.py`, `test_sweep.py` and, of
-# choosing, `test_differentiate.py`.
-LONG = {"choosing", "control", "flexible", "fidelity", "own_elements", "small_motions", "suspension", "sweeps", "trust"}
+# `test_certify.py`, `test_flexible.py`, `test_suspension_files.py`, `test_own_elements.py`, `test_sweep.py`,
+# `test_joint_motion.py` and, of choosing, `test_differentiate.py`.
+LONG = {
+    "choosing",
+    "control",
+    "design",
+    "flexible",
+    "fidelity",
+    "own_elements",
+    "small_motions",
+    "suspension",
+    "sweeps",
+    "trust",
+}
 WHOLE = [pytest.param(path, marks=[pytest.mark.slow] * (path.stem in LONG), id=path.stem) for path in PAGES]
 
 
@@ -95,7 +106,14 @@ def _flexible(names):
         np.testing.assert_allclose(by_end, [0.46, -0.48, -0.52], rtol=0, atol=0.0051)
 
 
-CHECKS = {"choosing": _choosing, "control": _control, "flexible": _flexible, "sweeps": _sweeps}
+def _design(names):
+    """The torque by positions alone, and by a simulation of second order in 120 steps of a turn."""
+    of_positions = names["jax"].grad(lambda p: names["torque_and_swing"](p)[0])(names["best"].x)
+    for name, slope in names["gradient"].items():
+        np.testing.assert_allclose(slope, of_positions[name], rtol=0, atol=0.03)  # of 1.5
+
+
+CHECKS = {"choosing": _choosing, "control": _control, "design": _design, "flexible": _flexible, "sweeps": _sweeps}
 
 
 def test_commands():

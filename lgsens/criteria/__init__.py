@@ -16,7 +16,12 @@ from lgsens.criteria._differentiate import (
     differentiate as differentiate,
 )
 from lgsens.criteria._error_estimate import corrected as corrected, error_estimate as error_estimate
-from lgsens.criteria._kinks import Kink as Kink, kinks as kinks, roughness as roughness
+from lgsens.criteria._kinks import (
+    Kink as Kink,
+    jumps_of as jumps_of,
+    kinks as kinks,
+    roughness as roughness,
+)
 from lgsens.criteria._reference_methods import FiniteDifferences as FiniteDifferences, IndexReduced as IndexReduced
 from lgsens.criteria._steps_for import PlacedSteps as PlacedSteps, steps_for as steps_for
 from lgsens.criteria._to_accuracy import differentiate_to as differentiate_to

@@ -34,6 +34,7 @@ class Certificate(NamedTuple):
         margin: the least margin to a singular configuration of those looked at, relative to the largest, shape ().
         kinks: where in time an acceleration has a kink or a jump inside of a step, of which body, by which forces, as
             far as it stands out: such as are small beside a smooth change are not seen, nor two within five steps.
+        jumps: the ends of steps in which the integrand of a `Criterion` jumps [s], likewise: an angle that comes round.
         unresolved: the share of steps in which accelerations change as much as they are large, shape ().
         result: a value of `RESULTS`, shape (), int32.
     """
@@ -49,6 +50,7 @@ class Certificate(NamedTuple):
     exponential: Any
     margin: Float[Array, ""]
     kinks: tuple[Kink, ...]
+    jumps: tuple[float, ...]
     unresolved: Float[Array, ""]
     result: Int[Array, ""]
 
@@ -93,6 +95,13 @@ class Certificate(NamedTuple):
                     "gradient lacks what its shift does, in any number of steps, and may have the wrong sign: make the "
                     "force continuous over several steps, or end a run there and begin another (`t1` may depend on p)"
                 )
+        if self.jumps:
+            at = ", ".join(f"{t:.6g}" for t in self.jumps[:4]) + (" …" if len(self.jumps) > 4 else "")
+            said.append(
+                f"the integrand jumps inside of a step, at t = {at} s, which estimates and the gradient do not see: "
+                "take a continuous one, of an angle that comes round its sine and cosine or, to count turns, what a "
+                "TorsionSpringDamper(…, stiffness=0, turns=True) measures (`s.force(name).angle`)"
+            )
         if self.margin < _NEAR:
             said.append(
                 f"a singular configuration is near: the margin falls to {float(self.margin):.1e} of its largest"

@@ -19,7 +19,8 @@ gradient by the adjoint variable method are the same number, computed with L and
 **Growth.** The variation of the motion along that direction, g(t) = max |δq|/scale up to t: where it grows by more than
 16 times in the second half of the run, growth is exponential (`sensitivity_growth`).
 
-**Kinks** of forces between two steps are looked for in second differences (`_kinks`).
+**Kinks** of forces between two steps are looked for in second differences, jumps of integrands in first ones
+(`_kinks`).
 
 Sources: Eriksson, Estep, Hansbo & Johnson, Introduction to adaptive methods for differential equations, Acta Numerica 4
 (1995) (errors of functionals by adjoint equations); Cao & Petzold, SIAM J. Sci. Comput. 26 (2004) 359 (a posteriori
@@ -32,6 +33,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
@@ -39,8 +41,9 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from lgsens._validate import as_count, as_parameters
 from lgsens.criteria._certificate import Certificate
+from lgsens.criteria._criterion import Criterion
 from lgsens.criteria._error_estimate import corrected, error_estimate
-from lgsens.criteria._kinks import kinks, roughness
+from lgsens.criteria._kinks import jumps_of, kinks, roughness
 from lgsens.dynamics import State
 from lgsens.integrate import (
     AbstractIntegrator,
@@ -55,7 +58,7 @@ from lgsens.integrate import (
     with_first,
 )
 from lgsens.sensitivity import Parameters, linearized_trajectory, to_ambient
-from lgsens.simulation import check_integrator, interval, raise_if_failed, simulate
+from lgsens.simulation import Trajectory, check_integrator, interval, raise_if_failed, simulate
 
 _LEAST_STEPS = 8
 _REGULAR = 16.0  # of twice the time; in a regular motion sensitivities grow like t, under a constant force like t²
@@ -111,6 +114,8 @@ def certify(
     if throw:
         raise_if_failed(trajectory)
     shared |= {"tolerance": float(tolerance), "kinks": kinks(trajectory, rough)}
+    for one in found:
+        one["jumps"] = tuple(np.asarray(trajectory.t)[np.asarray(one["jumps"])].tolist())
     return structure.unflatten([Certificate(**one, **shared) for one in found])
 
 
@@ -180,6 +185,7 @@ def _certified(criteria, build, start, p, t0, t1, num_steps: int, integrator):
             "gradient_error": unravel(better[i] - gradient[i]),
             "duality": duality[i],
             "newton": newton[i],
+            "jumps": jumps_of(_integrand(criteria[i], trajectory, p)),
         }
         for i in range(each)
     ]
@@ -191,6 +197,14 @@ def _certified(criteria, build, start, p, t0, t1, num_steps: int, integrator):
         "result": trajectory.result,
     }
     return found, shared, trajectory, rough
+
+
+def _integrand(criterion: Callable, trajectory: Trajectory, p) -> Float[Array, " n+1"]:
+    """At all times; 0 of what has none that is known."""
+    if not isinstance(criterion, Criterion):
+        return jnp.zeros_like(trajectory.t)
+    rate = lambda state, t: criterion.rate(trajectory.system, state, t, p)
+    return jax.vmap(rate)(trajectory.states, trajectory.t)
 
 
 def grows_exponentially(factor: Float[Array, " n+1"]) -> Bool[Array, ""]:

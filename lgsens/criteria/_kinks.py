@@ -75,6 +75,11 @@ def roughness(trajectory: Trajectory) -> Roughness:
     return Roughness(_rough(a, size), jnp.concatenate([none, *forces], axis=2), jnp.mean(turns))
 
 
+def jumps_of(values: Float[Array, " n+1"]) -> Bool[Array, " n+1"]:
+    """Whether a function of time jumps in the step that ends at each time, as far as that stands out."""
+    return _jumps(values[:, None, None], jnp.max(jnp.abs(values))[None])[:, 0]
+
+
 def _rough(values: Float[Array, "n+1 items parts"], size: Float[Array, " items"]) -> Bool[Array, "2 n+1 items"]:
     """Kinks, and jumps."""
     jumps = _jumps(values, size)

@@ -58,8 +58,10 @@ class RigidMotions(AbstractDirectProduct):
         return argument[self.index]
 
     def _each(self, method, *args):
-        """What `Poses` says of all bodies, and in it what SE(3) says of the whole ones; both, of matrices. JAX transposes
-        only what writes to places that it is told to be different."""
+        """What `Poses` says of all bodies, and in it what SE(3) says of the whole ones; both, of matrices.
+
+        JAX transposes only what writes to places that it is told to be different.
+        """
         both = [each if type(each) is tuple else (self._own(each), each) for each in args]
         own = jax.vmap(getattr(_ONE, method))(*(first for first, _ in both))
         every = getattr(self._poses, method)(*(second for _, second in both))

@@ -68,6 +68,16 @@ class JointMotion(NamedTuple):
         """The acceleration of the joint's one coordinate [rad/s²] or [m/s²]; of several there are `accelerations`."""
         return self._only("acceleration", self.accelerations)
 
+    @property
+    def axial_force(self) -> Float[Array, " n"]:
+        """What the joint does to b along its axis [N]: the force of a `TranslationDriver`, or in a rod."""
+        return self.local_force[..., 0]
+
+    @property
+    def axial_moment(self) -> Float[Array, " n"]:
+        """What the joint does to b about its axis [N m]: the torque of a `RotationDriver`."""
+        return self.local_moment[..., 0]
+
     def _only(self, what: str, values: Mapping[str, Any], name: str | None = None):
         if (name not in values) if name else (len(values) != 1):
             raise ValueError(

@@ -298,6 +298,10 @@ class Trajectory(AbstractRun):
             raise IndexError(f"`index` must be from {-count} to {count - 1}, as there are {count} states; got {index}.")
         return jax.tree.map(lambda leaf: leaf[index], self.states)
 
+    def instant(self, index: int) -> "Instant":
+        """Step `index` (negative: from the end) as the integrand of a `Criterion` sees it. Raises as `state`."""
+        return Instant(t=self.t[index], state=self.state(index), system=self.system)
+
 
 class Saved(eqx.Module):
     """What `simulate` returns with `save`: the outputs asked for, and no trajectory.

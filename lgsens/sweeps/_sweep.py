@@ -175,7 +175,10 @@ def _as_array(path, leaf) -> np.ndarray:
     if array.dtype.kind not in "fiub":
         raise ValueError(f"`designs`: {name} must be an array of numbers, got {leaf!r}.")
     if array.ndim == 0:
-        raise ValueError(f"`designs`: {name} must have a leading axis over the designs, got the number {leaf}.")
+        raise ValueError(
+            f"`designs`: {name} must have a leading axis over the designs, got the number {leaf}. A list is a tree of "
+            "numbers here: give an array, `jnp.array([…])`."
+        )
     return array.astype(jax.dtypes.canonicalize_dtype(array.dtype))
 
 

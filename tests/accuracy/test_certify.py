@@ -10,7 +10,7 @@ from oscillator import CRITERION, T1, P, build, exact
 
 import lgsens as lg
 from lgsens.accuracy import certify
-from lgsens.criteria import kinks, roughness
+from lgsens.criteria import jumps_of, kinks, roughness
 from lgsens.examples import linear_quarter_car
 
 HEIGHT = lg.Criterion(terminal=lambda s, p: s.body("mass").position[2])
@@ -131,6 +131,38 @@ def test_a_jump_is_told_from_a_kink():
     assert (body, forces, jump) == ("mass", ("switch",), True)
     at = np.sqrt(0.1 / 3.0)
     assert t - 0.005 <= at <= t + 0.005  # the numerical motion is as late as a step
+
+
+def turning(p):
+    """A shaft that is driven by 8 t + p t²."""
+    shaft = lg.RigidBody(1.0, (0.1, 0.1, 0.1))
+    law = lg.Polynomial(jnp.stack([jnp.zeros_like(p), jnp.full_like(p, 8.0), p]))
+    bearing = lg.RevoluteJoint(None, "shaft", at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    drive = lg.RotationDriver(None, "shaft", axis=(0.0, 0.0, 1.0), value=law)
+    counter = lg.TorsionSpringDamper(None, "shaft", axis=(0.0, 0.0, 1.0), stiffness=0.0, turns=True)
+    return lg.Model({"shaft": shaft}, {"bearing": bearing, "drive": drive}, {"counter": counter})
+
+
+@pytest.mark.slow
+def test_an_angle_that_comes_round_is_no_integrand_and_a_counted_one_is():
+    """θ = 8 t + t² passes π at √(16 + π) − 4; ∫θ dt = 4 + 1/3, by p: 1/3."""
+    wrapped = lg.Criterion(integrand=lambda s, p: s.joint("bearing").angle)
+    counted = lg.Criterion(integrand=lambda s, p: s.force("counter").angle)
+    one, other = certify([wrapped, counted], turning, 1.0, t1=1.0, num_steps=400)
+    (at,) = one.jumps
+    assert at - 1 / 400 <= np.sqrt(16.0 + np.pi) - 4.0 <= at
+    assert not one.good and "the integrand jumps" in str(one)
+    assert other.good and not other.jumps
+    # h² of the trapezoidal rule: h²/12 of θ′ at the ends
+    np.testing.assert_allclose([other.value, other.gradient], [13.0 / 3.0, 1.0 / 3.0], rtol=1e-5)
+
+
+def test_where_a_function_jumps():
+    t = jnp.linspace(0.0, 1.0, 101)
+    angle = (8.0 * t + t**2 + jnp.pi) % (2 * jnp.pi) - jnp.pi
+    (at,) = np.flatnonzero(jumps_of(angle))
+    assert t[at - 1] <= np.sqrt(16.0 + np.pi) - 4.0 <= t[at]
+    assert not jumps_of(jnp.sin(20.0 * t)).any() and not jumps_of(jnp.abs(t - 0.503)).any()
 
 
 @pytest.mark.slow
