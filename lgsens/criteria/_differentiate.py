@@ -154,7 +154,7 @@ def differentiate(
         found = worth(num_steps=num_steps, throw=False)
         each = structure.flatten_up_to(found)
         own = lambda name: structure.unflatten([getattr(one, name) for one in each])
-        if not throw or each[0].result == RESULTS.successful:  # else a run below says which step failed
+        if not throw or int(each[0].result) == RESULTS.successful:  # else a run below says which step failed
             return Sensitivities(own("value"), own("gradient"), AdjointVariable(), each[0].result, certificate=found)
     if method is None:
         method = direct_or_adjoint(size, len(leaves)).method
