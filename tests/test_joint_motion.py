@@ -9,6 +9,7 @@ from helpers import EPS, GRAVITY, central_difference, random_body, random_point,
 from scipy.spatial.transform import Rotation
 
 import lgsens as lg
+from lgsens.criteria._criterion_use import Use
 from lgsens.model import Frame, relative_motion
 
 ORIGIN, X, Y, Z = np.zeros(3), np.eye(3)[0], np.eye(3)[1], np.eye(3)[2]
@@ -408,6 +409,21 @@ def test_joints_of_an_instant():
     np.testing.assert_allclose(saved.values["angle"], run.joint("hinge").angle, rtol=0, atol=1e-14)
     with pytest.raises(ValueError, match=says("`joint`: 'hing' is not one of ['hinge']")):
         instant.joint("hing")
+
+
+def test_what_a_criterion_of_a_joint_depends_on():
+    """An angle and a rate on no acceleration and no multiplier: the continuous adjoint method may have them."""
+    p = {"at": np.zeros(3), "axis": Y}
+    system = pendulum(p).system()
+    questions = {
+        (False, False): [lambda j: j.angle, lambda j: j.rate, lambda j: j.point[0]],
+        (True, False): [lambda j: j.acceleration],
+        (False, True): [lambda j: j.force[0], lambda j: j.axial_moment],
+    }
+    for expected, asked in questions.items():
+        for of in asked:
+            criterion = lg.Criterion(integrand=lambda s, p, of=of: of(s.joint("hinge")))
+            assert Use.of(criterion, system, jnp.zeros(()), p).integrand == expected
 
 
 @pytest.mark.slow

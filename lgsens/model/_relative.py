@@ -6,12 +6,9 @@ in that on a,
 
     d = C_aᵀ(p_b − p_a),     D = C_aᵀ C_b,
 
-each relative coordinate s of a joint is a function. Along
-
-    x(τ) = x + τ ẋ + τ²/2 ẍ,     R(τ) = R (I + w̃ + w̃²/2),     w = τ Ω + τ²/2 Ω̇,
-
-bodies have their velocities and accelerations at τ = 0 (R exp(w̃) to O(τ³), and T(w) w' = Ω + τ Ω̇ + O(τ²)), so ṡ and s̈
-are the derivatives of s by τ.
+each relative coordinate s of a joint is a function. Its rate is the derivative of s along (ẋ, R Ω̃) of either body, and
+its acceleration that of the rate along (ẋ, R Ω̃, ẍ, Ω̇): a coordinate has no operation on a velocity behind it, nor a
+rate one on an acceleration, which says what a criterion depends on.
 """
 
 from collections.abc import Callable
@@ -86,7 +83,7 @@ class Relative(NamedTuple):
     point: Float[Array, "n 3"]
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jax.jit, static_argnums=0, inline=True)
 def relative_motion(coordinates: tuple[Coordinate, ...], frames, references, motions) -> Relative:
     """The formulas above of two bodies, a and b.
 
@@ -96,32 +93,33 @@ def relative_motion(coordinates: tuple[Coordinate, ...], frames, references, mot
         motions: of each x, R, ẋ, Ω, ẍ, Ω̇, with a leading axis.
     """
 
-    def ends(tau, motions):
-        for frame, reference, (x, orientation, velocity, spin, acceleration, change) in zip(
-            frames, references, motions
-        ):
-            w = skew(tau * spin + tau**2 / 2 * change)
-            body = Frame(
-                x + tau * velocity + tau**2 / 2 * acceleration,
-                orientation @ (jnp.eye(3, dtype=x.dtype) + w + w @ w / 2),
-            )
+    def ends(poses):
+        for frame, reference, (x, orientation) in zip(frames, references, poses):
             axes = reference.orientation.T @ frame.orientation
-            yield Frame(body.point(reference.local_point(frame.position)), body.orientation @ axes)
+            point = Frame(x, orientation).point(reference.local_point(frame.position))
+            yield Frame(point, orientation @ axes)
 
-    def seen(tau, motions):
-        a, b = ends(tau, motions)
+    def seen(poses):
+        a, b = ends(poses)
         return Frame(a.local_point(b.position), a.orientation.T @ b.orientation)
 
     def at_time(motions):
-        zero = jnp.zeros((), motions[0][0].dtype)
-        values = lambda tau: jnp.stack([of(seen(tau, motions)) for _, _, of, _ in coordinates] or [zero])
-        along = lambda function: lambda tau: jax.jvp(function, (tau,), (jnp.ones_like(tau),))
-        (s, rate), (_, acceleration) = along(along(values))(zero)
-        a, b = ends(zero, motions)
-        count = len(coordinates)
-        return Relative(s[:count], rate[:count], acceleration[:count], seen(zero, motions), a.orientation, b.position)
+        poses, twists, changes = ([motion[i : i + 2] for motion in motions] for i in (0, 2, 4))
+        none = [jnp.zeros((), motions[0][0].dtype)] * (not coordinates)
+        values = lambda poses: jnp.stack([of(seen(poses)) for _, _, of, _ in coordinates] or none)
 
-    return jax.vmap(at_time)(motions)
+        def moved(poses, twists):
+            return [(velocity, R @ skew(spin)) for (_, R), (velocity, spin) in zip(poses, twists)]
+
+        def with_rates(poses, twists):
+            return jax.jvp(values, (poses,), (moved(poses, twists),))
+
+        (s, rate), (_, acceleration) = jax.jvp(with_rates, (poses, twists), (moved(poses, twists), changes))
+        a, b = ends(poses)
+        count = len(coordinates)
+        return Relative(s[:count], rate[:count], acceleration[:count], seen(poses), a.orientation, b.position)
+
+    return jax.vmap(at_time)([tuple(motion) for motion in motions])
 
 
 def but_for_turns(s: Float[Array, ""], near: Any = 0.0, turn: float = 2.0 * jnp.pi) -> Float[Array, ""]:
