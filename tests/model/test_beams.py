@@ -248,6 +248,35 @@ def test_derivatives_of_a_swinging_beam():
         np.testing.assert_allclose(jnp.sum(direct[name] * along), difference, rtol=0, atol=1e-5 * size + 1e-7)
 
 
+@pytest.mark.slow  # programs of statics and of its gradients
+def test_derivatives_of_a_loaded_beam():
+    """Forwards, backwards and differences by the same numbers of an equilibrium: the soft curved beam clamped and bent
+    by a load, tip and strain of a fibre."""
+
+    def bent(p):
+        model = swinging({**p, "damping": jnp.zeros(())})
+        clamp = {"clamp": lg.FixedJoint(None, "b.0", at=p["points"][0])}
+        push = {"push": lg.AppliedForce("b.2", at=p["points"][2], force=[0.1, 0.5, 0.3])}
+        run = lg.statics(lg.Model(model.bodies, clamp, model.forces | push, merge_fixed=True), loads={"push": [1.0]})
+        return run.body("b.2").position[-1], 10.0 * run.force("b.1").fibre_strain(0.01, 0.015)[-1]
+
+    numbers = {name: number for name, number in NUMBERS.items() if name != "damping"}
+    total = lambda p: (lambda tip, strain: jnp.sum(tip * jnp.array([1.0, 2.0, -1.0])) + strain)(*bent(p))
+    forwards, backwards, value = (jax.jit(of(total)) for of in (jax.jacfwd, jax.grad, lambda f: f))
+    direct, adjoint = forwards(numbers), backwards(numbers)
+    assert np.linalg.norm(bent(numbers)[0] - numbers["points"][2]) > 0.05
+    rng = np.random.default_rng(0)
+    for name, number in numbers.items():
+        scale = np.abs(np.asarray(direct[name])).max()
+        np.testing.assert_allclose(adjoint[name], direct[name], rtol=0, atol=1e-10 * scale)
+        along = jnp.asarray(rng.normal(size=number.shape)) * jnp.abs(number).max()
+        at = lambda s, name=name, moved=along: value(numbers | {name: numbers[name] + s * moved})
+        step = 1e-3  # of fourth order; what Newton leaves, 1e-11, over the step
+        difference = (8 * (at(step) - at(-step)) - (at(2 * step) - at(-2 * step))) / (12 * step)
+        size = scale * float(jnp.abs(along).max())
+        np.testing.assert_allclose(jnp.sum(direct[name] * along), difference, rtol=0, atol=1e-6 * size + 1e-8)
+
+
 def test_free_flight_keeps_momenta():
     """A soft beam thrown: a rigid motion leaves strains at round-off, forces between nodes move no centre of mass."""
     beam = lg.Beam("b", UNIT, [[0, 0, 0], [2.0, 0, 0]], elements=3)
