@@ -376,10 +376,12 @@ def test_a_criterion_of_joints(options):
     """An instant knows the joints of its scene: on the fly, backwards, and through a trajectory, whose `joint` is
     tested against differences above; by the hardpoint and the axis, on which its frames depend directly."""
     p, build = {"at": jnp.array([0.0, 0.05, 0.1]), "axis": jnp.array([0.1, 1.0, 0.2])}, of_scene(**options)
+    # programs stop Newton's iteration at other increments: 1e-10 over h², of accelerations, would be seen
+    settings = {"t1": 0.2, "num_steps": 20, "integrator": lg.GeneralizedAlpha(tolerance=1e-13)}
     criterion = lg.Criterion(integrand=joint_criterion, terminal=lambda s, p: s.joint("hinge").angle * p["at"][2])
 
     def through_trajectory(p):
-        run = lg.simulate(build(p), t1=0.2, num_steps=20)
+        run = lg.simulate(build(p), **settings)
         hinge = run.joint("hinge")
         product = jnp.sum(hinge.force * hinge.local_moment, axis=1)
         rate = hinge.angle**2 + 1e-2 * hinge.rate * hinge.acceleration + 1e-4 * product
@@ -387,11 +389,11 @@ def test_a_criterion_of_joints(options):
 
     value, expected = jax.jit(jax.value_and_grad(through_trajectory))(p)
     for method in (lg.DirectDifferentiation(), lg.AdjointVariable()):
-        found = lg.differentiate(criterion, build, p, t1=0.2, num_steps=20, method=method)
-        np.testing.assert_allclose(found.value, value, rtol=1e-8)  # Newton's tolerance, 1e-10, in accelerations
+        found = lg.differentiate(criterion, build, p, method=method, **settings)
+        np.testing.assert_allclose(found.value, value, rtol=1e-11)
         for name in p:
             scale = np.abs(expected[name]).max()
-            np.testing.assert_allclose(found.gradient[name], expected[name], rtol=0, atol=1e-8 * scale)
+            np.testing.assert_allclose(found.gradient[name], expected[name], rtol=0, atol=1e-10 * scale)  # EPS/(βh²)
             assert scale > 1e-2
 
 

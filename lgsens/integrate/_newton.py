@@ -12,6 +12,13 @@ Round-off, the increments that remain however often one iterates, grows with the
 the quarter-car, 230 ε for the 3072 of a chain of 512 links, about ε for each dozen. Increments near it bound κ from
 above and do not measure it. An iteration is also the last where increments of at most one ε for each coordinate no
 longer fall.
+
+Multipliers may lag behind. Where the joints of a body turn with it, as B = R B̄, its displacements do not see what is
+missing from multipliers: the range of Bᵀ is that of the older B₀ᵀ, and Bᵀ ε in the residual is answered by δλ = R₀ᵀR ε
+and no displacement. So ε contracts by |1 − R₀ᵀR|, the turn since the matrix was made, and grows for more than 1 rad (a
+driven shaft with its centre of mass off the axis; a hinge on SE(3)). Hence an iteration is the last only if it changes
+multipliers by little; where that does not fall any longer, and is no round-off, the step has a matrix of its own.
+Round-off is ε m l/(βh²), of multipliers of m l per s² or more.
 """
 
 from functools import partial
@@ -32,6 +39,8 @@ Solver = Any  # factors; None: each iteration makes its own
 _FASTEST = 0.02  # contractions of earlier steps, when the matrix was newer, are no better than this
 _ROUGH = 64  # ε: increments below measure no contraction, and are noise where they fall no longer
 _LEFT = 0.01  # of the tolerance: what the last two increments let expect of the next one at most
+_OF_FORCES = 1e-8  # of the largest multiplier: by how much the last iteration may change them
+_FALLS = 0.7  # of the increment before
 
 
 class _Iterate(NamedTuple):
@@ -39,6 +48,7 @@ class _Iterate(NamedTuple):
     lam: Float[Array, " m"]
     increment: Float[Array, ""]
     before: Float[Array, ""]  # the increment before it
+    of_forces: Float[Array, ""]  # the largest increment of a multiplier
     contraction: Float[Array, ""]  # of modified Newton
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
@@ -85,6 +95,7 @@ def take_step(
             u=iterate.u - du,
             lam=iterate.lam - dlam,
             increment=size,
+            of_forces=jnp.max(jnp.abs(dlam), initial=0.0),
             residual=jnp.max(jnp.abs(residual)),
             iterations=count,
             margin=margin,
@@ -93,10 +104,14 @@ def take_step(
             return found
         # NaN compares false, and ends full Newton
         unfinished = (size > tolerance) & (count - iterate.modified < scheme.max_iterations)
-        return found._replace(going=unfinished) if matrix is None else watched(found, iterate.increment, unfinished)
+        return found._replace(going=unfinished) if matrix is None else watched(found, iterate, unfinished)
 
-    def watched(iterate: _Iterate, last, unfinished) -> _Iterate:
-        """After an iteration, with the increment of the one before: is modified Newton done, or does it give up?"""
+    def watched(iterate: _Iterate, earlier: _Iterate, unfinished) -> _Iterate:
+        """After an iteration, with the one before: is modified Newton done, or does it give up?"""
+        last, largest = earlier.increment, jnp.max(jnp.abs(iterate.lam), initial=0.0)
+        falls = iterate.of_forces <= _FALLS * earlier.of_forces
+        allowed = jnp.where(falls, _OF_FORCES, at_least(_ROUGH * eps / (scheme.beta * h**2), _OF_FORCES))
+        held = iterate.of_forces <= allowed * largest
         size, before, count, full = iterate.increment, iterate.before, iterate.iterations, iterate.full
         measured = ~full & (count > 2) & (before > noise)
         ratio = jnp.sqrt(jnp.maximum(size, round_off) / jnp.where(measured, before, 1.0))
@@ -106,8 +121,10 @@ def take_step(
         contraction = jnp.where(jnp.isfinite(contraction), contraction, 1.0)
         rough = (size <= noise) & (size > 0.25 * before)
         left = (size <= noise) | (size**2 <= _LEFT * tolerance * last)
-        settled = ~full & ((last * contraction**2 <= target) & left | rough)
+        moves_no_more = ~full & ((last * contraction**2 <= target) & left | rough)
+        settled = moves_no_more & held
         fast = (count < 4) | (contraction < tuned.CHORD_CONTRACTION)  # by then the second pair is measured
+        fast &= falls | held | ~moves_no_more
         gives_up = ~full & ~settled & ~(fast & (count < tuned.CHORD_ITERATIONS))
         astray = gives_up & (contraction >= 1.0)
         return iterate._replace(
@@ -139,6 +156,7 @@ def take_step(
         lam=lam,
         increment=infinite,
         before=infinite,
+        of_forces=infinite,
         contraction=guess.contraction,
         residual=infinite,
         iterations=none,
