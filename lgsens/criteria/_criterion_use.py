@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Literal
+from jax._src.interpreters.partial_eval import dce_jaxpr  # there is no public way to ask
 
 from lgsens.criteria._criterion import Criterion
 from lgsens.dynamics import AbstractSystem, State
@@ -23,11 +23,7 @@ class Dependence(NamedTuple):
         lam = jnp.zeros(len(system.constraint_names), v.dtype)
         at = lambda vdot, lam: function(system, State(q, v, vdot, lam, vdot), t, p)
         jaxpr = jax.make_jaxpr(at)(jnp.zeros_like(v), lam).jaxpr
-        needed = {v for v in jaxpr.outvars if not isinstance(v, Literal)}
-        for equation in reversed(jaxpr.eqns):
-            if needed & set(equation.outvars):
-                needed |= {v for v in equation.invars if not isinstance(v, Literal)}
-        return cls(*(v in needed for v in jaxpr.invars))
+        return cls(*dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))[1])  # inside of functions that are called, too
 
 
 class Use(NamedTuple):
