@@ -124,8 +124,8 @@ def take_step(
         moves_no_more = ~full & ((last * contraction**2 <= target) & left | rough)
         settled = moves_no_more & held
         fast = (count < 4) | (contraction < tuned.CHORD_CONTRACTION)  # by then the second pair is measured
-        fast &= falls | held | ~moves_no_more
-        gives_up = ~full & ~settled & ~(fast & (count < tuned.CHORD_ITERATIONS))
+        stuck = moves_no_more & ~falls
+        gives_up = ~full & ~settled & (stuck | ~(fast & (count < tuned.CHORD_ITERATIONS)))
         astray = gives_up & (contraction >= 1.0)
         return iterate._replace(
             u=jnp.where(astray, u, iterate.u),

@@ -83,7 +83,7 @@ class Relative(NamedTuple):
     point: Float[Array, "n 3"]
 
 
-@partial(jax.jit, static_argnums=0, inline=True)
+@partial(jax.jit, static_argnums=0)
 def relative_motion(coordinates: tuple[Coordinate, ...], frames, references, motions) -> Relative:
     """The formulas above of two bodies, a and b.
 

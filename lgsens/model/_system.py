@@ -16,7 +16,7 @@ from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew, turn
 from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, chosen
 from lgsens.model._checks import are_bodies, far_from_rotation
 from lgsens.model._constraints import AbstractRows
-from lgsens.model._frames import BODY_DIM, ROTATION, motion_at
+from lgsens.model._frames import BODY_DIM, ROTATION, Frame, motion_at
 from lgsens.model._given_joints import GivenJoints, JointsOf
 from lgsens.model._loads import AbstractDynamicLoad, AbstractLoad, generalized_force
 from lgsens.model._merged_parts import Parts
@@ -165,9 +165,19 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         return self.parts.multiplier(joint, self.multiplier_rows, q, v, vdot, lam, t)
 
     @property
+    def whole(self) -> "MultibodySystem":
+        """The system of the bodies as they are named."""
+        return self if self.parts is None else self.parts.system
+
+    def reference_frame(self, body: str) -> Frame:
+        """The frame at the centre of mass of a body as it is named, in the reference configuration."""
+        of, still = self.whole, jnp.zeros_like(self.whole.velocity)
+        return Frame(*of.motion(of.body_names.index(body), of.pose, still, still)[:2])
+
+    @property
     def joints(self) -> JointsOf:
         """The joints of the bodies as they are named, as they were given."""
-        return JointsOf((self if self.parts is None else self.parts.system).given)
+        return JointsOf(self.whole.given)
 
     def is_valid(self):
         known = finite(self.pose, self.velocity, self.constraints, self.loads)

@@ -93,11 +93,9 @@ def joint_motions(
     """The motions of joints of a scene, along the leading axis of a motion."""
     wrenches = joint_wrenches(system, names, q, v, vdot, lam, t)
     whole, *motion = system.of_parts(q, v, vdot)
-    still = jnp.zeros_like(whole.velocity)
-    number = whole.body_names.index
-    reference = lambda name: Frame(*whole.motion(number(name), whole.pose, still, still)[:2])
-    moving = lambda name: whole.motion(number(name), *motion)
-    return {name: _joint_motion(system.joints[name], moving, reference, wrench, t) for name, wrench in wrenches.items()}
+    moving = lambda body: whole.motion(whole.body_names.index(body), *motion)
+    known, reference = system.joints, system.reference_frame
+    return {name: _joint_motion(known[name], moving, reference, wrench, t) for name, wrench in wrenches.items()}
 
 
 def _joint_motion(

@@ -52,7 +52,7 @@ def quantities(run: Any, what: str) -> dict[str, Quantity]:
             f"`{what}`: this is a batch of motions, of shape {t.shape[:-1]}; write each of them: "
             "jax.tree.map(lambda leaf: leaf[i], trajectories)."
         )
-    whole = system if system.parts is None else system.parts.system
+    whole = system.whole
     found: dict[str, Quantity] = {}
     vector: Axes = {"axis": _AXES}
 

@@ -16,7 +16,7 @@ from lgsens._brief import brief, listed, roster, shown
 from lgsens._validate import as_float, is_concrete, suggestion
 from lgsens.dynamics import RESULTS, AbstractSystem, State
 from lgsens.integrate import Stages
-from lgsens.model import Frame, MultibodySystem, SE3System, measured, motion_at, scene_of
+from lgsens.model import MultibodySystem, SE3System, measured, motion_at, scene_of
 from lgsens.sensitivity import Sound
 from lgsens.simulation._body_motion import BodyMotion, PointMotion
 from lgsens.simulation._joint_motion import JointMotion, joint_motions
@@ -102,7 +102,7 @@ class AbstractMotion(eqx.Module):
         if reached is not None:
             fields["reached"] = reached.brief
         if (scene := scene_of(system)) is not None:
-            whole = scene if scene.parts is None else scene.parts.system
+            whole = scene.whole
             fields |= {"bodies": roster(whole.body_names), "joints": roster(scene.joints)}
             fields["forces"] = roster(dict.fromkeys(owner for stack in whole.loads for owner in stack.owners))
         unknowns = f"{sizes[0]} coordinates, {sizes[1]} multipliers of"
@@ -145,16 +145,9 @@ class AbstractMotion(eqx.Module):
         Raises `ValueError` for an unknown name or a wrong shape.
         """
         x, orientation, velocity, spin, acceleration, change = self.body(body)
-        local = self._reference(body).local_point(as_float(at, (3,), "`at`"))
+        local = self.of_bodies()[0].reference_frame(body).local_point(as_float(at, (3,), "`at`"))
         twist, rate = (jnp.concatenate(parts, axis=-1) for parts in ((velocity, spin), (acceleration, change)))
         return PointMotion(*motion_at(local, x, orientation, twist, rate))
-
-    def _reference(self, body: str) -> Frame:
-        """The frame at a body's centre of mass in the reference configuration."""
-        system = self.of_bodies()[0]
-        system = system if system.parts is None else system.parts.system
-        still = jnp.zeros_like(system.velocity)
-        return Frame(*system.motion(system.body_names.index(body), system.pose, still, still)[:2])
 
     @_of_each
     def multiplier(self, joint: str) -> Float[Array, "*n rows"]:
