@@ -10,8 +10,8 @@ Errors of a scheme of order p have an expansion h^p e(t; p) + … whose terms ar
 derivative of the leading term is that of the error of the derivative. Where the motion is not smooth, or not resolved,
 there is no such expansion: this is looked for, below.
 
-**Newton.** What the steps leave of their equations, r = E(y_n, y_{n+1}), moves the trajectory by −L⁻¹ r, and Ψ by its
-derivative along that.
+**Newton.** What the steps leave of their equations, r = E(y_n, y_{n+1}), moves the trajectory by −L⁻¹ r, and Ψ by
+−Ψ_y L⁻¹ r = −μ·r, μ = L⁻ᵀ Ψ_yᵀ the adjoint variables of Ψ.
 
 **Duality.** Along a random direction the derivative by the direct differentiation method and the product with the
 gradient by the adjoint variable method are the same number, computed with L and with Lᵀ.
@@ -42,23 +42,21 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lgsens._validate import as_count, as_parameters
 from lgsens.criteria._certificate import Certificate
 from lgsens.criteria._criterion import Criterion
-from lgsens.criteria._error_estimate import corrected, error_estimate
+from lgsens.criteria._error_estimate import corrected, error_in_equal_steps
 from lgsens.criteria._kinks import jumps_of, kinks, roughness
+from lgsens.criteria._known_motion import known_motion, unpacked
 from lgsens.dynamics import State
 from lgsens.integrate import (
     AbstractIntegrator,
-    AbstractScheme,
-    EqualGrid,
     GeneralizedAlpha,
     Variation,
     earlier,
     later,
     rows,
     singular_steps,
-    with_first,
 )
-from lgsens.sensitivity import Parameters, linearized_trajectory, to_ambient
-from lgsens.simulation import Trajectory, check_integrator, interval, raise_if_failed, simulate
+from lgsens.sensitivity import KnownRun
+from lgsens.simulation import Trajectory, check_integrator, interval, raise_if_failed
 
 _LEAST_STEPS = 8
 _REGULAR = 16.0  # of twice the time; in a regular motion sensitivities grow like t, under a constant force like t²
@@ -110,13 +108,13 @@ def certify(
         raise ValueError(f"`tolerance` must be a number between 0 and 1, got {tolerance!r}.")
     t0, t1 = interval(t0, t1)
     p = as_parameters(p)
-    found, shared, trajectory, rough = _certified(tuple(criteria), build, state0, p, t0, t1, num_steps, integrator)
+    motion = known_motion(build, state0, p, t0, t1, num_steps, integrator.scheme)
+    found, shared, trajectory, rough = _certified(tuple(criteria), motion, p, integrator)
     if throw:
         raise_if_failed(trajectory)
-    shared |= {"tolerance": float(tolerance), "kinks": kinks(trajectory, rough)}
-    for one in found:
-        one["jumps"] = tuple(np.asarray(trajectory.t)[np.asarray(one["jumps"])].tolist())
-    return structure.unflatten([Certificate(**one, **shared) for one in found])
+    own = {"tolerance": float(tolerance), "kinks": kinks(trajectory, rough)}
+    at = lambda jumps: tuple(np.asarray(trajectory.t)[np.asarray(jumps)].tolist())
+    return structure.unflatten([Certificate(**one | {"jumps": at(one["jumps"])}, **shared, **own) for one in found])
 
 
 def check_certifiable(integrator: AbstractIntegrator, num_steps: int | None, numbers: PyTree) -> None:
@@ -133,37 +131,42 @@ def check_certifiable(integrator: AbstractIntegrator, num_steps: int | None, num
 
 
 @eqx.filter_jit
-def _certified(criteria, build, start, p, t0, t1, num_steps: int, integrator):
+def _certified(criteria, motion, p, integrator: AbstractIntegrator) -> tuple[list[dict], dict[str, Any], Any, Any]:
     """What is known of each criterion, and of the motion; the motion, and how rough it is."""
+    motion = unpacked(motion)
+    known, each = motion.known, len(criteria)
+    system, states = known.parameters.system, known.states
     flat, unravel = ravel_pytree(p)
-    each = len(criteria)
 
-    def values_of(trajectory, p):
-        return jnp.stack([jnp.asarray(criterion(trajectory, p)) for criterion in criteria])
+    def values_of(trajectory, flat):
+        return jnp.stack([jnp.asarray(criterion(trajectory, unravel(flat))) for criterion in criteria])
 
-    def both(flat):
-        p = unravel(flat)
-        state0 = None if start is None else start(p)
-        trajectory = simulate(
-            build(p), t0=t0, t1=t1, num_steps=num_steps, integrator=integrator, state0=state0, throw=False
-        )
-        better = corrected(trajectory, error_estimate(trajectory, integrator))
-        values = jnp.concatenate([values_of(run, p) for run in (trajectory, better)])
-        return (values, trajectory.states), trajectory
+    def computed(states, system, flat):
+        trajectory = motion.trajectory(integrator, states, system)
+        return values_of(trajectory, flat), trajectory
 
-    (values, _), derivative, trajectory = jax.linearize(both, flat, has_aux=True)
-    states, system = trajectory.states, trajectory.system
-    to_p = jax.linear_transpose(lambda direction: derivative(direction)[0], flat)
-    rows = jax.vmap(lambda row: to_p(row)[0])(jnp.eye(2 * each, dtype=flat.dtype))
-    gradient, better = rows[:each], rows[each:]
+    def improved(states, system, flat):
+        trajectory = motion.trajectory(integrator, states, system)
+        parameters = known.parameters._replace(system=system)
+        error = error_in_equal_steps(known.scheme, trajectory, parameters, known.linear)
+        return values_of(corrected(trajectory, error), flat)
+
+    at = states, system, flat
+    values, pull_back, trajectory = jax.vjp(computed, *at, has_aux=True)
+    improved_values, pull_back_improved = jax.vjp(improved, *at)
+    unit = list(jnp.eye(each, dtype=flat.dtype))
+    of_each = [pull(row) for pull in (pull_back, pull_back_improved) for row in unit]
+    gradients, mu = motion.gradients(jax.tree.map(lambda *rows: jnp.stack(rows), *of_each), flat)
+    gradient, better = gradients[:each], gradients[each:]
+
     random = jax.random.normal(jax.random.key(0), flat.shape, flat.dtype)
     direction = random * jnp.where(flat == 0.0, 1.0, jnp.abs(flat))
-    along, moved = derivative(direction)
+    delta, tangents = motion.along(direction)
+    along = jax.jvp(lambda *at: computed(*at)[0], at, tangents)[1]
     terms = gradient * direction[None]
     largest = jnp.maximum(jnp.max(jnp.abs(terms), axis=1), jnp.finfo(flat.dtype).tiny)
-    duality = jnp.abs(along[:each] - jnp.sum(terms, axis=1)) / largest
-    w = jax.vmap(system.group.from_ambient)(states.q, moved.q)
-    grown = lax.cummax(jnp.max(jnp.abs(w) / system.coordinate_scale()[None], axis=1))
+    duality = jnp.abs(along - jnp.sum(terms, axis=1)) / largest
+    grown = lax.cummax(jnp.max(jnp.abs(delta.w) / system.coordinate_scale()[None], axis=1))
     growth = grown[-1] / jnp.max(jnp.abs(random))
     margins = trajectory.stats.margin
     margin = jnp.min(margins) / jnp.max(
@@ -171,17 +174,14 @@ def _certified(criteria, build, start, p, t0, t1, num_steps: int, integrator):
     )  # infinite: none was looked at
     margin = jnp.where(jnp.any(singular_steps(margins)), 0.0, margin)
     newton = jnp.full(each, jnp.nan, flat.dtype)
-    if integrator.scheme.physical(system, states) is states:  # nothing of them was left out
-        grid = EqualGrid(t0, (t1 - t0) / num_steps, num_steps)
-        moved = _left_by_newton(integrator.scheme, states, Parameters(system, grid))
-        by_states = lambda states: values_of(eqx.tree_at(lambda t: t.states, trajectory, states), p)
-        newton = jax.jvp(by_states, (states,), (moved,))[1]
+    if known.scheme.physical(system, states) is states:  # nothing of them was left out
+        newton = _left_by_newton(known, jax.tree.map(lambda leaf: leaf[:each], mu))
     rough = roughness(trajectory)
     found = [
         {
             "value": values[i],
             "gradient": unravel(gradient[i]),
-            "value_error": values[each + i] - values[i],
+            "value_error": improved_values[i] - values[i],
             "gradient_error": unravel(better[i] - gradient[i]),
             "duality": duality[i],
             "newton": newton[i],
@@ -212,14 +212,13 @@ def grows_exponentially(factor: Float[Array, " n+1"]) -> Bool[Array, ""]:
     return factor[-1] > _REGULAR * factor[(factor.shape[0] - 1) // 2]
 
 
-def _left_by_newton(scheme: AbstractScheme, states: State, parameters: Parameters) -> State:
-    """The tangent of the states that would take what the steps leave of their equations away."""
-    system, grid = parameters
+def _left_by_newton(known: KnownRun, mu: Variation) -> Float[Array, " c"]:
+    """−μ·r, one for each criterion."""
+    (system, grid), states = known.parameters, known.states
 
     def left(place, before, state):
-        return rows(scheme, system, grid.node(place), grid.begun(scheme, system, place, before), state)
+        return rows(known.scheme, system, grid.node(place), grid.begun(known.scheme, system, place, before), state)
 
     residual = jax.vmap(left)(grid.places(), earlier(states), later(states))
-    b = with_first(jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]), residual), jax.tree.map(jnp.negative, residual))
-    delta: Variation = linearized_trajectory(scheme, states, parameters, b, jax.tree.map(jnp.zeros_like, parameters))
-    return jax.vmap(lambda state, delta: to_ambient(system.group, state, delta))(states, delta)
+    products = jax.tree.map(lambda mu, r: jnp.einsum("cnk,nk->c", mu[:, 1:], r), mu, residual)
+    return -jnp.sum(jnp.stack(jax.tree.leaves(products)), axis=0)

@@ -15,7 +15,6 @@ Source: Becker & Rannacher, Acta Numerica 10 (2001), doi:10.1017/S09624929010000
 Hutchinson, Communications in Statistics 19 (1990) 433 (norms from random directions).
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -26,39 +25,31 @@ from jaxtyping import Array, Float
 
 from lgsens.criteria._criterion import Criterion
 from lgsens.criteria._error_estimate import corrected, error_by_defects
-from lgsens.integrate import AbstractScheme, EqualGrid
-from lgsens.sensitivity import Parameters
-from lgsens.simulation import Trajectory, simulate
+from lgsens.criteria._known_motion import unpacked
+from lgsens.integrate import AbstractScheme
+from lgsens.simulation import Trajectory
 
 _DIRECTIONS = 8
 
 
 @eqx.filter_jit
 def defect_densities(
-    criteria: tuple[Criterion, ...],
-    build: Callable[[Any], Any],
-    start: Callable[[Any], Any] | None,
-    p: Any,
-    t0,
-    t1,
-    num_steps: int,
-    scheme: AbstractScheme,
+    criteria: tuple[Criterion, ...], motion: Any, p: Any, scheme: AbstractScheme
 ) -> tuple[Float[Array, "c k n"], Trajectory]:
     """Rows of errors that add up over the n steps, relative to each of c criteria, and the run in equal steps.
 
-    The first of the k rows is η_n/|Ψ|; the squares of the others add up to that of dη_n/dp over |dΨ/dp|.
+    The first of the k rows is η_n/|Ψ|; the squares of the others add up to that of dη_n/dp over |dΨ/dp|. `motion`: a
+    `known_motion` at p.
     """
+    motion = unpacked(motion)
+    known = motion.known
     flat, unravel = ravel_pytree(p)
 
-    def terms(flat):
+    def terms(states, system, flat):
         p = unravel(flat)
-        state0 = None if start is None else start(p)
-        settings = {"num_steps": num_steps, "integrator": scheme, "state0": state0, "throw": False}
-        trajectory = simulate(build(p), t0=t0, t1=t1, **settings)
-        system, states = trajectory.system, trajectory.states
-        grid = EqualGrid(t0, (t1 - t0) / num_steps, num_steps)
-        parameters = Parameters(system, grid)
-        b = scheme.defects(system, grid, states)
+        trajectory = motion.trajectory(scheme, states, system)
+        parameters = known.parameters._replace(system=system)
+        b = scheme.defects(system, parameters.grid, trajectory.states)
         if b is None:
             raise ValueError(
                 f"What {scheme!r} misses in its steps is not known: GeneralizedAlpha of index 3 says it, if no force "
@@ -66,7 +57,7 @@ def defect_densities(
             )
 
         def better(b):
-            run = corrected(trajectory, error_by_defects(scheme, states, parameters, b))
+            run = corrected(trajectory, error_by_defects(scheme, trajectory.states, parameters, b, known.linear))
             return jnp.stack([criterion(run, p) for criterion in criteria])
 
         z = jax.jacrev(better)(b)
@@ -77,11 +68,12 @@ def defect_densities(
         values = jnp.stack([criterion(trajectory, p) for criterion in criteria])
         return (of_motion + of_rule, values), trajectory
 
-    (eta, values), derivative, trajectory = jax.linearize(terms, flat, has_aux=True)
+    at = known.states, known.parameters.system, flat
+    (eta, values), derivative, trajectory = jax.linearize(terms, *at, has_aux=True)
     size = flat.shape[0]
     directions = jax.random.normal(jax.random.key(0), (size, min(size, _DIRECTIONS)), flat.dtype)
     along = jnp.sqrt(size / directions.shape[1]) * jnp.linalg.qr(directions)[0].T
-    d_eta, d_values = jax.vmap(derivative)(along)
+    d_eta, d_values = jax.vmap(lambda direction: derivative(*motion.along(direction)[1]))(along)
     norms = jnp.sqrt(jnp.sum(d_values**2, axis=0))
     relative = lambda rows, to: rows / jnp.where(to > 0.0, to, 1.0)
     of_values = relative(eta, jnp.abs(values)[:, None])[:, None]

@@ -23,7 +23,7 @@ from lgsens.integrate import (
     GeneralizedAlpha,
     Variation,
 )
-from lgsens.sensitivity import Parameters, linearized_trajectory
+from lgsens.sensitivity import LinearStep, Parameters, linearized_trajectory
 from lgsens.simulation import StateError, Trajectory
 
 _LEAST_STEPS = 3
@@ -100,17 +100,32 @@ def _is_by(integrator: AbstractIntegrator, trajectory: Trajectory):
 
 @eqx.filter_jit
 def _estimated(integrator: AbstractIntegrator, trajectory: Trajectory) -> StateError:
-    scheme, states, system, t = integrator.scheme, trajectory.states, trajectory.system, trajectory.t
+    scheme, t = integrator.scheme, trajectory.t
+    if not integrator.equal_steps:
+        return refined_error(scheme, trajectory)
     grid = EqualGrid(t[0], (t[-1] - t[0]) / (t.shape[0] - 1), t.shape[0] - 1)
-    defects = scheme.defects(system, grid, states) if integrator.equal_steps else None
+    return error_in_equal_steps(scheme, trajectory, Parameters(trajectory.system, grid))
+
+
+def error_in_equal_steps(
+    scheme: AbstractScheme, trajectory: Trajectory, parameters: Parameters, linear: LinearStep | None = None
+) -> StateError:
+    """By the defects of its steps, where the scheme says them; else by a second run."""
+    defects = scheme.defects(parameters.system, parameters.grid, trajectory.states)
     if defects is None:
         return refined_error(scheme, trajectory)
-    return error_by_defects(scheme, states, Parameters(system, grid), defects)
+    return error_by_defects(scheme, trajectory.states, parameters, defects, linear)
 
 
-def error_by_defects(scheme: AbstractScheme, states: State, parameters: Parameters, defects: Variation) -> StateError:
-    """−e of L e = b, without a change of parameters."""
-    e = linearized_trajectory(scheme, states, parameters, defects, jax.tree.map(jnp.zeros_like, parameters))
+def error_by_defects(
+    scheme: AbstractScheme,
+    states: State,
+    parameters: Parameters,
+    defects: Variation,
+    linear: LinearStep | None = None,
+) -> StateError:
+    """−e of L e = b, without a change of parameters; `linear`: as in `linearized_trajectory`."""
+    e = linearized_trajectory(scheme, states, parameters, defects, None, linear=linear)
     return StateError(-e.w, -e.v, -e.vdot, -e.lam)
 
 

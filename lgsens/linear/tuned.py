@@ -64,6 +64,15 @@ CHORD_ITERATIONS, CHORD_CONTRACTION = 12, 0.3
 BLOCK_NUMBERS, BLOCK_STEPS = 2**14, 64
 COUNTED_BLOCKS = 12  # at least, where the number of steps is not known when the program is compiled
 
+# Blocks of products with L are so many times as long (`sensitivity._linearization`): they keep no factors. The
+# derivative of the quarter-car's in reverse mode takes 1.3 times as long in blocks of 4 steps as in those of 16 or in
+# one of all 480, which takes 23 MB in place of 5 and compiles 1.4 times as long.
+PRODUCT_BLOCKS = 4
+
+# Numbers of all linearized steps of a run that may be kept for several sweeps (`sensitivity._known_run`): 128 MB. Of
+# 480 steps of the quarter-car, 25 MB, a sweep then takes 9 in place of 33 ms.
+KEPT_NUMBERS = 2**24
+
 # What value and gradient cost in simulations (`criteria.direct_or_adjoint`): the top with four parameters and five
 # criteria, by benchmarks/methods.py; the four-bar differs by less than the noise.
 TYPICAL_COSTS = {

@@ -14,6 +14,7 @@ Forward substitution with L is the direct differentiation method, back substitut
 variable method (`_sweeps.py`). Both solve with the exact iteration matrix of eq. (30).
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -30,6 +31,8 @@ from lgsens.integrate import (
     rows,
     with_first,
 )
+from lgsens.linear import tuned
+from lgsens.sensitivity._step_blocks import StepBlocks
 
 
 class Parameters(NamedTuple):
@@ -68,8 +71,19 @@ def node_tangent(grid: AbstractGrid, d: AbstractGrid, place, d_place) -> Node:
     return jax.jvp(lambda grid, place: grid.node(place), (grid, place), (d, d_place))[1]
 
 
-def matvec(scheme: AbstractScheme, states: State, parameters: Parameters, delta: Variation, d: Parameters):
-    """L (δ, p'), all steps at once: the tangents of their equations. What JAX differentiates a second time."""
+def matvec(
+    scheme: AbstractScheme,
+    states: State,
+    parameters: Parameters,
+    delta: Variation,
+    d: Parameters | None,
+    *,
+    at_once: bool = False,
+):
+    """L (δ, p'), the tangents of all equations: what JAX differentiates a second time; d None: p is no unknown.
+
+    By blocks of steps, of which a derivative in reverse mode keeps what goes in, and no more; `at_once`: by one.
+    """
     system, grid = parameters
     group = system.group
 
@@ -78,7 +92,10 @@ def matvec(scheme: AbstractScheme, states: State, parameters: Parameters, delta:
             return rows(scheme, system, grid.node(place), grid.begun(scheme, system, place, before), state)
 
         d_states = to_ambient(group, before, previous), to_ambient(group, state, current)
-        _, found = jax.jvp(equations, (system, grid, place, before, state), (d.system, d.grid, d_place, *d_states))
+        if d is None:
+            _, found = jax.jvp(partial(equations, system, grid, place), (before, state), d_states)
+        else:
+            _, found = jax.jvp(equations, (system, grid, place, before, state), (*d, d_place, *d_states))
         return grid.unless_empty(place, found, jax.tree.map(jnp.subtract, current, previous))
 
     def taken(rows: Variation) -> Variation:
@@ -89,8 +106,13 @@ def matvec(scheme: AbstractScheme, states: State, parameters: Parameters, delta:
         where = lambda row, own: jnp.where(jnp.expand_dims(beyond, range(1, row.ndim)), own, row)
         return jax.tree.map(where, rows, later(delta))
 
-    every = (grid.places(), place_tangents(grid, d.grid), earlier(states), later(states), earlier(delta), later(delta))
-    return with_first(jax.tree.map(lambda leaf: leaf[0], delta), taken(jax.vmap(row)(*every))), d
+    numbers = max(1, scheme.numbers(system) // tuned.PRODUCT_BLOCKS)
+    blocks = StepBlocks(grid.num_steps, 0) if at_once else StepBlocks.of(grid.num_steps, numbers)
+    block = jax.checkpoint(lambda inputs: jax.vmap(row)(*inputs), prevent_cse=False)  # a loop keeps them apart
+    d_places = None if d is None else place_tangents(grid, d.grid)
+    every = (grid.places(), d_places, earlier(states), later(states), earlier(delta), later(delta))
+    _, found = blocks.scan(lambda _, inputs: ((), block(inputs)), (), blocks.padded(every, repeat=True))
+    return with_first(jax.tree.map(lambda leaf: leaf[0], delta), taken(found)), d
 
 
 # Conversion between Lie-algebra coordinates and the arrays of q: the only place where it happens.

@@ -63,8 +63,12 @@ class LinearizedSteps(NamedTuple):
         equations = self.scheme.linearized(system, self.shared, node, begun, step.state)
         return LinearStep(step, begun, factors, equations)
 
-    def loads(self, linear: LinearStep, d: Parameters, d_place: Any) -> Loads:
-        """E_p p', and what p' makes of y_n*."""
+    def loads(self, linear: LinearStep, d: Parameters | None, d_place: Any) -> Loads:
+        """E_p p', and what p' makes of y_n*; d None: nothing."""
+        if d is None:
+            none = jax.tree.map(jnp.zeros_like, (self.parameters, linear.step.place))
+            shapes = jax.eval_shape(self.loads, linear, *none)
+            return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         system, grid = self.parameters
         step, begun = linear.step, None
         node, d_node = grid.node(step.place), node_tangent(grid, d.grid, step.place, d_place)

@@ -1,37 +1,27 @@
-"""How a trajectory is differentiated, as a value: the two rules on the whole trajectory.
-
-Both rules are module-level functions of explicit arguments, and keep states only.
-"""
+"""How a trajectory is differentiated, as a value."""
 
 import abc
-import dataclasses
-from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jax import lax
 
 from lgsens._validate import require_setting
 from lgsens.dynamics import State, require_independent, require_linear
-from lgsens.integrate import AbstractScheme, GeneralizedAlpha, Stats, Variation, earlier, states_of, with_first
-from lgsens.linear import LinearEquations, linear_solve
+from lgsens.integrate import AbstractScheme, Stats
 from lgsens.sensitivity._continuous_adjoint import Cotangents, continuous_adjoint_sweep
-from lgsens.sensitivity._continuous_direct import continuous_direct_sweep
 from lgsens.sensitivity._criterion_terms import Functional, OfState, derivative_terms, plain_terms, points
-from lgsens.sensitivity._failed import Sound
 from lgsens.sensitivity._first_order_adjoint import first_order_adjoint_sweep
-from lgsens.sensitivity._linearization import (
-    Parameters,
-    cotangent_to_algebra,
-    cotangent_to_ambient,
-    matvec,
-    to_algebra,
-    to_ambient,
+from lgsens.sensitivity._linearization import Parameters
+from lgsens.sensitivity._rules import (
+    AT_ONCE,
+    SWEEPS,
+    adjoint_trajectory,
+    continuous_trajectory,
+    decoded_run,
+    direct_trajectory,
+    encoded_run,
+    linear_scheme,
 )
-from lgsens.sensitivity._log_depth import adjoint_at_once, direct_at_once
-from lgsens.sensitivity._sweeps import adjoint_sweep, direct_sweep
 
 _TREATMENTS = ("state", "derivatives", "first_order", None)
 
@@ -84,7 +74,7 @@ class DirectDifferentiation(AbstractDiscrete):
 
     def trajectory(self, scheme, state0, parameters, found=None):
         self._require_all_states()
-        return _decoded(_direct_trajectory(_SWEEPS, scheme, state0, parameters, found))
+        return decoded_run(direct_trajectory(SWEEPS, scheme, state0, parameters, found))
 
 
 class AssociativeScan(AbstractSensitivity):
@@ -105,7 +95,7 @@ class AssociativeScan(AbstractSensitivity):
     """
 
     def trajectory(self, scheme, state0, parameters, found=None):
-        return _decoded(_direct_trajectory(_AT_ONCE, scheme, state0, parameters, found))
+        return decoded_run(direct_trajectory(AT_ONCE, scheme, state0, parameters, found))
 
 
 class AdjointVariable(AbstractDiscrete):
@@ -122,7 +112,7 @@ class AdjointVariable(AbstractDiscrete):
 
     def trajectory(self, scheme, state0, parameters, found=None):
         self._require_all_states()
-        return _decoded(_adjoint_trajectory(scheme, state0, parameters, found))
+        return decoded_run(adjoint_trajectory(scheme, state0, parameters, found))
 
 
 class ContinuousDirect(AbstractSensitivity):
@@ -135,7 +125,7 @@ class ContinuousDirect(AbstractSensitivity):
 
     def trajectory(self, scheme, state0, parameters, found=None):
         _require_positions("ContinuousDirect", parameters)
-        return _decoded(_continuous_trajectory(scheme, state0, parameters))
+        return decoded_run(continuous_trajectory(scheme, state0, parameters))
 
 
 class Autodiff(AbstractSensitivity):
@@ -147,7 +137,7 @@ class Autodiff(AbstractSensitivity):
     """
 
     def trajectory(self, scheme, state0, parameters, found=None):
-        return _decoded(_run(scheme.for_autodiff(), state0, parameters))
+        return decoded_run(encoded_run(scheme.for_autodiff(), state0, parameters))
 
 
 class ContinuousAdjoint(eqx.Module):
@@ -186,7 +176,7 @@ class ContinuousAdjoint(eqx.Module):
     ) -> Cotangents:
         """dΨ as it acts on the initial state, the system and p; `uses`: whether F and G use v̇ or λ."""
         _require_positions("ContinuousAdjoint", parameters)
-        scheme = _linear_scheme(scheme)
+        scheme = linear_scheme(scheme)
         t, h = parameters.grid.times(), parameters.grid.h
         if self.accelerations != "state" and h.ndim:
             raise ValueError(
@@ -212,129 +202,3 @@ def _require_positions(method: str, parameters: Parameters) -> None:
             f"{method} integrates the differentiated equations of motion with constraints of position level only: "
             "leave `Rolling` out, or take DirectDifferentiation() or AdjointVariable()."
         )
-
-
-def _linear_scheme(scheme: AbstractScheme) -> GeneralizedAlpha:
-    """What integrates linear equations along a motion: index 3, with the numbers of its scheme where it has them."""
-    return dataclasses.replace(scheme, stabilized=False) if isinstance(scheme, GeneralizedAlpha) else GeneralizedAlpha()
-
-
-# The custom rules see statistics as floats: an integer output of a `custom_vjp` reaches operations that have no
-# derivative (`jnp.all`) with a tangent, and JAX refuses. Numbers of the scheme have no derivative where they are data.
-
-
-@partial(jax.jit, inline=True)  # traced once for the trajectory and its rule
-def _marched(scheme, state0, parameters):
-    return states_of(scheme, parameters.system, parameters.grid, state0)
-
-
-def _run(scheme, state0, parameters, found=None):
-    states, stats = _marched(scheme, state0, parameters) if found is None else found
-    return states, encoded(stats, states.v.dtype)
-
-
-def encoded(stats: Stats, dtype) -> Stats:
-    return jax.tree.map(lambda leaf: leaf.astype(dtype), stats)
-
-
-def decoded(stats: Stats) -> Stats:
-    stats = lax.stop_gradient(stats)
-    return stats._replace(iterations=stats.iterations.astype(jnp.int32), converged=stats.converged.astype(bool))
-
-
-def _decoded(run: tuple[State, Stats]) -> tuple[State, Stats]:
-    states, stats = run
-    return states, decoded(stats)
-
-
-# Direct differentiation. The tangent of the trajectory solves L (δ, p') = (b, p'), b = (δ_0, 0, …, 0). `linear_solve`
-# carries the two sweeps side by side: JAX takes the first one forwards, the other one backwards, and for second
-# derivatives differentiates `matvec`, that is L itself, never the sweeps.
-
-# Either both sweeps, or what takes all steps at once.
-
-_SWEEPS = LinearEquations(
-    lambda of, x: matvec(*of, *x), lambda of, b: direct_sweep(*of, *b), lambda of, c: adjoint_sweep(*of, *c)
-)
-_AT_ONCE = LinearEquations(
-    _SWEEPS.product, lambda of, b: direct_at_once(*of, *b), lambda of, c: adjoint_at_once(*of, *c)
-)
-
-
-def linearized_trajectory(
-    scheme: AbstractScheme,
-    states: State,
-    parameters: Parameters,
-    b: Variation,
-    d: Parameters,
-    equations: LinearEquations = _SWEEPS,
-):
-    """δ of L (δ, p') = (b, d) at the states of a run, differentiable by products with L."""
-    return linear_solve(equations, (scheme, states, parameters), (b, d))[0]
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _direct_trajectory(equations, scheme, state0, parameters, found):
-    return _run(scheme, state0, parameters, found)
-
-
-@_direct_trajectory.defjvp
-def _direct_rule(equations, primals, tangents):
-    scheme, state0, parameters, _ = primals
-    _, d_state0, d_parameters, _ = tangents
-    states, stats = _direct_trajectory(equations, *primals)
-    group, sound = parameters.system.group, Sound.of(states, parameters.system)
-    b = with_first(to_algebra(group, state0, d_state0), earlier(Variation.none(states)))
-    delta = linearized_trajectory(scheme, sound.states, parameters, b, d_parameters, equations)
-    d_states = sound.lost(jax.vmap(partial(to_ambient, group))(sound.states, delta))
-    return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
-
-
-# Direct differentiation of the equations of motion: a rule whose tangent is linear in the input tangents, as it is.
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _continuous_trajectory(scheme, state0, parameters):
-    states, stats = _run(scheme, state0, parameters)
-    return scheme.physical(parameters.system, states), stats
-
-
-@_continuous_trajectory.defjvp
-def _continuous_rule(scheme, primals, tangents):
-    state0, parameters = primals
-    d_state0, d_parameters = tangents
-    states, stats = _continuous_trajectory(scheme, state0, parameters)
-    group = parameters.system.group
-    physical = partial(scheme.physical, parameters.system)
-    first = to_algebra(group, physical(state0), physical(d_state0))
-    delta = continuous_direct_sweep(_linear_scheme(scheme), states, parameters, first, d_parameters)
-    d_states = jax.vmap(partial(to_ambient, group))(states, delta)
-    return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
-
-
-# Adjoint variable method.
-
-
-@jax.custom_vjp
-def _adjoint_trajectory(scheme, state0, parameters, found):
-    return _run(scheme, state0, parameters, found)
-
-
-def _adjoint_forward(scheme, state0, parameters, found):
-    # Forward mode over this rule needs the derivative of the states, which those that error control has found lack.
-    states, stats = _direct_trajectory(_SWEEPS, scheme, state0, parameters, found)
-    return (states, stats), (scheme, states, parameters)
-
-
-def _adjoint_backward(kept, cotangents):
-    scheme, found, parameters = kept
-    group, sound = parameters.system.group, Sound.of(found, parameters.system)
-    states = sound.states
-    c = jax.vmap(partial(cotangent_to_algebra, group))(states, sound.asked(cotangents[0]))
-    mu, bar = adjoint_sweep(scheme, states, parameters, c, jax.tree.map(jnp.zeros_like, parameters))
-    state0 = jax.tree.map(lambda leaf: leaf[0], states)
-    first = jax.tree.map(lambda leaf: leaf[0], mu)
-    return None, cotangent_to_ambient(group, state0, first), bar, None
-
-
-_adjoint_trajectory.defvjp(_adjoint_forward, _adjoint_backward)

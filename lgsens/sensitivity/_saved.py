@@ -19,7 +19,8 @@ from lgsens.integrate import AbstractScheme, Stats, march
 from lgsens.linear import LinearEquations, linear_solve
 from lgsens.sensitivity._failed import Sound
 from lgsens.sensitivity._linearization import Parameters
-from lgsens.sensitivity._methods import AbstractSensitivity, AdjointVariable, DirectDifferentiation, decoded, encoded
+from lgsens.sensitivity._methods import AbstractSensitivity, AdjointVariable, DirectDifferentiation
+from lgsens.sensitivity._rules import decoded, encoded
 from lgsens.sensitivity._segments import (
     Output,
     Segments,

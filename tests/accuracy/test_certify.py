@@ -12,6 +12,7 @@ import lgsens as lg
 from lgsens.accuracy import certify
 from lgsens.criteria import jumps_of, kinks, roughness
 from lgsens.examples import linear_quarter_car
+from lgsens.linear import tuned
 
 HEIGHT = lg.Criterion(terminal=lambda s, p: s.body("mass").position[2])
 BOTH = {"squares": CRITERION, "end": HEIGHT}
@@ -43,6 +44,18 @@ def test_it_says_how_many_digits_and_what_to_do(oscillator):
     assert "take 2 times as many steps" in str(strict)
     assert not strict.good
     assert strict._replace(tolerance=0.5).good
+
+
+def test_certificates_share_the_motion_and_need_no_memory(oscillator, compiled, monkeypatch):
+    """Another criterion compiles no motion; without room for the steps each sweep linearizes for itself."""
+    names, _ = compiled(lambda: [certify(HEIGHT, build, P, t1=T1, num_steps=100)._asdict()])
+    assert "_certified" in names and "known_motion" not in names
+    monkeypatch.setattr(tuned, "KEPT_NUMBERS", 0)
+    jax.clear_caches()  # the limit is no argument
+    plain = certify(CRITERION, build, P, t1=T1, num_steps=100)
+    for name in ("value", "gradient", "value_error", "gradient_error", "growth"):
+        for kept, own in zip(*map(jax.tree.leaves, (getattr(oscillator, name), getattr(plain, name)))):
+            np.testing.assert_allclose(kept, own, rtol=1e-9)  # round-off of a hundred steps in another order
 
 
 @pytest.mark.slow  # programs of two runs; `certify` is in the quick run

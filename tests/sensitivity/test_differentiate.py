@@ -9,7 +9,7 @@ from helpers import equations, says, some_quick
 import lgsens as lg
 from lgsens.examples import spinning_top
 from lgsens.linear import LU
-from lgsens.sensitivity._sweeps import StepBlocks
+from lgsens.sensitivity._step_blocks import StepBlocks
 
 SIDE = lg.Criterion(integrand=lambda s, p: s.body("top").position[0] ** 2)
 SETTINGS = {"t1": 0.2, "num_steps": 40}
