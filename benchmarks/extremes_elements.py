@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import diffrax
 import jax.numpy as jnp
 import numpy as np
 from extremes_rows import EPS, derivatives, largest, linear_error, worst_row
@@ -37,10 +38,23 @@ def _radau_error(phase, steps):
     return np.abs(stability**steps - np.exp(z * steps))
 
 
+def _explicit_error(solver, phase, steps):
+    """The same of an explicit scheme, R(z) = 1 + z bᵀ (I − z A)⁻¹ 1 from its coefficients."""
+    b = np.asarray(solver.tableau.b_sol)
+    a = np.zeros((b.size, b.size))
+    for i, row in enumerate(solver.tableau.a_lower):
+        a[i + 1, : i + 1] = row
+    z, one = 1j * np.asarray(phase), np.ones(b.size)
+    stability = np.array([1 + one_z * b @ np.linalg.solve(np.eye(b.size) - one_z * a, one) for one_z in z])
+    return np.abs(stability**steps - np.exp(z * steps))
+
+
 SCHEMES = {
     "generalized-α, index 3": (lg.GeneralizedAlpha(0.9), partial(linear_error, 0.9)),
     "generalized-α, stabilized": (lg.GeneralizedAlpha(0.9, stabilized=True), partial(linear_error, 0.9)),
     "Radau IIA": (lg.RadauIIA(), _radau_error),
+    "index-reduced, Tsit5": (lg.IndexReducedODE(), partial(_explicit_error, diffrax.Tsit5())),
+    "index-reduced, Dopri8": (lg.IndexReducedODE(diffrax.Dopri8()), partial(_explicit_error, diffrax.Dopri8())),
 }
 
 

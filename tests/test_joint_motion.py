@@ -411,6 +411,10 @@ def test_joints_of_an_instant():
     np.testing.assert_allclose(saved.values["angle"], run.joint("hinge").angle, rtol=0, atol=1e-14)
     with pytest.raises(ValueError, match=says("`joint`: 'hing' is not one of ['hinge']")):
         instant.joint("hing")
+    with pytest.raises(IndexError, match=says("`index` must be from -21 to 20")):
+        run.instant(21)
+    with pytest.raises(IndexError, match=says("`index` must be a whole number", "1.5")):
+        run.instant(1.5)
 
 
 def test_what_a_criterion_of_a_joint_depends_on():
@@ -463,6 +467,7 @@ def test_a_batch_is_asked_one_by_one():
         "force": lambda run: run.force("spring"),
         "multiplier": lambda run: run.multiplier("ball"),
         "state": lambda run: run.state(-1),
+        "instant": lambda run: (run.instant(2).t, run.instant(2).body("bob").velocity),
     }
     batch = jax.jit(jax.vmap(jax.vmap(run)))(jnp.array([[0.4, 0.5, 0.6], [0.7, 0.8, 0.9]]))
     one = jax.tree.map(lambda leaf: leaf[1, 2], batch)

@@ -207,8 +207,8 @@ def test_failure_says_which_run(at, place):
 @pytest.mark.parametrize(
     ("attempt", "message"),
     [
-        (lambda: lg.Richardson(0.9), says("Richardson: `integrator` must be a GeneralizedAlpha", "0.9")),
-        (lambda: lg.Richardson(RICHARDSON), says("Richardson: `integrator` must be a GeneralizedAlpha", "Richardson(")),
+        (lambda: lg.Richardson(0.9), says("Richardson: `integrator` must be a scheme", "0.9")),
+        (lambda: lg.Richardson(RICHARDSON), says("Richardson: `integrator` must be a scheme", "Richardson(")),
         (lambda: lg.richardson(lambda n: 1.0 / n, 0), says("`num_steps` must be at least 1", "0")),
         (lambda: lg.richardson(lambda n: 1.0 / n, 2.5), says("`num_steps` must be a Python int", "2.5")),
         (lambda: lg.richardson(lambda n: 1.0 / n, 2, runs=1), says("`runs` must be a Python int of at least 2", "1")),

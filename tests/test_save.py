@@ -159,3 +159,5 @@ def test_one_compilation_for_one_function():
 def test_bad_input():
     with pytest.raises(ValueError, match=says("`save` must be a function", "'side'", "Leave it out")):
         lg.simulate(spinning_top(0.7), **(SETTINGS | {"save": "side"}))
+    with pytest.raises(ValueError, match=says("`save` must return numbers and arrays", "got 'x'")):
+        lg.simulate(spinning_top(0.7), **(SETTINGS | {"save": lambda s: {"name": "x"}}))

@@ -125,7 +125,9 @@ class AbstractIntegrator(eqx.Module):
 def scheme_of(owner: str, integrator: Any) -> "AbstractScheme":
     """The scheme that an integrator is to lay steps for; `ValueError` where that is none."""
     if not isinstance(integrator, AbstractScheme):
-        raise ValueError(f"{owner}: `integrator` must be a GeneralizedAlpha, got {integrator!r}.")
+        raise ValueError(
+            f"{owner}: `integrator` must be a scheme, as GeneralizedAlpha() and RadauIIA() are, got {integrator!r}."
+        )
     integrator.require_steps()
     return integrator
 

@@ -52,4 +52,9 @@ class Output(eqx.Module):
 
     def __call__(self, system, state: State, t):
         found = self.function(Instant(t=t, state=state, system=system), *self.numbers)
+        for leaf in jax.tree.leaves(found):
+            if not eqx.is_array_like(leaf):
+                raise ValueError(
+                    f"`save` must return numbers and arrays, or a dict or another pytree of them, got {leaf!r}."
+                )
         return found, Turning.at(system, state)

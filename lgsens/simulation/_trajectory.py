@@ -293,7 +293,7 @@ class Trajectory(AbstractRun):
 
     def instant(self, index: int) -> "Instant":
         """Step `index` (negative: from the end) as the integrand of a `Criterion` sees it. Raises as `state`."""
-        return Instant(t=self.t[index], state=self.state(index), system=self.system)
+        return Instant(state=self.state(index), t=self.t[..., index], system=self.system)  # of a batch, too
 
 
 class Saved(eqx.Module):
