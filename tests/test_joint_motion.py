@@ -417,6 +417,20 @@ def test_joints_of_an_instant():
         run.instant(1.5)
 
 
+@pytest.mark.parametrize("bodies", [(None, "bob"), ("bob", None)])
+def test_the_force_along_a_rod_turns_with_it(bodies):
+    """Of a swinging bob, −(m v²/l − m g z/l), whichever end is a, and as many N as there are in the force."""
+    at = dict(zip(("at_a", "at_b"), [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)][:: 1 if bodies[0] is None else -1]))
+    bob = lg.RigidBody(2.0, None, position=(1.0, 0.0, 0.0))
+    model = lg.Model({"bob": bob}, {"rod": lg.DistanceJoint(*bodies, **at)}, {"g": lg.Gravity((0.0, 0.0, -9.81))})
+    run = lg.simulate(model, t1=0.6, num_steps=60, integrator=lg.RadauIIA())
+    position, velocity = run.body("bob").position, run.body("bob").velocity
+    tension = 2.0 * (np.sum(velocity**2, axis=1) - 9.81 * position[:, 2])
+    assert np.abs(position[-1, 0]) < 0.5  # it has turned by more than a radian
+    np.testing.assert_allclose(run.joint("rod").axial_force, -tension, atol=1e-9)  # Radau's λ in 10 ms
+    np.testing.assert_allclose(np.linalg.norm(run.joint("rod").force, axis=1), np.abs(tension), atol=1e-9)
+
+
 def test_what_a_criterion_of_a_joint_depends_on():
     """An angle and a rate on no acceleration and no multiplier: the continuous adjoint method may have them."""
     p = {"at": np.zeros(3), "axis": Y}

@@ -7,8 +7,9 @@ differentiated exactly, e by the rule of `linear_solve`, e' = L⁻¹ (b' − L' 
     true Ψ ≈ Ψ + (Ψ̂ − Ψ),     true dΨ/dp ≈ dΨ/dp + (dΨ̂/dp − dΨ/dp).
 
 Errors of a scheme of order p have an expansion h^p e(t; p) + … whose terms are smooth in the parameters, and the
-derivative of the leading term is that of the error of the derivative. Where the motion is not smooth, or not resolved,
-there is no such expansion: this is looked for, below.
+derivative of the leading term is that of the error of the derivative. Of a scheme that does not know what its steps
+miss Ψ̂ is extrapolated from a second run (`_refined_run`), each with its own quadrature over stages. Where the motion is
+not smooth, or not resolved, there is no such expansion: this is looked for, below.
 
 **Newton.** What the steps leave of their equations, r = E(y_n, y_{n+1}), moves the trajectory by −L⁻¹ r, and Ψ by
 −Ψ_y L⁻¹ r = −μ·r, μ = L⁻ᵀ Ψ_yᵀ the adjoint variables of Ψ.
@@ -42,9 +43,10 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lgsens._validate import as_count, as_parameters
 from lgsens.criteria._certificate import Certificate
 from lgsens.criteria._criterion import Criterion
-from lgsens.criteria._error_estimate import corrected, error_in_equal_steps
+from lgsens.criteria._error_estimate import corrected, error_by_defects
 from lgsens.criteria._kinks import jumps_of, kinks, roughness
 from lgsens.criteria._known_motion import known_motion, unpacked
+from lgsens.criteria._refined_run import extrapolated, refined_run, require_order
 from lgsens.dynamics import State
 from lgsens.integrate import (
     AbstractIntegrator,
@@ -91,8 +93,8 @@ def certify(
         throw: raise if the simulation fails; with False the certificate says so.
 
     The errors are those of the discretization in time, to leading order: from this one run for `GeneralizedAlpha` of
-    index 3, from a second one in half the steps for others. What the model leaves out is no part of them. Kinks are
-    told from second differences of accelerations, in steps that resolve what is around.
+    index 3, from a second one in half the steps for others, whose criteria are extrapolated. What the model leaves out
+    is no part of them. Kinks are told from second differences of accelerations, in steps that resolve what is around.
 
     Returns a `Certificate`, or a pytree of them as the criteria. `differentiate(…, certificate=True)` has it beside its
     own result. Raises `ValueError` as `differentiate`, for an integrator with unequal steps or fewer than eight of
@@ -126,6 +128,7 @@ def check_certifiable(integrator: AbstractIntegrator, num_steps: int | None, num
             f"`integrator` must be a scheme with equal steps, got {integrator!r}; certify the scheme that it lays or "
             "extrapolates, `integrator.scheme`."
         )
+    require_order(integrator.scheme)
     if num_steps is not None and num_steps < _LEAST_STEPS:
         raise ValueError(f"`num_steps` must be at least {_LEAST_STEPS} for an estimate, got {num_steps}.")
 
@@ -148,7 +151,11 @@ def _certified(criteria, motion, p, integrator: AbstractIntegrator) -> tuple[lis
     def improved(states, system, flat):
         trajectory = motion.trajectory(integrator, states, system)
         parameters = known.parameters._replace(system=system)
-        error = error_in_equal_steps(known.scheme, trajectory, parameters, known.linear)
+        defects = known.scheme.defects(system, parameters.grid, trajectory.states)
+        if defects is None:
+            finer = refined_run(known.scheme, trajectory)
+            return extrapolated(known.scheme, values_of(trajectory, flat), values_of(finer, flat))
+        error = error_by_defects(known.scheme, trajectory.states, parameters, defects, known.linear)
         return values_of(corrected(trajectory, error), flat)
 
     at = states, system, flat
@@ -168,7 +175,7 @@ def _certified(criteria, motion, p, integrator: AbstractIntegrator) -> tuple[lis
     duality = jnp.abs(along - jnp.sum(terms, axis=1)) / largest
     grown = lax.cummax(jnp.max(jnp.abs(delta.w) / system.coordinate_scale()[None], axis=1))
     growth = grown[-1] / jnp.max(jnp.abs(random))
-    margins = trajectory.stats.margin
+    margins = known.stats.margin
     margin = jnp.min(margins) / jnp.max(
         margins, where=jnp.isfinite(margins), initial=0.0
     )  # infinite: none was looked at

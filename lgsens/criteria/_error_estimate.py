@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lgsens._validate import is_concrete, require
-from lgsens.criteria._refined_run import refined_error
+from lgsens.criteria._refined_run import refined_error, require_order
 from lgsens.dynamics import State
 from lgsens.integrate import (
     AbstractIntegrator,
@@ -62,11 +62,7 @@ def error_estimate(trajectory: Trajectory, integrator: AbstractIntegrator = Gene
     if not isinstance(integrator, AbstractIntegrator):
         raise ValueError(f"`integrator` must be a GeneralizedAlpha or another integrator, got {integrator!r}.")
     integrator.scheme.require_steps()
-    if integrator.scheme.convergence_order is None:
-        raise ValueError(
-            f"`integrator`: {type(integrator.scheme).__name__} does not say its `convergence_order`, without which no "
-            "error can be told from two runs; give the class that property."
-        )
+    require_order(integrator.scheme)
     if num_steps < _LEAST_STEPS:
         raise ValueError(f"`error_estimate` needs at least {_LEAST_STEPS} steps, got {num_steps}.")
     valid = _is_by(integrator, trajectory)
@@ -104,17 +100,10 @@ def _estimated(integrator: AbstractIntegrator, trajectory: Trajectory) -> StateE
     if not integrator.equal_steps:
         return refined_error(scheme, trajectory)
     grid = EqualGrid(t[0], (t[-1] - t[0]) / (t.shape[0] - 1), t.shape[0] - 1)
-    return error_in_equal_steps(scheme, trajectory, Parameters(trajectory.system, grid))
-
-
-def error_in_equal_steps(
-    scheme: AbstractScheme, trajectory: Trajectory, parameters: Parameters, linear: LinearStep | None = None
-) -> StateError:
-    """By the defects of its steps, where the scheme says them; else by a second run."""
-    defects = scheme.defects(parameters.system, parameters.grid, trajectory.states)
+    defects = scheme.defects(trajectory.system, grid, trajectory.states)
     if defects is None:
         return refined_error(scheme, trajectory)
-    return error_by_defects(scheme, trajectory.states, parameters, defects, linear)
+    return error_by_defects(scheme, trajectory.states, Parameters(trajectory.system, grid), defects)
 
 
 def error_by_defects(

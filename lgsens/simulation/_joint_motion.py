@@ -70,8 +70,11 @@ class JointMotion(NamedTuple):
 
     @property
     def axial_force(self) -> Float[Array, " n"]:
-        """What the joint does to b along its axis [N]: the force of a `TranslationDriver`, or in a rod."""
-        return self.local_force[..., 0]
+        """What the joint does to b along its axis [N]: the force of a `TranslationDriver`; that of a `DistanceJoint`
+        along the rod as it is now, positive where it pushes b away from a."""
+        if "length" not in self.coordinates:
+            return self.local_force[..., 0]
+        return jnp.sum(self.local_force * self.position, -1) / jnp.linalg.norm(self.position, axis=-1)
 
     @property
     def axial_moment(self) -> Float[Array, " n"]:

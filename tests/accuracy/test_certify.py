@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import says
+from helpers import says, some_quick
 from oscillator import CRITERION, T1, P, build, exact
 
 import lgsens as lg
@@ -34,6 +34,20 @@ def test_errors_are_those_of_the_closed_form(oscillator):
     assert oscillator.duality < 1e-10  # round-off of a hundred steps
     assert abs(oscillator.newton) < 1e-10 * abs(value)
     assert not oscillator.warnings
+
+
+@pytest.mark.parametrize(
+    "integrator", some_quick([lg.IndexReducedODE(), lg.RadauIIA(), lg.GeneralizedAlpha(stabilized=True)])
+)
+def test_of_other_schemes(integrator):
+    """By a second run; to the next term again, O(ω²h²) with ωh = 0.45."""
+    found = certify(CRITERION, build, P, t1=T1, num_steps=10, integrator=integrator)
+    p = jax.tree.map(jnp.asarray, P)
+    value, gradient = jax.value_and_grad(exact)(p)
+    np.testing.assert_allclose(found.value_error, value - found.value, rtol=0.1)
+    for name in p:
+        np.testing.assert_allclose(found.gradient_error[name], gradient[name] - found.gradient[name], rtol=0.1)
+    assert found.duality < 1e-10 and not found.kinks
 
 
 def test_it_says_how_many_digits_and_what_to_do(oscillator):
