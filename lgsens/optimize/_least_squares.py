@@ -93,7 +93,8 @@ def least_squares(
     Sources: Nocedal & Wright 2006, §10.3; Kay, Fundamentals of Statistical Signal Processing I (1993), §3.
     """
     z0, design = variables(parametrization, x0)
-    flat_residual = _Residual(residual, design)
+    plain = _Residual(residual, design)
+    flat_residual = _ByMatrix(plain)
     count = jax.eval_shape(flat_residual, z0).shape[0]
     if count < z0.size:
         raise ValueError(
@@ -109,7 +110,7 @@ def least_squares(
             throw=False,
         )
     converged = found.result == optimistix.RESULTS.successful
-    return LeastSquaresResult(**_at(flat_residual, found.value), converged=converged, steps=found.stats["num_steps"])
+    return LeastSquaresResult(**_at(plain, found.value), converged=converged, steps=found.stats["num_steps"])
 
 
 class _Residual(eqx.Module):
@@ -120,6 +121,34 @@ class _Residual(eqx.Module):
 
     def __call__(self, z, _=None):
         return ravel_pytree(self.residual(self.design(z)))[0]
+
+
+class _ByMatrix(eqx.Module):
+    """The same, whose linearization at z is the matrix J, made once.
+
+    Of a function optimistix keeps what its tangents need, the motion and more, and takes products with it in several
+    places, of which each is compiled as a sweep of its own, transposed ones too: 13 s in place of 9 for a pendulum.
+    """
+
+    of: _Residual
+
+    def __call__(self, z, _=None):
+        return _by_matrix(eqx.filter_closure_convert(self.of, z), z)  # what it closes over has derivatives, too
+
+
+@eqx.filter_custom_jvp
+def _by_matrix(of: Callable[[Array], Array], z: Array) -> Array:
+    return of(z)
+
+
+@_by_matrix.def_jvp
+def _by_matrix_rule(primals, tangents):
+    (of, z), (d_of, dz) = primals, tangents
+    jacobian, left = jax.jacfwd(lambda z: (of(z),) * 2, has_aux=True)(z)
+    tangent = jnp.zeros_like(left) if dz is None else jacobian @ dz
+    if jax.tree.leaves(d_of):
+        tangent = tangent + eqx.filter_jvp(lambda of: of(z), (of,), (d_of,))[1]
+    return left, tangent
 
 
 @eqx.filter_jit

@@ -8,7 +8,8 @@ with r_C = C_t + M ad(v). In τ = t_f − t the sign of the damping turns, and g
 with a matrix that is neither the iteration matrix of eq. (30) nor its transpose.
 
 Final conditions. The boundary terms at t_f are b₁ δq̇ + b₂ δq with b₁ = F_M + G_C + μᵀM and
-b₂ = F_C + G_K + μᵀr_C − Ḟ_M − μ̇ᵀM, and δq, δq̇ are not free: B δq = −Φ_p δp and B δq̇ = −Ḃ δq − (Φ̇)_p δp. So b₁ = −η₁ᵀB
+b₂ = F_C + G_K + μᵀr_C − Ḟ_M − μ̇ᵀM, and δq, δq̇ are not free: B δq = −Φ_p δp and B δq̇ = −Ḃ δq − (Φ̇)_p δp, where of a
+constraint that depends on time Φ̇ = B v + Φ_t, and Ḃ its derivative along the motion, ∂B/∂t included. So b₁ = −η₁ᵀB
 and b₂ + η₁ᵀḂ = −η₂ᵀB is all that can be asked for, together with eq. (40) and its derivative:
 
     M μ + Bᵀη₁ = −(F_M + G_C)ᵀ                                 B μ = −F_λᵀ                       (42)
@@ -32,7 +33,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens._xla import scan
-from lgsens.dynamics import AbstractSystem, State, mass_scale
+from lgsens.dynamics import AbstractSystem, State, constraint_velocity, mass_scale
 from lgsens.integrate import GeneralizedAlpha, earlier, with_last
 from lgsens.sensitivity._criterion_terms import Functional, PathPoint, gradients, near
 from lgsens.sensitivity._linear_alpha import LinearMotion, LinearNode, advance, start
@@ -67,9 +68,10 @@ def constrained_solve(mass, jacobian, force, level):
     return x, inverse.T @ (force - mass @ x)
 
 
-def along(function, system: AbstractSystem, state: State):
-    """The derivative of function(q) along the motion."""
-    return jax.jvp(function, (state.q,), (system.group.to_ambient(state.q, state.v),))[1]
+def jacobian_rate(system: AbstractSystem, state: State, t) -> Float[Array, "m k"]:
+    """Ḃ along the motion."""
+    motion = system.group.to_ambient(state.q, state.v), jnp.ones_like(t)
+    return jax.jvp(system.constraint_jacobian, (state.q, t), motion)[1]
 
 
 def continuous_adjoint_sweep(
@@ -126,12 +128,11 @@ def _final_conditions(
     state, mass = point.state, system.mass_matrix()
     terminal = near(functional.final, p, system, state, point.t)
     g = gradients(lambda state: terminal(p, system, state, point.t), system.group, state)
-    jacobian_rate = along(lambda q: system.constraint_jacobian(q, point.t), system, state)
-    jacobian = node.constraint_jacobian
+    jacobian, b_rate = node.constraint_jacobian, jacobian_rate(system, state, point.t)
     mu, eta1 = constrained_solve(mass, jacobian, -(of.f_m + g.v).T, of.level.T)
     g_k = g.w + g.v @ system.group.ad(state.v)
-    force = (of.f_c + g_k - of.df_m).T + node.damping @ mu + jacobian_rate.T @ eta1
-    mu_rate, minus_eta2 = constrained_solve(mass, jacobian, force, -jacobian_rate @ mu - of.df_lam.T)
+    force = (of.f_c + g_k - of.df_m).T + node.damping @ mu + b_rate.T @ eta1
+    mu_rate, minus_eta2 = constrained_solve(mass, jacobian, force, -b_rate @ mu - of.df_lam.T)
     return Final(mu, mu_rate, eta1, -minus_eta2)
 
 
@@ -141,7 +142,7 @@ def final_cotangents(functional: Functional, p, system: AbstractSystem, point: P
     terminal = near(functional.final, p, system, state, point.t)
 
     def ends(system, p):
-        rate = system.constraint_jacobian(state.q, point.t) @ state.v
+        rate = constraint_velocity(system, state.q, state.v, point.t)
         return terminal(p, system, state, point.t), rate, system.constraint(state.q, point.t)
 
     values, pull_back = jax.vjp(ends, system, p)

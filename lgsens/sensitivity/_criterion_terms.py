@@ -26,7 +26,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens._xla import scan
-from lgsens.dynamics import AbstractSystem, State, accelerations, kkt_solve
+from lgsens.dynamics import AbstractSystem, State, accelerations, constraint_acceleration, kkt_solve
 from lgsens.integrate import GeneralizedAlpha, Variation
 from lgsens.sensitivity._linearization import cotangent_to_algebra
 
@@ -80,9 +80,9 @@ def gradients(function: Callable[[State], Float[Array, " c"]], group, state: Sta
 def near(function: Pointwise | OfState, p, system: AbstractSystem, state: State, t) -> Pointwise:
     """What stands for a function in first derivatives at a state.
 
-    For an F of v̇(q, v, t, p) and λ(q, v, t, p), with Γ = B v̇ + Ḃ v and [[M, Bᵀ], [B, 0]] [a; b] = [F_v̇ᵀ; F_λᵀ], that is
+    For an F of v̇(q, v, t, p) and λ(q, v, t, p), with Γ = Φ̈ and [[M, Bᵀ], [B, 0]] [a; b] = [F_v̇ᵀ; F_λᵀ], that is
 
-        F(q, v, v̇, λ, p) − aᵀ r(q, v, v̇, λ, t, p) − bᵀ Γ(q, v, v̇, p),      v̇, λ, a, b fixed:
+        F(q, v, v̇, λ, p) − aᵀ r(q, v, v̇, λ, t, p) − bᵀ Γ(q, v, v̇, t, p),      v̇, λ, a, b fixed:
 
     as r = 0 and Γ = 0 for every q, v and p, it has the value of F and its first derivatives. The solve of eq. (41)
     is not differentiated; a second derivative differentiates v̇, λ, a and b, which are computed here.
@@ -98,9 +98,7 @@ def near(function: Pointwise | OfState, p, system: AbstractSystem, state: State,
 
     def fixed(p, system, state, t):
         q, v = state.q, state.v
-        velocity = lambda q: system.constraint_jacobian(q, t) @ v
-        _, hidden = jax.jvp(velocity, (q,), (system.group.to_ambient(q, v),))
-        hidden = hidden + system.constraint_jacobian(q, t) @ vdot
+        hidden = constraint_acceleration(system, q, v, vdot, t)
         residual = system.residual(q, v, vdot, lam, t)
         return of(p, system, State(q, v, vdot, lam, vdot), t) - residual @ a - hidden @ b
 

@@ -20,7 +20,7 @@ b = (4 η_{n+1} − η_{n+2})/3 and s η_q = (M + s C_tᵀ) μ + F_v̇ᵀ + s F_
 
 At t_f, as in `_continuous_adjoint.py` with η₁, η₂ for what the constraints leave of the boundary terms,
 
-    M μ + Bᵀη₁ = −(F_v̇ + G_v)ᵀ, B μ = −F_λᵀ;     η_v = −G_vᵀ − Bᵀη₁,     η_q = −G_qᵀ − D_q(B v)ᵀη₁ − Bᵀη₂
+    M μ + Bᵀη₁ = −(F_v̇ + G_v)ᵀ, B μ = −F_λᵀ;     η_v = −G_vᵀ − Bᵀη₁,     η_q = −G_qᵀ − D_q(Φ̇)ᵀη₁ − Bᵀη₂
 
 and η₂ follows from the derivative of B μ = −F_λᵀ, the one place where Ḟ_v̇ and Ḟ_λ are needed. The cotangents of the
 initial state are −η_q and −η_v at t_0.
@@ -32,15 +32,15 @@ import jax
 import jax.numpy as jnp
 
 from lgsens._xla import scan
-from lgsens.dynamics import AbstractSystem, State, accelerations, mass_scale
+from lgsens.dynamics import AbstractSystem, State, accelerations, constraint_velocity, mass_scale
 from lgsens.integrate import with_last
 from lgsens.linear import Factors
 from lgsens.sensitivity._continuous_adjoint import (
     Cotangents,
     accumulated,
-    along,
     constrained_solve,
     final_cotangents,
+    jacobian_rate,
 )
 from lgsens.sensitivity._criterion_terms import Functional, PathPoint, gradients
 from lgsens.sensitivity._linearization import Parameters
@@ -97,9 +97,9 @@ def _final_conditions(functional: Functional, p, system: AbstractSystem, point: 
     eta_v = -g.v - jacobian.T @ eta1
 
     def constraint_force(state):
-        return jax.vmap(lambda eta: eta @ (system.constraint_jacobian(state.q, t) @ state.v), in_axes=1)(eta1)
+        return eta1.T @ constraint_velocity(system, state.q, state.v, t)
 
-    of_velocity = gradients(constraint_force, group, state).w.T  # D_q(B v)ᵀη₁
+    of_velocity = gradients(constraint_force, group, state).w.T  # D_q(Φ̇)ᵀη₁
 
     # d/dt (M μ + F_v̇) = F_v − η_q + C_tᵀμ and d/dt (B μ + F_λ) = 0 give μ̇ and η₂; the motion's own v̈ and λ̇
     # are those of eq. (41).
@@ -113,9 +113,8 @@ def _final_conditions(functional: Functional, p, system: AbstractSystem, point: 
     q_rate, v_rate, t_rate = direction
     at = (state.q, state.v, state.vdot, state.lam, t)
     df_m, df_lam = jax.jvp(partials, at, (q_rate, v_rate, vddot, lam_rate, t_rate))[1]
-    jacobian_rate = along(lambda q: system.constraint_jacobian(q, t), system, state)
     force = f.v + g.w + of_velocity + c_tT @ mu - df_m.T
-    _, minus_eta2 = constrained_solve(mass, jacobian, force, -jacobian_rate @ mu - df_lam.T)
+    _, minus_eta2 = constrained_solve(mass, jacobian, force, -jacobian_rate(system, state, t) @ mu - df_lam.T)
     eta2 = -minus_eta2
     return (-g.w - of_velocity - jacobian.T @ eta2, eta_v), mu, eta1, eta2
 

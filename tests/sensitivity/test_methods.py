@@ -138,3 +138,66 @@ def test_other_treatments_of_accelerations(treatment):
     coarse, fine = (error(found(lg.ContinuousAdjoint(treatment), n), wanted) for n in (500, 1000))
     assert np.all(fine <= 1e-3)  # (10 rad/s × 1e-3 s)² × 10
     assert np.all(np.log2(coarse / fine) >= 1.0 - 0.1)
+
+
+def shaken(f):
+    """A slider that a driver moves by 0.2 sin 2πft."""
+    value = lg.Harmonic(amplitude=0.2, frequency=f)
+    drive = lg.TranslationDriver(None, "b", at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0), value=value)
+    return lg.Model({"b": lg.RigidBody(2.0, None, free="x")}, {"drive": drive})
+
+
+SPEED_AND_FORCE = {
+    "speed": lg.Criterion(terminal=lambda s, p: s.body("b").velocity[0]),
+    "force": lg.Criterion(terminal=lambda s, p: s.multiplier("drive")[0]),
+    "effort": lg.Criterion(integrand=lambda s, p: s.multiplier("drive")[0] ** 2),
+}
+
+
+def test_by_the_signal_of_a_driver():
+    """Closed forms of ẋ, −m ẍ and ∫ m² ẍ²: Φ̇ has the part Φ_t, and Φ̈ its derivatives, which depend on f."""
+    f, t1, w = 1.5, 0.3, 2.0 * np.pi * 1.5
+    found = lg.differentiate(SPEED_AND_FORCE, shaken, f, t1=t1, num_steps=64, method=lg.ContinuousAdjoint()).gradient
+    phase, per_f = w * t1, 2.0 * np.pi
+    np.testing.assert_allclose(found["speed"], 0.2 * per_f * (np.cos(phase) - phase * np.sin(phase)), rtol=1e-10)
+    of_force = 2.0 * 0.2 * w * per_f * (2.0 * np.sin(phase) + phase * np.cos(phase))
+    np.testing.assert_allclose(found["force"], of_force, rtol=1e-10)  # a prescribed motion: nothing is integrated
+    # ∫ 0.16 w⁴ sin² wt dt = 0.16 (w⁴ t₁/2 − w³ sin(2wt₁)/4)
+    of_effort = 0.16 * per_f * (2 * w**3 * t1 - 0.75 * w**2 * np.sin(2 * phase) - 0.5 * w**3 * t1 * np.cos(2 * phase))
+    np.testing.assert_allclose(found["effort"], of_effort, rtol=1e-3)  # the trapezoidal rule, (wh)²/12 and more
+
+
+def screw(p):
+    """A body that falls in a screw whose pitch grows, on a spring."""
+    pitch = lg.Ramp(start=0.5, end=3.0, duration=1.0)
+    spring = {"at_a": (-1.0, 0.0, 0.0), "at_b": (0.0, 0.0, 0.0), "free_length": 1.0}
+    return lg.Model(
+        {"b": lg.RigidBody(p["m"], (0.1, 0.1, 0.1))},
+        {"s": lg.ScrewJoint(None, "b", at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0), pitch=pitch)},
+        {"g": lg.Gravity((9.81, 0.0, 0.0)), "spring": lg.SpringDamper(None, "b", stiffness=p["k"], **spring)},
+    )
+
+
+@pytest.mark.slow  # `test_by_the_signal_of_a_driver` is in the quick run
+@pytest.mark.parametrize("accelerations", ["state", "first_order"])
+def test_joints_that_change_with_time(accelerations):
+    """Ḃ has the part ∂B/∂t: the derivatives of the end's velocity come together at second order."""
+    criteria, p = {"speed": SPEED_AND_FORCE["speed"]}, {"m": 2.0, "k": 30.0}
+    apart = []
+    for num_steps in (100, 200):
+        run = lambda method, n=num_steps: lg.differentiate(criteria, screw, p, t1=0.5, num_steps=n, method=method)
+        one, other = run(lg.ContinuousAdjoint(accelerations)).gradient, run(lg.AdjointVariable()).gradient
+        apart.append([float(one["speed"][key] / other["speed"][key] - 1.0) for key in p])
+    np.testing.assert_allclose(apart[1], 0.0, atol=2e-3)
+    assert np.all(np.abs(apart[1]) < 0.35 * np.abs(apart[0]))
+
+
+@pytest.mark.slow  # as that of "state"
+@pytest.mark.parametrize("accelerations", ["derivatives", "first_order"])
+def test_by_the_signal_of_a_driver_otherwise(accelerations):
+    criteria = {name: SPEED_AND_FORCE[name] for name in ("speed", "effort")}
+    settings = {"t1": 0.3, "num_steps": 256}
+    found = lg.differentiate(criteria, shaken, 1.5, method=lg.ContinuousAdjoint(accelerations), **settings).gradient
+    exact = lg.differentiate(criteria, shaken, 1.5, method=lg.ContinuousAdjoint(), **settings).gradient
+    np.testing.assert_allclose(found["speed"], exact["speed"], rtol=1e-10)
+    np.testing.assert_allclose(found["effort"], exact["effort"], rtol=1e-3)  # second order, 2e-4 here
