@@ -56,6 +56,7 @@ def check_rates(axle, a, b, left):
     return test, rate
 
 
+@pytest.mark.slow  # `test_a_flat_leaf_is_a_beam_on_two_supports` is in the quick run
 def test_a_flat_spring_is_a_beam_on_two_supports(load):
     """And winds up by M L/12 E I under a moment in its middle."""
     axle = load(flat(leaves=3, full_length=3))

@@ -60,10 +60,15 @@ def test_it_says_how_many_digits_and_what_to_do(oscillator):
     assert strict._replace(tolerance=0.5).good
 
 
-def test_certificates_share_the_motion_and_need_no_memory(oscillator, compiled, monkeypatch):
-    """Another criterion compiles no motion; without room for the steps each sweep linearizes for itself."""
+def test_certificates_share_the_motion(oscillator, compiled):
+    """Another criterion compiles none."""
     names, _ = compiled(lambda: [certify(HEIGHT, build, P, t1=T1, num_steps=100)._asdict()])
     assert "_certified" in names and "known_motion" not in names
+
+
+@pytest.mark.slow  # all programs anew; `test_known_run.py` compares the sweeps in the quick run
+def test_certificates_need_no_memory(oscillator, monkeypatch):
+    """Without room for the steps each sweep linearizes for itself."""
     monkeypatch.setattr(tuned, "KEPT_NUMBERS", 0)
     jax.clear_caches()  # the limit is no argument
     plain = certify(CRITERION, build, P, t1=T1, num_steps=100)

@@ -148,6 +148,7 @@ def test_a_tolerance_inside_of_jit_is_refused():
         eqx.filter_jit(run)(jnp.asarray(P["k"]))
 
 
+@pytest.mark.slow  # the program of a run; what is refused without one is below
 def test_forces_that_depend_on_multipliers_are_refused():
     def rubbing(p):
         body = lg.RigidBody(p["m"], (0.1, 0.1, 0.1), position=(0.0, 0.0, 1.0))

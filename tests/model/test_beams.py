@@ -106,6 +106,7 @@ def cantilever(beam, force=(0.0, 0.0, 0.0), moment=(0.0, 0.0, 0.0)):
     return lg.Model(beam.bodies, {"clamp": clamp}, beam.forces | {"P": load}, merge_fixed=True)
 
 
+@pytest.mark.slow  # `test_a_beam_that_is_bent_by_three_radians_at_once` is in the quick run
 def test_bent_to_a_circle():
     """M = 2π EI/L closes a straight beam: tip at the clamp, with two elements as with many, no shear that locks."""
     bending, length = 86900.0, 10.0
