@@ -198,3 +198,17 @@ def test_the_same_residual_is_traced_once_whatever_the_start():
     second = least_squares(residual, {"c": 0.7, "k": 31.0, "m": 1.8})
     assert first.converged and second.converged
     assert count < len(traces) <= count + 1  # that of the number of residuals
+
+
+def test_the_answer_depends_on_what_the_residual_closes_over():
+    """By data, in both modes, against central differences: 1e-10 of their third derivatives, 1e-16/1e-5 of round-off.
+
+    Implicit derivatives are those at the end of the search, to its tolerance of 1e-5 and the curvature there.
+    """
+    t = jnp.linspace(0.0, 1.0, 20)
+    data = jnp.exp(-1.3 * t) + 0.01 * jnp.sin(40.0 * t)
+    fit = lambda data: least_squares(lambda x: jnp.exp(-x * t) - data, jnp.asarray(1.0)).x
+    moved = lambda e: (fit(data + 1e-5 * e) - fit(data - 1e-5 * e)) / 2e-5
+    expected = [moved(e) for e in jnp.eye(20)[1:4]]
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(fit)(data)[1:4], expected, rtol=1e-5)
