@@ -168,12 +168,13 @@ def _certified(criteria, motion, p, integrator: AbstractIntegrator) -> tuple[lis
 
     random = jax.random.normal(jax.random.key(0), flat.shape, flat.dtype)
     direction = random * jnp.where(flat == 0.0, 1.0, jnp.abs(flat))
-    delta, tangents = motion.along(direction)
+    tangents = motion.along(direction)
     along = jax.jvp(lambda *at: computed(*at)[0], at, tangents)[1]
     terms = gradient * direction[None]
     largest = jnp.maximum(jnp.max(jnp.abs(terms), axis=1), jnp.finfo(flat.dtype).tiny)
     duality = jnp.abs(along - jnp.sum(terms, axis=1)) / largest
-    grown = lax.cummax(jnp.max(jnp.abs(delta.w) / system.coordinate_scale()[None], axis=1))
+    w = jax.vmap(system.group.from_ambient)(states.q, tangents[0].q)
+    grown = lax.cummax(jnp.max(jnp.abs(w) / system.coordinate_scale()[None], axis=1))
     growth = grown[-1] / jnp.max(jnp.abs(random))
     margins = known.stats.margin
     margin = jnp.min(margins) / jnp.max(

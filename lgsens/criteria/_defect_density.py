@@ -15,6 +15,7 @@ Source: Becker & Rannacher, Acta Numerica 10 (2001), doi:10.1017/S09624929010000
 Hutchinson, Communications in Statistics 19 (1990) 433 (norms from random directions).
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -25,7 +26,7 @@ from jaxtyping import Array, Float
 
 from lgsens.criteria._criterion import Criterion
 from lgsens.criteria._error_estimate import corrected, error_by_defects
-from lgsens.criteria._known_motion import unpacked
+from lgsens.criteria._known_motion import known_motion, unpacked
 from lgsens.integrate import AbstractScheme
 from lgsens.simulation import Trajectory
 
@@ -34,14 +35,22 @@ _DIRECTIONS = 8
 
 @eqx.filter_jit
 def defect_densities(
-    criteria: tuple[Criterion, ...], motion: Any, p: Any, scheme: AbstractScheme
+    criteria: tuple[Criterion, ...],
+    build: Callable[[Any], Any],
+    start: Callable[[Any], Any] | None,
+    p: Any,
+    t0,
+    t1,
+    num_steps: int,
+    scheme: AbstractScheme,
 ) -> tuple[Float[Array, "c k n"], Trajectory]:
     """Rows of errors that add up over the n steps, relative to each of c criteria, and the run in equal steps.
 
-    The first of the k rows is η_n/|Ψ|; the squares of the others add up to that of dη_n/dp over |dΨ/dp|. `motion`: a
-    `known_motion` at p.
+    The first of the k rows is η_n/|Ψ|; the squares of the others add up to that of dη_n/dp over |dΨ/dp|.
     """
-    motion = unpacked(motion)
+    motion = unpacked(
+        known_motion(build, start, p, t0, t1, num_steps, scheme)
+    )  # of this program: what is refused is so
     known = motion.known
     flat, unravel = ravel_pytree(p)
 
@@ -73,7 +82,7 @@ def defect_densities(
     size = flat.shape[0]
     directions = jax.random.normal(jax.random.key(0), (size, min(size, _DIRECTIONS)), flat.dtype)
     along = jnp.sqrt(size / directions.shape[1]) * jnp.linalg.qr(directions)[0].T
-    d_eta, d_values = jax.vmap(lambda direction: derivative(*motion.along(direction)[1]))(along)
+    d_eta, d_values = jax.vmap(lambda direction: derivative(*motion.along(direction)))(along)
     norms = jnp.sqrt(jnp.sum(d_values**2, axis=0))
     relative = lambda rows, to: rows / jnp.where(to > 0.0, to, 1.0)
     of_values = relative(eta, jnp.abs(values)[:, None])[:, None]

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from lgsens.criteria._packed import Packed
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate import AbstractIntegrator, AbstractScheme, EqualGrid, Variation
-from lgsens.sensitivity import Given, KnownRun, Parameters, to_ambient
+from lgsens.sensitivity import Given, KnownRun, Parameters
 from lgsens.simulation import Begin, Trajectory, as_system, begin, run
 
 
@@ -33,13 +33,11 @@ class KnownMotion(NamedTuple):
         given = Given(states, self.known.stats)
         return run(system, self.begun, grid.t0, self.t1, grid.num_steps, integrator, given)[0]
 
-    def along(self, direction: Float[Array, " p"]) -> tuple[Variation, tuple[State, AbstractSystem, Array]]:
-        """δ along a direction of p by the direct differentiation method, and the tangents of (states, system, p)."""
-        (system, grid), states = self.known.parameters, self.known.states
+    def along(self, direction: Float[Array, " p"]) -> tuple[State, AbstractSystem, Array]:
+        """The tangents of (states, system, p) along a direction of p, by the direct differentiation method."""
         d_system, d_state0 = self.of_scene(direction)
-        delta = self.known.forwards(d_state0, Parameters(d_system, jax.tree.map(jnp.zeros_like, grid)))
-        d_states = jax.vmap(lambda state, delta: to_ambient(system.group, state, delta))(states, delta)
-        return delta, (d_states, d_system, direction)
+        still = jax.tree.map(jnp.zeros_like, self.known.parameters.grid)
+        return self.known.forwards(d_state0, Parameters(d_system, still)), d_system, direction
 
     def gradients(self, rows: Any, p: Float[Array, " p"]) -> tuple[Float[Array, "c p"], Variation]:
         """Derivatives by p of functions whose derivatives by (states, system, p) are these rows, by the adjoint

@@ -12,7 +12,6 @@ from lgsens._brief import brief
 from lgsens._validate import as_count, as_parameters, is_concrete
 from lgsens.criteria._criterion import Criterion
 from lgsens.criteria._defect_density import defect_densities
-from lgsens.criteria._known_motion import known_motion
 from lgsens.criteria._placed_steps import LONGEST, Placed, placed_steps
 from lgsens.dynamics import State
 from lgsens.integrate import AbstractScheme, GeneralizedAlpha, GivenSteps
@@ -113,8 +112,9 @@ def steps_for(
         )
     t0, t1 = interval(t0, t1)
     p, t0, t1 = jax.lax.stop_gradient((as_parameters(p), t0, t1))  # and below what `build` has from elsewhere
-    motion = known_motion(build, state0, p, t0, t1, pilot, integrator)
-    rows, trajectory = jax.lax.stop_gradient(defect_densities(tuple(leaves), motion, p, integrator))
+    rows, trajectory = jax.lax.stop_gradient(
+        defect_densities(tuple(leaves), build, state0, p, t0, t1, pilot, integrator)
+    )
     if is_concrete(rows, trajectory.result):
         raise_if_failed(trajectory)
         _check_resolved(rows, pilot)

@@ -8,7 +8,6 @@ keeps the factors: less work, and a shorter program.
 
 from typing import NamedTuple
 
-import jax
 from jax import lax
 
 from lgsens.dynamics import State
@@ -18,7 +17,7 @@ from lgsens.sensitivity._failed import Sound
 from lgsens.sensitivity._linearization import Parameters
 from lgsens.sensitivity._linearized_steps import LinearStep
 from lgsens.sensitivity._methods import AbstractSensitivity, DirectDifferentiation
-from lgsens.sensitivity._rules import back, from_start, linearized_trajectory
+from lgsens.sensitivity._rules import back, forth
 from lgsens.sensitivity._sweeps import linearized_steps
 
 
@@ -40,12 +39,9 @@ class KnownRun(NamedTuple):
         linear = linearized_steps(scheme, Sound.of(states, parameters.system).states, parameters)
         return cls(scheme, parameters, states, stats, lax.stop_gradient(linear))
 
-    def forwards(self, d_state0: State, d: Parameters) -> Variation:
-        """The direct differentiation method: δ of all states from the tangents of the first one and of parameters."""
-        sound = Sound.of(self.states, self.parameters.system)
-        state0 = jax.tree.map(lambda leaf: leaf[0], sound.states)
-        b = from_start(self.parameters, self.states, state0, d_state0)
-        return sound.lost(linearized_trajectory(self.scheme, sound.states, self.parameters, b, d, linear=self.linear))
+    def forwards(self, d_state0: State, d: Parameters) -> State:
+        """The direct differentiation method: the tangents of all states from those of the first and of parameters."""
+        return forth(self.scheme, self.states, self.parameters, (d_state0, d), linear=self.linear)
 
     def backwards(self, cotangents: State) -> tuple[Variation, State, Parameters]:
         """The adjoint variable method: μ and the cotangents of state0 and parameters, from those of all states."""

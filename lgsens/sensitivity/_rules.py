@@ -4,7 +4,6 @@ All are module-level functions of explicit arguments, and keep states only.
 """
 
 import dataclasses
-from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -69,14 +68,15 @@ def decoded_run(run: tuple[State, Stats]) -> tuple[State, Stats]:
 # Either both sweeps, or what takes all steps at once.
 
 
-def _with(linear: bool, function: Callable) -> Callable:
-    """A sweep as a function of the constants of its equations and of two unknowns."""
-    return lambda of, x: function(*(of[:3]), *x, *(of[3:] if linear else ()))
-
-
-SWEEPS = LinearEquations(_with(False, matvec), _with(True, direct_sweep), _with(True, adjoint_sweep))
+SWEEPS = LinearEquations(
+    lambda of, x: matvec(*of[:3], *x),
+    lambda of, b: direct_sweep(*of[:3], *b, linear=of[3]),
+    lambda of, c: adjoint_sweep(*of[:3], *c, linear=of[3]),
+)
 AT_ONCE = LinearEquations(
-    _with(False, partial(matvec, at_once=True)), _with(False, direct_at_once), _with(False, adjoint_at_once)
+    lambda of, x: matvec(*of[:3], *x, at_once=True),
+    lambda of, b: direct_at_once(*of[:3], *b),
+    lambda of, c: adjoint_at_once(*of[:3], *c),
 )
 
 
@@ -94,9 +94,21 @@ def linearized_trajectory(
     return linear_solve(equations, (scheme, states, parameters, linear), (b, d))[0]
 
 
-def from_start(parameters: Parameters, states: State, state0: State, d_state0: State) -> Variation:
-    """b = (δ_0, 0, …, 0)."""
-    return with_first(to_algebra(parameters.system.group, state0, d_state0), earlier(Variation.none(states)))
+def forth(
+    scheme: AbstractScheme,
+    found: State,
+    parameters: Parameters,
+    d: tuple[State, Parameters],
+    equations: LinearEquations = SWEEPS,
+    linear: LinearStep | None = None,
+) -> State:
+    """The tangents of all states of a run, from those of the initial state and of the parameters."""
+    group, sound = parameters.system.group, Sound.of(found, parameters.system)
+    states, (d_state0, d_parameters) = sound.states, d
+    first = to_algebra(group, jax.tree.map(lambda leaf: leaf[0], states), d_state0)
+    b = with_first(first, earlier(Variation.none(states)))
+    delta = linearized_trajectory(scheme, states, parameters, b, d_parameters, equations, linear)
+    return sound.lost(jax.vmap(partial(to_ambient, group))(states, delta))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -106,13 +118,10 @@ def direct_trajectory(equations, scheme, state0, parameters, found):
 
 @direct_trajectory.defjvp
 def _direct_rule(equations, primals, tangents):
-    scheme, state0, parameters, _ = primals
-    _, d_state0, d_parameters, _ = tangents
+    scheme, _, parameters, _ = primals
+    _, *d, _ = tangents
     states, stats = direct_trajectory(equations, *primals)
-    group, sound = parameters.system.group, Sound.of(states, parameters.system)
-    b = from_start(parameters, states, state0, d_state0)
-    delta = linearized_trajectory(scheme, sound.states, parameters, b, d_parameters, equations)
-    d_states = sound.lost(jax.vmap(partial(to_ambient, group))(sound.states, delta))
+    d_states = forth(scheme, states, parameters, tuple(d), equations)
     return (states, stats), (d_states, jax.tree.map(jnp.zeros_like, stats))
 
 

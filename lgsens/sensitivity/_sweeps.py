@@ -20,8 +20,9 @@ large operations that one step would cost; what remains in the sweep is one solv
 sweeps are gone through at the same states, the steps may be linearized once for all of them (`linearized_steps`).
 """
 
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,17 +35,29 @@ from lgsens.sensitivity._linearized_steps import LinearizedSteps, LinearStep
 from lgsens.sensitivity._step_blocks import StepBlocks
 
 
-def _blocks(scheme: AbstractScheme, parameters: Parameters) -> StepBlocks:
-    system, grid = parameters
-    return StepBlocks.of(grid.num_steps, scheme.numbers(system), grid.taken)
+class _Gone(NamedTuple):
+    """What a sweep goes through: the steps, those that fill the last block too, and what linearizes a block of them."""
+
+    equations: LinearizedSteps
+    blocks: StepBlocks
+    steps: Any
+    linearized: Callable[[Any], LinearStep]
+
+    @classmethod
+    def of(cls, scheme: AbstractScheme, states: State, parameters: Parameters, linear: LinearStep | None) -> "_Gone":
+        """`linear`: the steps, linearized, where they are known."""
+        system, grid = parameters
+        equations = LinearizedSteps.of(scheme, parameters)
+        blocks = StepBlocks.of(grid.num_steps, scheme.numbers(system), grid.taken)
+        if linear is not None:
+            return cls(equations, blocks, linear, lambda steps: steps)
+        return cls(equations, blocks, blocks.padded(steps(states, grid), repeat=True), jax.vmap(equations.linearized))
 
 
 def linearized_steps(scheme: AbstractScheme, states: State, parameters: Parameters) -> LinearStep:
     """The steps of a run with their matrices and factors, and those that fill its last block: what its sweeps share."""
-    equations, blocks = LinearizedSteps.of(scheme, parameters), _blocks(scheme, parameters)
-    block = lambda carry, step: (carry, jax.vmap(equations.linearized)(step))
-    every = blocks.padded(steps(states, parameters.grid), repeat=True)
-    return blocks.scan(block, (), every, filled=True)[1]
+    _, blocks, every, linearized = _Gone.of(scheme, states, parameters, None)
+    return blocks.scan(lambda _, steps: ((), linearized(steps)), (), every, filled=True)[1]
 
 
 def direct_sweep(
@@ -61,8 +74,7 @@ def direct_sweep(
     The steps after the last, which fill its block, are computed and dropped.
     """
     grid = parameters.grid
-    equations, blocks = LinearizedSteps.of(scheme, parameters), _blocks(scheme, parameters)
-    given = blocks.padded(steps(states, grid), repeat=True) if linear is None else linear
+    equations, blocks, every, linearized = _Gone.of(scheme, states, parameters, linear)
 
     def one(previous: Variation, inputs):
         (linear, loads), row = inputs
@@ -71,13 +83,13 @@ def direct_sweep(
 
     def block(previous: Variation, inputs):
         given, rows, d_place = inputs
-        steps = jax.vmap(equations.linearized)(given) if linear is None else given
+        steps = linearized(given)
         loads = jax.vmap(lambda step, d_place: equations.loads(step, d, d_place))(steps, d_place)
         return scan(one, previous, ((steps, loads), rows))
 
     first = jax.tree.map(lambda leaf: leaf[0], b)
     d_places = None if d is None else place_tangents(grid, d.grid)
-    end, rest = blocks.scan(block, first, (given, *blocks.padded((later(b), d_places), repeat=True)))
+    end, rest = blocks.scan(block, first, (every, *blocks.padded((later(b), d_places), repeat=True)))
     if grid.resizes and blocks.count is not None:  # empty steps, which hand on what they get
         handed_on = lambda end, b: end[None] + jnp.cumsum(b, axis=0)
         rest = blocks.beyond(jax.tree.map(handed_on, end, blocks.beyond(later(b))), rest)
@@ -97,8 +109,7 @@ def adjoint_sweep(
     c_p None: p is no unknown. `linear`: as in `direct_sweep`.
     """
     grid = parameters.grid
-    equations, blocks = LinearizedSteps.of(scheme, parameters), _blocks(scheme, parameters)
-    given = blocks.padded(steps(states, grid), repeat=True) if linear is None else linear
+    equations, blocks, every, linearized = _Gone.of(scheme, states, parameters, linear)
 
     def one(loads, c: Variation, inputs):
         linear, own = inputs
@@ -108,7 +119,7 @@ def adjoint_sweep(
     def block(carry, inputs):
         c, bar = carry
         given, own = inputs
-        steps = jax.vmap(equations.linearized)(given) if linear is None else given
+        steps = linearized(given)
         loads, pull_back = equations.pull_back(steps)
         c, found = scan(partial(one, loads), c, (steps, own), reverse=True)
         if c_p is None:
@@ -123,6 +134,6 @@ def adjoint_sweep(
     after = later(c)
     # The steps that fill the last block come first, with zero cotangents, and leave them zero.
     c = blocks.padded(c, repeat=False)
-    (first, bar), (rest, of_places) = blocks.scan(block, (blocks.last(c), c_p), (given, earlier(c)), reverse=True)
+    (first, bar), (rest, of_places) = blocks.scan(block, (blocks.last(c), c_p), (every, earlier(c)), reverse=True)
     rest = blocks.beyond(after, rest) if with_empty else rest
     return with_first(first, rest), None if c_p is None else with_places(grid, bar, of_places)

@@ -10,7 +10,6 @@ from oscillator import CRITERION, T1, P, V, build, exact
 
 import lgsens as lg
 from lgsens.criteria._defect_density import defect_densities
-from lgsens.criteria._known_motion import known_motion
 
 CENTRE, WIDTH = 0.3, 0.05
 EARLY = lg.Criterion(integrand=lambda s, p: window(s.t) * (s.body("mass").position[2] - 1.0) ** 2)
@@ -70,8 +69,7 @@ def test_densities_add_up_to_the_errors_of_a_certificate():
     """Signed: η_n by adjoint variables, and by the corrected run as a whole."""
     numbers = jax.tree.map(jnp.asarray, P)
     begin, end = jnp.zeros(()), jnp.asarray(T1)
-    motion = known_motion(build, None, numbers, begin, end, PILOT, lg.GeneralizedAlpha())
-    rows, _ = defect_densities((EARLY,), motion, numbers, lg.GeneralizedAlpha())
+    rows, _ = defect_densities((EARLY,), build, None, numbers, begin, end, PILOT, lg.GeneralizedAlpha())
     one = lg.certify(EARLY, build, P, t1=T1, num_steps=PILOT)
     of_value, of_gradient = one.relative
     assert np.sign(rows[0, 0].sum()) == np.sign(one.value_error)
@@ -150,7 +148,6 @@ def test_a_tolerance_inside_of_jit_is_refused():
         eqx.filter_jit(run)(jnp.asarray(P["k"]))
 
 
-@pytest.mark.slow  # the program of a run; what is refused without one is below
 def test_forces_that_depend_on_multipliers_are_refused():
     def rubbing(p):
         body = lg.RigidBody(p["m"], (0.1, 0.1, 0.1), position=(0.0, 0.0, 1.0))
