@@ -258,6 +258,36 @@ def test_out_of_reach():
     close(found.body("coupler").position[:first, :2], Linkage(angles[:first], a=0.7).coupler, 1000, scale=1.0)
 
 
+def test_a_singular_position_is_named():
+    """At ℓ = 1.5 m the bar stands upright above the cylinder: dφ/dℓ = 2ℓ/cos φ is infinite. With cos φ = 2e-4 it is
+    not, the force is still m g 2ℓ; cos φ comes from 1 − sin φ, round-off over 2e-8."""
+    near = np.sqrt(2.25 - 2e-8)
+    message = says("singular", "at position 2", "cylinder = 1.5", "another coordinate")
+    with pytest.raises(ValueError, match=message):
+        lg.kinematics(lifted(0.5), {"cylinder": [1.4, near, 1.5, 1.4]})
+    found = jax.jit(lambda lengths: lg.kinematics(lifted(0.5), {"cylinder": lengths}))([1.4, near, 1.5, 1.4])
+    assert found.result == lg.RESULTS.singular_configuration
+    with pytest.raises(lg.SimulationError, match="singular"):
+        lg.raise_if_failed(found)
+    found = lg.kinematics(lifted(0.5), {"cylinder": [1.4, near, 1.5, 1.4]}, throw=False)
+    np.testing.assert_array_equal(np.isfinite(found.multiplier("cylinder")[:, 0]), [True, True, False, False])
+    slope = -found.body("bar").angular_velocity[1, 1]
+    np.testing.assert_allclose(slope, 2 * near / np.sqrt(1 - (1 - 2e-8) ** 2), rtol=ULPS * 2.3e-16 / 2e-8)
+
+
+def test_a_reference_that_is_singular_is_named():
+    """Nothing says which way an upright bar falls when the cylinder becomes shorter."""
+    bar = lg.RigidBody(mass=3.0, inertia=(0.01, 1.0, 1.0), position=(0.0, 0.0, 1.0), free="x z ry")
+    joints = {
+        "hinge": lg.RevoluteJoint(None, "bar", at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0)),
+        "cylinder": lg.DistanceJoint(None, "bar", at_a=(0.0, 0.0, -0.5), at_b=(0.0, 0.0, 1.0)),
+    }
+    model = lg.Model({"bar": bar}, joints, redundant="minimum_norm")
+    for length in (1.4, 1.5):
+        with pytest.raises(ValueError, match=says("its reference", "at position 0", f"cylinder = {length}")):
+            lg.kinematics(model, {"cylinder": [length]})
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -86,7 +86,8 @@ def kinematics(
     Differentiable by every number of the model and by the driven values, by the implicit function theorem: one
     factorization per position for all of them. Raises `ValueError` for names that are not drivers, values of different
     lengths, joints that only constrain velocities, a mechanism with other degrees of freedom than the driven ones, and
-    positions that do not exist; inside `jit` the states are NaN and `result` says why. Source: Haug (1989), chapter 3.
+    positions that do not exist, or that are singular, so that the driven values do not determine the motion; inside
+    `jit` the states are NaN and `result` says why. Source: Haug (1989), chapter 3.
     """
     if not isinstance(model, Model):
         raise ValueError(f"`model` must be a Model, got {type(model).__name__}.")
@@ -133,7 +134,8 @@ def _kinematics_jit(drive: Drive, driven, rates):
     found = positions(drive, *driven)
     states = jax.vmap(lambda *args: forces_of_motion(drive, *args))(found.q, driven, rates)
     first = jnp.argmin(found.found)  # the first that was not found, 0 if all were
-    result = jnp.where(jnp.all(found.found), RESULTS.successful, RESULTS.position_failed)
+    failed = jnp.where(found.singular[first], RESULTS.singular_configuration, RESULTS.position_failed)
+    result = jnp.where(jnp.all(found.found), RESULTS.successful, failed)
     first, result = unless_jumped(drive.system, found.q, first, result)
     details = {"violation": found.violation[first], "values": driven[0][first], "time": driven[1][first]}
     details["position"] = first

@@ -74,8 +74,8 @@ _MESSAGES = {
     ),
     RESULTS.position_failed: (
         "No position satisfies the joints for these values of the driven ones: they are out of reach, or the mechanism "
-        "passes a dead centre, where the driven values do not determine it. Ask for values within reach, drive another "
-        "coordinate, or come there in smaller steps."
+        "passes a dead centre, where the driven values do not determine it, or begins in one, its reference. Ask for "
+        "values within reach, drive another coordinate, come there in smaller steps, or begin elsewhere."
     ),
     RESULTS.invalid_numbers: (
         "A number of the scene is not finite, or one that no body has (a mass that is not positive, an inertia whose "

@@ -62,6 +62,11 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
                 f"iterations: last increment {details['increment']:.3g}{asked}, residual {details['residual']:.3g}. "
                 "`throw=False` returns the data up to the step before."
             )
+        case RESULTS.singular_configuration if "position" in details:
+            more = f"It is in one at position {int(details['position'])}{_driven(details)}, {time}: the driven values "
+            more += (
+                "do not determine it, rates and forces are infinite. Drive another coordinate, or stay away from it."
+            )
         case RESULTS.singular_configuration:
             more = f"It does so about {place}, {time}. `throw=False` returns the data, which follow one branch."
         case RESULTS.turn_not_resolved:
@@ -112,7 +117,8 @@ def _exception(result: int, details: dict[str, Any], names: tuple[str, ...], not
         RESULTS.not_steady,
         RESULTS.not_held,
     )
-    kind = ValueError if result in bad_input else SimulationError
+    of_values = result == RESULTS.singular_configuration and "position" in details
+    kind = ValueError if result in bad_input or of_values else SimulationError
     return kind(f"{note} {_describe(result, details, names)}".strip())
 
 
@@ -197,7 +203,10 @@ def raise_if_failed(found: Any) -> Any:
             if system is not None
             else {}
         )
-    elif code in (RESULTS.newton_failed, RESULTS.integration_failed, RESULTS.singular_configuration):
+    elif (
+        code in (RESULTS.newton_failed, RESULTS.integration_failed, RESULTS.singular_configuration)
+        and stats is not None
+    ):
         details = _of_steps(code, t, stats)
     raise _exception(code, details, () if system is None else system.constraint_names, of_batch)
 
