@@ -133,9 +133,11 @@ def kinematics(
 def _kinematics_jit(drive: Drive, driven, rates):
     found = positions(drive, *driven)
     states = jax.vmap(lambda *args: forces_of_motion(drive, *args))(found.q, driven, rates)
-    first = jnp.argmin(found.found)  # the first that was not found, 0 if all were
+    sound = found.found & jnp.all(jnp.isfinite(jnp.hstack([states.v, states.vdot, states.lam])), axis=1)
+    first = jnp.argmin(sound)  # the first that was not found or has no rates, 0 if all have
     failed = jnp.where(found.singular[first], RESULTS.singular_configuration, RESULTS.position_failed)
-    result = jnp.where(jnp.all(found.found), RESULTS.successful, failed)
+    failed = jnp.where(found.found[first], RESULTS.invalid_numbers, failed)
+    result = jnp.where(jnp.all(sound), RESULTS.successful, failed)
     first, result = unless_jumped(drive.system, found.q, first, result)
     details = {"violation": found.violation[first], "values": driven[0][first], "time": driven[1][first]}
     details["position"] = first

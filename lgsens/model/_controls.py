@@ -18,7 +18,8 @@ from lgsens.model._elements import body_fixed
 from lgsens.model._forces import AbstractConnection, AbstractForce, Attached, _distance, _frame
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._loads import AbstractDynamicLoad, AbstractLoad, LineForce, SpringDamperLoad
-from lgsens.model._signals import Prescribed, at_time, prepared, prescribed_field
+from lgsens.model._signal_fields import prescribed_field
+from lgsens.model._signals import Prescribed, at_time, prepared
 from lgsens.model._stack import constraint_jacobian
 
 

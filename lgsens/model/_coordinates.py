@@ -19,7 +19,8 @@ from lgsens.model._frames import BODY_DIM, Frame
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._loads import AbstractClosedFormLoad, LoadTangents
 from lgsens.model._relative import Coordinate, but_for_turns
-from lgsens.model._signals import Prescribed, at_time, prepared, prescribed_field
+from lgsens.model._signal_fields import prescribed_field
+from lgsens.model._signals import Prescribed, at_time, prepared
 from lgsens.model._turning_loads import BallLoad
 from lgsens.model._turns import CountedTurns, acting, branch_of, force_along, require_half_a_turn, unless_whole
 

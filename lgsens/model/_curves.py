@@ -9,7 +9,8 @@ from lgsens._validate import number_field, point_field
 from lgsens.model._elements import body_fixed
 from lgsens.model._forces import AbstractConnection, _distance
 from lgsens.model._loads import AbstractClosedFormLoad, LineForce, SpringDamperLoad
-from lgsens.model._signals import AbstractSignal, Prescribed, prepared, prescribed_field
+from lgsens.model._signal_fields import prescribed_field
+from lgsens.model._signals import AbstractSignal, Prescribed, prepared
 
 
 class CurveLoad(AbstractClosedFormLoad):

@@ -10,7 +10,8 @@ from lgsens.model._elements import body_fixed
 from lgsens.model._frames import TURNING_A, TURNING_B, Frame, normals
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._relative import ANGLE, DISPLACEMENT, frames_along, frames_at
-from lgsens.model._signals import Prescribed, at_time, number_of, prepared, prescribed_field
+from lgsens.model._signal_fields import prescribed_field
+from lgsens.model._signals import Prescribed, at_time, number_of, prepared
 
 
 class Angle(AbstractConstraint):

@@ -22,7 +22,8 @@ from lgsens.model._loads import (
     Weight,
 )
 from lgsens.model._roads import FlatRoad
-from lgsens.model._signals import AbstractSignal, Constant, prepared, signal_field
+from lgsens.model._signal_fields import signal_field
+from lgsens.model._signals import AbstractSignal, Constant, prepared
 from lgsens.model._turning_loads import FixedMoment, FollowingForce, LoadSum
 
 

@@ -28,7 +28,8 @@ from lgsens.model._relative import (
     frames_along,
     frames_at,
 )
-from lgsens.model._signals import Prescribed, prepared, prescribed_field
+from lgsens.model._signal_fields import prescribed_field
+from lgsens.model._signals import Prescribed, prepared
 
 
 def _coincidence(a: Frame, b: Frame, at) -> Coincidence:

@@ -20,14 +20,8 @@ from lgsens.model._frames import Frame, normals
 from lgsens.model._free import TRANSLATIONS, single_rotation
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._relative import ANGLE, DISPLACEMENT, frames_at
-from lgsens.model._signals import (
-    AbstractSignal,
-    Prescribed,
-    at_time,
-    prepared,
-    prescribed_field,
-    require_ratio,
-)
+from lgsens.model._signal_fields import prescribed_field, require_ratio
+from lgsens.model._signals import AbstractSignal, Prescribed, at_time, prepared
 from lgsens.model._sliders import CylindricalJoint
 from lgsens.model._stack import constraint_force, constraint_jacobian, constraint_stiffness
 

@@ -13,7 +13,8 @@ from lgsens.model._elements import body_fixed
 from lgsens.model._frames import ROTATION, Frame, normals
 from lgsens.model._joints import AbstractJoint, _coincidence
 from lgsens.model._relative import ROTATION_VECTOR, but_for_turns, frames_at
-from lgsens.model._signals import AbstractSignal, Prescribed, at_time, prepared, prescribed_field, require_ratio
+from lgsens.model._signal_fields import prescribed_field, require_ratio
+from lgsens.model._signals import AbstractSignal, Prescribed, at_time, prepared
 from lgsens.model._turns import unless_whole
 
 

@@ -33,7 +33,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float, number_field, require, require_nonzero, shaped
+from lgsens._validate import as_float, number_field, require, shaped
 
 _KINDS = ("linear", "cubic", "monotone")
 
@@ -291,46 +291,3 @@ def number_of(value: Prescribed | None) -> Float[Array, ""] | None:
 def constant_of(signal: AbstractSignal) -> Float[Array, ""] | None:
     """The number of a signal that is one; None: of another."""
     return signal.value if isinstance(signal, Constant) else None
-
-
-def _no_signal(name: str, what: str, value: Any) -> ValueError:
-    return ValueError(
-        f"`{name}` must be {what} (Harmonic, Polynomial, Ramp, Sampled, or a subclass of AbstractSignal, whose numbers "
-        f"are leaves), got {value!r}."
-    )
-
-
-def require_ratio(what: str, name: str, value: Prescribed | None, advice: str) -> None:
-    """Raise `ValueError` for the ratio of a transmission that is missing, or a number and zero."""
-    if value is None:
-        raise ValueError(f"{what}: `{name}` is missing; give a number, or a signal.")
-    if not isinstance(value, AbstractSignal):
-        require_nonzero(what, name, value, advice)
-
-
-def signal_field(name: str, **default: Any) -> Any:
-    """A keyword-only signal of an element."""
-
-    def convert(value: Any) -> AbstractSignal:
-        if not isinstance(value, AbstractSignal):
-            raise _no_signal(name, "a signal", value)
-        return value
-
-    return eqx.field(converter=convert, kw_only=True, **default)
-
-
-def prescribed_field(name: str, *, positional: bool = False, driven: bool = False) -> Any:
-    """A scalar leaf or signal of an element, None by default, keyword-only unless `positional`; `driven`: of which
-    positions follow, and so velocities and accelerations its derivatives."""
-
-    def convert(value: Any) -> Prescribed | None:
-        if driven and isinstance(value, AbstractSignal) and value.straight:
-            raise ValueError(
-                f"`{name}` follows straight lines between samples: at each the velocity would jump, and no force is "
-                'large enough for that. Give Sampled(…, kind="cubic"), or "monotone".'
-            )
-        if callable(value) and not isinstance(value, AbstractSignal):
-            raise _no_signal(name, "a number or a signal", value)
-        return value if value is None or isinstance(value, AbstractSignal) else as_float(value, (), f"`{name}`")
-
-    return eqx.field(converter=convert, kw_only=not positional, default=None, metadata={"prescribed": True})

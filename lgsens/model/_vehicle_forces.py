@@ -19,7 +19,8 @@ from lgsens.model._contacts import PlaneContactLoad
 from lgsens.model._curves import CurveLoad
 from lgsens.model._forces import AbstractConnection, AbstractForce, Attached, _distance
 from lgsens.model._frames import normals
-from lgsens.model._signals import AbstractSignal, Prescribed, prepared, prescribed_field
+from lgsens.model._signal_fields import prescribed_field
+from lgsens.model._signals import AbstractSignal, Prescribed, prepared
 from lgsens.model._turning_loads import DragLoad, TorsionLoad
 from lgsens.model._turns import CountedTurns, require_half_a_turn
 

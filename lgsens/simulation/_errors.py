@@ -55,6 +55,8 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
             more = worst
         case RESULTS.invalid_numbers if "numbers" in details:
             more = f"Found: {'; '.join(details['numbers'])}."
+        case RESULTS.invalid_numbers if "position" in details:
+            more = f"It is so at position {int(details['position'])}{_driven(details)}, {time}."
         case RESULTS.newton_failed:
             asked = f" (tolerance {details['tolerance']:.3g})" if "tolerance" in details else ""
             more = (

@@ -1,7 +1,10 @@
 """Constraints with time: their rates along a given motion, the state that drivers start from, driven motions."""
 
+import math
 import re
+from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -171,6 +174,44 @@ def test_equilibrium_holds_a_driver_at_t0():
     # in the middle of a ramp the rate is 1.875/2, the curvature zero; λ is that of rest
     np.testing.assert_allclose(state.v, [0.0, 0.0, -0.9375, 0.0, 0.0, 0.0], rtol=0, atol=1e-8)
     np.testing.assert_allclose(state.vdot, 0.0, rtol=0, atol=1e-8)
+
+
+class Own(lg.AbstractSignal):
+    value: jax.Array
+    of: Callable = eqx.field(static=True)
+
+    def __call__(self, t):
+        return self.of(self.value, t)
+
+
+def motor(of):
+    return lg.RotationDriver(None, "crank", axis=(0.0, 0.0, 1.0), value=Own(jnp.asarray(0.2), of))
+
+
+@pytest.mark.parametrize(
+    ("of", "message"),
+    [
+        (lambda x, t: x if t < 0.5 else 2.0 * x, says("`value`", "Own", "jnp.where")),
+        (lambda x, t: x * math.sin(t), says("`value`", "Own", "jax.numpy")),
+        (lambda x, t: x * np.asarray(t), says("`value`", "Own", "jax.numpy")),
+        (lambda x, t: x * jnp.ones(1) * t, says("`value`", "Own", "(1,)")),
+    ],
+)
+def test_signals_of_ones_own_that_cannot_be_compiled(of, message):
+    with pytest.raises(ValueError, match=message):
+        motor(of)
+
+
+def test_a_signal_without_a_finite_rate_is_no_success():
+    """√t at 0, at the second position."""
+    crank = lg.RigidBody(mass=1.0, inertia=(0.1, 0.1, 0.1), free="rz")
+    model = lg.Model({"crank": crank}, {"motor": motor(lambda x, t: jnp.sqrt(jnp.abs(t)))})
+    with pytest.raises(ValueError, match=says("a signal has no finite rate", "position 1", "t = 0 s")):
+        lg.kinematics(model, t=[0.1, 0.0, 0.2])
+    found = lg.kinematics(model, t=[0.1, 0.0, 0.2], throw=False)
+    assert found.result == lg.RESULTS.invalid_numbers
+    with pytest.raises(ValueError, match="a signal has no finite rate"):
+        lg.initial_state(model)
 
 
 def test_bad_input():
