@@ -297,6 +297,7 @@ def test_a_reference_that_is_singular_is_named():
         ({"driven": {"motor": []}}, says("`driven` must hold vectors of one length", "(0,)")),
         ({"rates": {"moter": 1.0}}, says("'moter' is not one of ['motor']")),
         ({"rates": {"motor": [1.0, 2.0, 3.0]}}, says("`rates` must have shape () or (1,)", "(3,)")),
+        ({"t": [0.0]}, says("`rates`: with `t`", "['motor']", "rates={}")),
         ({"model": 3.0}, says("`model` must be a Model, got float")),
     ],
 )

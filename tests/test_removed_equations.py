@@ -225,3 +225,33 @@ def test_kinematics_takes_it():
     )
     for what in (lambda k: k.body("rocker").acceleration, lambda k: k.multiplier("motor")):
         np.testing.assert_allclose(what(found), what(expected), rtol=1e-11, atol=1e-11)  # round-off
+
+
+def engine(phase, **options):
+    """A slider-crank in space, as many equations as coordinates: on a ball at the crank, so that in the dead centre rod
+    and piston turn freely about the bore."""
+    pin = 0.04 * np.array([-np.sin(phase), np.cos(phase), 0.0])
+    wrist = np.array([0.0, pin[1] + np.sqrt(0.13**2 - pin[0] ** 2), 0.0])
+    bodies = {
+        "crank": lg.RigidBody(5.0, (0.02,) * 3),
+        "rod": lg.RigidBody(0.5, (3e-3,) * 3, position=(pin + wrist) / 2),
+        "piston": lg.RigidBody(0.4, (1e-3,) * 3, position=wrist),
+    }
+    joints = {
+        "main": lg.RevoluteJoint(None, "crank", at=(0.0, 0.0, 0.0), axis=Z),
+        "big": lg.SphericalJoint("crank", "rod", at=pin),
+        "small": lg.RevoluteJoint("rod", "piston", at=wrist, axis=Z),
+        "bore": lg.CylindricalJoint(None, "piston", at=wrist, axis=(0.0, 1.0, 0.0)),
+    }
+    motor = {"motor": lg.RotationDriver(None, "crank", axis=Z, **options)} if options else {}
+    return lg.Model(bodies, joints | motor)
+
+
+@pytest.mark.parametrize("options", [{}, {"value": 0.0}, {"value": lg.Polynomial((0.0, 30.0))}])
+def test_nothing_is_left_out_in_a_dead_centre(options):
+    """Its rank is one less there, with and without what holds the crank there, and nowhere else."""
+    model = engine(0.0, **options)
+    rank, beside = lg.constraint_rank(model), lg.constraint_rank(engine(0.3, **options))
+    assert rank.singular and not beside.singular
+    assert rank.rank == beside.rank == 17 + bool(options) and rank.joints == beside.joints == ()
+    assert dataclasses.replace(model, redundant="remove").removed == ()

@@ -75,7 +75,7 @@ def kinematics(
             that cannot be mistaken for another way to assemble the mechanism. None or {}: signals drive it.
         rates: rates of the driven values [m/s], [rad/s], shape () or (n,), by name; those left out are 0. None: 1 for
             all of them. With the one rate 1, velocities are derivatives by the driven value (a motion ratio); with 0,
-            forces are those at rest.
+            forces are those at rest. Beside `t` they must be given: what their rates by time are, values do not tell.
         t: times [s], shape (n,): signals run, and velocities and accelerations are the derivatives of the motion by
             time. None: signals are held at t0.
         t0: the time at which signals and time-dependent forces are taken where `t` is None [s], shape ().
@@ -103,6 +103,11 @@ def kinematics(
     columns("driven", rates or {}, where, "the drivers and distance joints of the model")
     names, times = list(values), {} if t is None else {"t": as_float(t, None, "`t`")}
     shape = of_one_length(times | values, ", and `t` be one")
+    if driven and t is not None and rates is None:
+        raise ValueError(
+            f"`rates`: with `t` velocities are those by time, and those of the driven values {sorted(driven)} are not "
+            "known: give them, rates={} for values that are held; or give the drivers a signal (Polynomial, Sampled)."
+        )
     given, speed = (table(rows, shape, start.dtype) for rows in (values.values(), speeds(names, rates, shape)))
     system = with_numbers(model, start, names).system()
     refuse_history(system)

@@ -2,9 +2,11 @@
 
 import dataclasses
 
+import numpy as np
+
 from lgsens._validate import as_float, is_concrete
 from lgsens.dynamics import AbstractSystem, rank_near_reference, redundant_names
-from lgsens.model import Model, scene_of
+from lgsens.model import Model, driven_equations, scene_of
 from lgsens.simulation import as_system
 
 
@@ -69,8 +71,8 @@ def constraint_rank(model: Model | AbstractSystem, *, t0=0.0) -> ConstraintRank:
         t0: the time at which drivers are taken [s].
 
     The rank is the largest found in the reference configuration and in four that the mechanism reaches by moving from
-    it by 0.01 rad or lengths of the scene: in a singular reference configuration alone it would be too small, and
-    equations would seem redundant that are not.
+    it by 0.01 rad or lengths of the scene, drivers let go: in a singular reference configuration alone it would be too
+    small, and equations would seem redundant that are not.
 
     Raises `ValueError` for numbers that are traced.
     """
@@ -83,8 +85,8 @@ def constraint_rank(model: Model | AbstractSystem, *, t0=0.0) -> ConstraintRank:
     scene = scene_of(system)
     if scene is not None:
         system = dataclasses.replace(scene, minimum_norm=True)  # which can be assembled whatever its rank
-    t = as_float(t0, (), "`t0`")
-    found = rank_near_reference(system, t)
+    none = np.zeros(len(system.constraint_names), bool)
+    found = rank_near_reference(system, as_float(t0, (), "`t0`"), none if scene is None else driven_equations(scene))
     m, k = found.jacobian.shape
     names = tuple(redundant_names(found.jacobian, system.constraint_names))
     return ConstraintRank(k - system.num_states, m, found.near, found.reference, names)

@@ -26,14 +26,18 @@ class Rank(NamedTuple):
     jacobian: Float[np.ndarray, "m k"]
 
 
-def rank_near_reference(system: AbstractSystem, t: Float[Array, ""]) -> Rank:
+def rank_near_reference(system: AbstractSystem, t: Float[Array, ""], driven: Bool[np.ndarray, " m"]) -> Rank:
     """The rank in the reference configuration and in others that the mechanism reaches by moving from it a little: in a
-    singular reference alone it would be too small. Numbers are known, and constraints may be redundant."""
+    singular reference alone it would be too small. Numbers are known, and constraints may be redundant.
+
+    driven: equations that need not hold there, as they will not a little later: those of drivers. A crank that is held
+    in its dead centre would be in one wherever the rest can move.
+    """
     q, _ = _assembled(system, t)
     at = best = _Place(q, _evaluated(system, q, t)[1])
     reference = rank = left_null_space(at.jacobian)[1]
     for direction in np.random.default_rng(0).normal(size=(_DIRECTIONS, at.jacobian.shape[1])):
-        there, _ = _moved(system, at, t, direction, _DISTANCE)
+        there, _ = _moved(system, at, t, direction, _DISTANCE, driven)
         if there is not None and (own := left_null_space(there.jacobian)[1]) > rank:
             best, rank = there, own
     return Rank(reference, rank, *best)
@@ -42,8 +46,7 @@ def rank_near_reference(system: AbstractSystem, t: Float[Array, ""]) -> Rank:
 def jacobians_on_the_way(
     system: AbstractSystem, found: Rank, t: Float[Array, ""], driven: Bool[np.ndarray, " m"]
 ) -> list[Float[np.ndarray, "m k"]]:
-    """J in configurations that the mechanism reaches, where it has the rank that was found; `driven`: equations that
-    need not hold there."""
+    """J in configurations that the mechanism reaches, where it has the rank that was found; `driven` as above."""
     every, k = [found.jacobian], found.jacobian.shape[1]
     for way in np.random.default_rng(1).normal(size=(_WAYS, k)):
         for direction in (way, -way):
@@ -100,27 +103,28 @@ class _Place(NamedTuple):
     jacobian: Float[np.ndarray, "m k"]
 
 
-def _moved(system: AbstractSystem, place: _Place, t, direction, distance: float, driven=None):
+def _moved(system: AbstractSystem, place: _Place, t, direction, distance: float, driven):
     """The place at a distance from another one along a direction, None if there is none; and the direction there.
     `driven`: equations that need not hold."""
-    (q, jacobian), scale = place, np.asarray(system.coordinate_scale())
-    held = np.ones(len(jacobian), bool) if driven is None else ~driven
+    (q, jacobian), scale, held = place, np.asarray(system.coordinate_scale()), ~driven
     # the part of the direction that the constraints allow, in comparable coordinates
     rows = jacobian[held] * scale
     x = direction - np.linalg.lstsq(rows, rows @ direction, rcond=None)[0]
     size = np.abs(x).max(initial=0.0)
     if size < 1e-6:  # no freedom
         return None, x
-    q = _retracted(system, q, distance * scale * x / size)
-    tolerance = float(system.constraint_round_off())
-    for _ in range(_ITERATIONS):
-        violation, jacobian = _evaluated(system, q, t)
-        own = np.flatnonzero(held[: len(violation)])
-        if np.abs(violation[own]).max(initial=0.0) <= tolerance:
-            return _Place(q, jacobian), x
-        # singular values that the distance does not explain belong to redundant equations
-        step = np.linalg.lstsq(jacobian[own] * scale, violation[own], rcond=1e-2 * distance)[0]
-        q = _retracted(system, q, -scale * step)
+    begun, tolerance = _retracted(system, q, distance * scale * x / size), float(system.constraint_round_off())
+    # Singular values that the distance does not explain belong to redundant equations. Those of a branch that begins in
+    # a singular reference, to which a direction between two of them leads, may be as small.
+    for least in (1e-2 * distance, 1e-4 * distance):
+        q = begun
+        for _ in range(_ITERATIONS):
+            violation, jacobian = _evaluated(system, q, t)
+            own = np.flatnonzero(held[: len(violation)])
+            if np.abs(violation[own]).max(initial=0.0) <= tolerance:
+                return _Place(q, jacobian), x
+            step = np.linalg.lstsq(jacobian[own] * scale, violation[own], rcond=least)[0]
+            q = _retracted(system, q, -scale * step)
     return None, x
 
 

@@ -94,6 +94,7 @@ from lgsens.model._relative import (
     continued as continued,
     relative_motion as relative_motion,
 )
+from lgsens.model._repeated_rows import driven_equations as driven_equations
 from lgsens.model._roads import (
     ISO_8608 as ISO_8608,
     BumpRoad as BumpRoad,

@@ -155,7 +155,7 @@ class Model(eqx.Module):
         if self._groups is not None and all(group.name is None for group in self._groups):
             raise ValueError("Model: fixed joints hold all bodies on the ground; let at least one of them move.")
         if redundant == "remove":
-            self.redundant = repeated_equations(self.system(), self.joints)
+            self.redundant = repeated_equations(self.system())
 
     @property
     def removed(self) -> Equations:

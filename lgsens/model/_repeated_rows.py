@@ -7,11 +7,12 @@ repeats others, they determine already what it prescribes.
 """
 
 import dataclasses
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 
 from lgsens._validate import is_concrete
 from lgsens.dynamics import jacobians_on_the_way, rank_near_reference, redundant_names, repeated_rows
@@ -41,7 +42,13 @@ def as_redundant(given: Any, joints: Collection[str]) -> str | Equations:
     return given
 
 
-def repeated_equations(system: MultibodySystem, joints: Mapping[str, AbstractJoint]) -> Equations:
+def driven_equations(system: MultibodySystem) -> Bool[np.ndarray, " m"]:
+    """Which equations prescribe a motion: of drivers, and where there is a signal of time."""
+    prescribing = {name for name, joint in system.joints.items() if _prescribes(joint)}
+    return np.array([name in prescribing for name in system.constraint_names], bool)
+
+
+def repeated_equations(system: MultibodySystem) -> Equations:
     """The equations of a scene that follow from the others near the reference, at t = 0.
 
     Raises `ValueError` where what drives is among those that repeat each other, and for traced numbers.
@@ -52,17 +59,16 @@ def repeated_equations(system: MultibodySystem, joints: Mapping[str, AbstractJoi
             "grad). Build the model once where they are known, and give redundant=model.removed here."
         )
     scene, t = dataclasses.replace(system, minimum_norm=True), jnp.zeros((), system.mass.dtype)
-    found = rank_near_reference(scene, t)
+    driven = driven_equations(scene)
+    found = rank_near_reference(scene, t, driven)
     if found.near == len(found.jacobian):
         return ()
     equations: dict[int, tuple[str, int, int]] = {}
-    driven = np.zeros(len(found.jacobian), bool)
     for stack, rows in zip(system.constraints, system.topology.rows):
         for owner, place, own in zip(stack.owners, stack.places, rows):
-            driven[own[own >= 0]] = _prescribes(joints[owner])
             equations |= {int(row): (owner, place, i) for i, row in enumerate(own) if row >= 0}
     repeating = redundant_names(found.jacobian, system.constraint_names)
-    if conflicts := [name for name in repeating if _prescribes(joints[name])]:
+    if conflicts := [name for name in repeating if _prescribes(system.joints[name])]:
         raise ValueError(
             f"Model: redundant='remove': {conflicts} prescribe what the other joints determine already; leave one out "
             f"of {repeating}."

@@ -122,7 +122,7 @@ def film(motion: Trajectory | Kinematics, speed: float, max_frames: int, colour_
         )
     if int(motion.result) != 0:
         raise ValueError("`motion` failed (its `result` is not 0), so it has no positions to draw from some frame on.")
-    if isinstance(motion, Kinematics):
+    if isinstance(motion, Kinematics) and motion.values:
         (label, values), *_ = motion.values.items()
         values = np.asarray(values)
         clock = np.linspace(0.0, SWEEP, len(values)) / speed

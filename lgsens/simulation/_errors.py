@@ -53,6 +53,9 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
     match code:
         case RESULTS.assembly_failed | RESULTS.off_joints:
             more = worst
+        case RESULTS.equilibrium_failed if np.any(np.isfinite(details.get("moved", np.nan))):
+            far = int(np.nanargmax(details["moved"]))
+            more = f"The search went farthest with body {str(details['bodies'][far])!r}, {details['moved'][far]:.3g} m."
         case RESULTS.invalid_numbers if "numbers" in details:
             more = f"Found: {'; '.join(details['numbers'])}."
         case RESULTS.invalid_numbers if "position" in details:

@@ -25,7 +25,7 @@ from lgsens.dynamics import (
 )
 from lgsens.integrate import AbstractScheme, Start
 from lgsens.linear import Matrix
-from lgsens.model import Model
+from lgsens.model import Model, MultibodySystem
 from lgsens.simulation._errors import primal_value, throw_if_failed
 
 
@@ -91,6 +91,9 @@ def _found_state(find: Callable[..., Initial], model: Model | AbstractSystem, t0
     if not throw or (is_concrete(initial.result) and int(initial.result) == RESULTS.successful):
         return initial.state
     details = {"violation": initial.violation, "jacobian": full_jacobian(system, initial.state.q, t0)}
+    if isinstance(system, MultibodySystem) and is_concrete(initial):
+        details["moved"] = jnp.linalg.norm(initial.state.q.position - system.reference()[0].position, axis=1)
+        details["bodies"] = system.body_names
     return throw_if_failed(initial.state, initial.result, details, system.constraint_names)
 
 

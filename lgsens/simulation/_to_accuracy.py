@@ -41,6 +41,7 @@ from lgsens.simulation._trajectory import Trajectory
 
 _FEWEST = 64
 _MOST = 2**17  # what a trajectory of a car keeps of them is 0.2 GB
+_MOST_SINGLE = 2**13  # in single precision: changes of a pendulum do not fall any more from 2048 steps on
 _CLEAR = (0.7, 1.5)  # of 2^p
 _SAFETY = 2.0  # of what the order of extrapolated runs says
 _LEAST = 1.4  # below that runs do not converge
@@ -68,7 +69,8 @@ def to_accuracy(
     Raises `SimulationError` if it is not reached.
     """
     n, results, tried = fewest or _FEWEST, [], []
-    most = max(_MOST, 8 * n)
+    single = jnp.result_type(float) == jnp.float32
+    most = max(_MOST_SINGLE if single else _MOST, 8 * n)
     while n <= most:
         found = run(n, n > most // 8 and not tried)  # a scene that fails in any number of steps says why
         if int(found.result) == RESULTS.successful:
@@ -85,8 +87,9 @@ def to_accuracy(
     last = ", ".join(f"{n}: {distance:.2e}" for n, distance in tried[-4:])
     raise SimulationError(
         f"`accuracy` = {accuracy:g} is not reached in {tried[-1][0]} steps. Steps and change from the run before: "
-        f"{last}. Changes that do not fall are those of a chaotic motion, of forces that jump, or of round-off: ask "
-        "for less, shorten the run, or see `lgsens.certify`."
+        f"{last}. Changes that do not fall are those of a chaotic motion, of forces that jump, or of round-off"
+        + (" (this is single precision; set `jax_enable_x64`)" if single else "")
+        + ": ask for less, shorten the run, or see `lgsens.certify`."
     )
 
 

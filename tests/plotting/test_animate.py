@@ -163,6 +163,14 @@ def test_a_driven_angle_has_its_unit(tmp_path):
     assert (data["label"], data["unit"], data["values"]) == ("motor", "rad", [0.0, 0.25])
 
 
+def test_a_mechanism_driven_by_signals_moves_in_time(tmp_path):
+    crank = lg.RigidBody(mass=1.0, inertia=(0.1, 0.1, 0.1), free="rz")
+    motor = lg.RotationDriver(None, "crank", axis=(0.0, 0.0, 1.0), value=lg.Polynomial((0.0, 2.0)))
+    motion = lg.kinematics(lg.Model({"crank": crank}, {"motor": motor}), t=[0.0, 0.25])
+    data = Page(plotting.animate(motion, tmp_path / "a.html")).data
+    assert (data["label"], data["unit"], data["values"]) == ("t", "s", [0.0, 0.25])
+
+
 def test_the_road_is_under_the_wheel(car, tmp_path):
     data = Page(plotting.animate(car, tmp_path / "a.html")).data
     (tyre,) = data["tyres"]
