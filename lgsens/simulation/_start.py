@@ -90,7 +90,8 @@ def _found_state(find: Callable[..., Initial], model: Model | AbstractSystem, t0
     initial = find(system, t0)
     if not throw or (is_concrete(initial.result) and int(initial.result) == RESULTS.successful):
         return initial.state
-    details = {"violation": initial.violation, "jacobian": full_jacobian(system, initial.state.q, t0)}
+    details: dict[str, Any] = {"violation": initial.violation}
+    details["jacobian"] = full_jacobian(system, initial.state.q, t0)
     if isinstance(system, MultibodySystem) and is_concrete(initial):
         details["moved"] = jnp.linalg.norm(initial.state.q.position - system.reference()[0].position, axis=1)
         details["bodies"] = system.body_names
