@@ -8,9 +8,9 @@ import pytest
 import lgsens as lg
 from lgsens.accuracy import Reference, Setting
 from lgsens.accuracy._table import Row
-from lgsens.analysis import Growth
+from lgsens.analysis import Growth, ModeShape
 from lgsens.integrate import Stats
-from lgsens.model import Summary
+from lgsens.model import LineForce, SlidingFriction, Summary
 from lgsens.optimize import GradientCheck, LeastSquaresResult, MultiStartResult, OptimizationResult
 from lgsens.optimize._minimize import History
 
@@ -55,6 +55,9 @@ RESULTS = {
     "linearization": lambda: lg.Linearization(
         *[WIDE] * 7, MANY * 1j, WIDE, MANY > 0, None, jnp.asarray(0.5), jnp.asarray(0), None, ("push",), tuple(TREE)
     ),
+    "force": lambda: LineForce(MANY, MANY, MANY),
+    "friction": lambda: SlidingFriction(MANY, WIDE, WIDE),
+    "mode": lambda: ModeShape({name: WIDE for name in TREE}, {name: WIDE for name in TREE}),
     "saved": lambda: lg.Saved(jnp.asarray(MANY), TREE, None, jnp.asarray(0), None),
     "model": chain,
     "trajectory": lambda: trajectory(chain()),

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from lgsens._brief import listed, roster, shown
+from lgsens._brief import brief, listed, roster, shown
 from lgsens._validate import as_count, as_float
 from lgsens.analysis._eigen import eigen, near, scaled
 from lgsens.analysis._inputs import check_inputs, with_inputs
@@ -44,6 +44,8 @@ class ModeShape(NamedTuple):
 
     translation: Complex[Array, "n 3"]
     rotation: Complex[Array, "n 3"]
+
+    __repr__ = brief
 
 
 class Linearization(eqx.Module):

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lgsens._brief import brief
 from lgsens.criteria import Criterion
 from lgsens.examples._mechanisms import four_bar, linear_quarter_car, simple_pendulum, slider_crank
 from lgsens.examples._quarter_car import QuarterCar
@@ -31,6 +32,8 @@ class Evaluation(NamedTuple):
     values: dict[str, Float[Array, ""]]
     gradients: dict[str, dict[str, Float[Array, ""]]]
     trajectory: Trajectory
+
+    __repr__ = brief
 
 
 class Problem(NamedTuple):

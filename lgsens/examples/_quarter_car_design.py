@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lgsens._brief import brief
 from lgsens._validate import suggestion
 from lgsens.criteria import time_integral
 from lgsens.examples._curve_bounds import CurveBounds
@@ -100,6 +101,8 @@ class Response(NamedTuple):
     tyre_force: Float[Array, " n"]
     objective: Float[Array, ""]
     constraints: Float[Array, "n 3"]
+
+    __repr__ = brief
 
 
 class SuspensionDesign(eqx.Module):

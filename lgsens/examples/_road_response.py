@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 from jaxtyping import Array, Float
 
+from lgsens._brief import brief
 from lgsens.analysis import FrequencyWeighting, linearize, random_road
 
 
@@ -19,6 +20,8 @@ class RoadResponse(NamedTuple):
     acceleration: Float[Array, ""]
     tyre: Float[Array, ""]
     travel: Float[Array, ""]
+
+    __repr__ = brief
 
 
 def road_response(car: Any, *, roughness, speed, weighting: str | None) -> RoadResponse:

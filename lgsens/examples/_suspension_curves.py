@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lgsens._brief import brief
 from lgsens.analysis import Kinematics
 from lgsens.examples._wheel import Stance, wheel_plane
 
@@ -46,6 +47,8 @@ class SuspensionCurves(NamedTuple):
     damper_motion_ratio: Float[Array, " n"]
     roll_centre_height: Float[Array, " n"]
     spring_length: Float[Array, " n"]
+
+    __repr__ = brief
 
 
 def suspension_curves(motion: Kinematics, stance: Stance, *, rear: bool, alone: bool) -> SuspensionCurves:

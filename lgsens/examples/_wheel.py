@@ -20,6 +20,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lgsens._brief import brief
 from lgsens.examples._suspension_parts import Part
 from lgsens.model import ALL_FREE, RigidBody
 
@@ -36,6 +37,8 @@ class WheelPlane(NamedTuple):
     steer: Float[Array, ""]
     inclination: Float[Array, ""]
     contact: Float[Array, "3"]
+
+    __repr__ = brief
 
 
 def wheel_plane(axis: Float[Array, "3"], centre: Float[Array, "3"], radius: Float[Array, ""]) -> WheelPlane:

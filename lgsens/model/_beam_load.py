@@ -32,6 +32,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lgsens._brief import brief
 from lgsens.liegroups import SE3, Pose, cross, skew, turn, turn_back
 from lgsens.model._beam_outlines import AbstractOutline
 from lgsens.model._beam_sections import BeamSection
@@ -62,6 +63,8 @@ class SectionState(NamedTuple):
     force: Float[Array, "3"]
     moment: Float[Array, "3"]
     stress: Float[Array, ""] | None = None
+
+    __repr__ = brief
 
     def fibre_strain(self, second, third) -> Float[Array, ""]:
         """ε₁ + x₃ κ₂ − x₂ κ₃, the strain along the beam where the section's axes 2 and 3 have x₂, x₃ [m]; E times it is

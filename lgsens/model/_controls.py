@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lgsens._brief import brief
 from lgsens._validate import number_field, point_field, require_positive
 from lgsens.model._constraints import AbstractConstraint
 from lgsens.model._elements import body_fixed
@@ -53,6 +54,8 @@ class ControlSignals(NamedTuple):
     error: Float[Array, ""]
     rate: Float[Array, ""]
     output: Float[Array, ""]
+
+    __repr__ = brief
 
 
 def _signals(load, a, b, va, vb, t) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, "12"]]:

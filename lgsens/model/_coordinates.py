@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lgsens._brief import brief
 from lgsens._validate import as_count, as_float, number_field, point_field, require, require_setting, suggestion
 from lgsens.liegroups import SO3, skew, turn_back
 from lgsens.model._constraints import AbstractClosedFormConstraint
@@ -73,6 +74,8 @@ class CoordinateMeasure(NamedTuple):
     coordinate: Float[Array, ""]
     rate: Float[Array, ""]
     force: Float[Array, ""]
+
+    __repr__ = brief
 
 
 class CoordinateLoad(AbstractClosedFormLoad):

@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lgsens._brief import brief
 from lgsens._validate import number_field, require_not_negative, require_positive, suggestion
 from lgsens.liegroups import cross
 from lgsens.model._constraints import AbstractRows, total
@@ -36,6 +37,7 @@ from lgsens.model._loads import AbstractDynamicLoad
 from lgsens.model._stack import constraint_force
 
 _ROUNDING = 9.81e-3  # m/s²
+_SLIPS = "x", "y", "z", "turn_x", "turn_y", "turn_z", "turn_x_b", "turn_y_b", "turn_z_b"
 
 
 class SlidingFriction(NamedTuple):
@@ -44,6 +46,8 @@ class SlidingFriction(NamedTuple):
     load: Float[Array, ""]
     slip: Float[Array, " w"]
     force: Float[Array, " w"]
+
+    __repr__ = brief
 
 
 class Surface(eqx.Module):
@@ -86,21 +90,18 @@ class Surface(eqx.Module):
 
     def slip(self, a: Frame, b: Frame, va, vb) -> Float[Array, " w"]:
         (axes, *turning), rows = self._along(a, b)
-        at = b.point(self.point)
         speed = lambda frame, v, local: v[: ROTATION.start] + frame.axis(cross(v[ROTATION], local))
-        linear = speed(b, vb, self.point) - speed(a, va, a.local_point(at))
-        angular = b.axis(vb[ROTATION]) - a.axis(va[ROTATION])
-        return rows @ jnp.concatenate([linear @ axes, *(angular @ triad for triad in turning)])
+        linear = speed(b, vb, self.point) - speed(a, va, a.local_point(b.point(self.point)))
+        turn = b.axis(vb[ROTATION]) - a.axis(va[ROTATION])
+        return rows @ jnp.concatenate([linear @ axes, *(turn @ triad for triad in turning)])
 
     def force(self, a: Frame, b: Frame, s) -> Float[Array, "12"]:
         """Q of the force s on b along w."""
         triads, rows = self._along(a, b)
         force, *moments = map(jnp.matmul, triads, jnp.split(s @ rows, len(triads)))
         moment = total(moments)
-        local = a.local_point(b.point(self.point))
-        on_a = a.local_axis(moment) + cross(local, a.local_axis(force))
-        on_b = b.local_axis(moment) + cross(self.point, b.local_axis(force))
-        return jnp.concatenate([-force, -on_a, force, on_b])
+        on_a = a.local_axis(moment) + cross(a.local_point(b.point(self.point)), a.local_axis(force))
+        return jnp.concatenate([-force, -on_a, force, b.local_axis(moment) + cross(self.point, b.local_axis(force))])
 
 
 class CoulombLoad(AbstractDynamicLoad):
@@ -151,8 +152,7 @@ class LuGreLoad(AbstractDynamicLoad):
 
     @property
     def states(self):
-        names = "x", "y", "z", "turn_x", "turn_y", "turn_z", "turn_x_b", "turn_y_b", "turn_z_b"
-        return tuple(f"bristle_{names[i]}" for i in self.surface.slips)
+        return tuple(f"bristle_{_SLIPS[i]}" for i in self.surface.slips)
 
     @property
     def reads(self):

@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens._brief import brief
 from lgsens.liegroups import cross, skew
 from lgsens.model._elements import AbstractElement, body_fixed
 from lgsens.model._frames import (
@@ -150,6 +151,8 @@ class LineForce(NamedTuple):
     length: Float[Array, ""]
     rate: Float[Array, ""]
     tension: Float[Array, ""]
+
+    __repr__ = brief
 
 
 class SpringDamperLoad(AbstractClosedFormLoad):

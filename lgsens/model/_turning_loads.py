@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lgsens._brief import brief
 from lgsens.liegroups import SO3, cross, skew, turn, turn_back
 from lgsens.model._constraints import total
 from lgsens.model._elements import body_fixed
@@ -28,6 +29,8 @@ class HingeMoment(NamedTuple):
     angle: Float[Array, ""]
     rate: Float[Array, ""]
     moment: Float[Array, ""]
+
+    __repr__ = brief
 
 
 Curves = tuple[AbstractSignal | None, AbstractSignal | None, AbstractSignal | None]

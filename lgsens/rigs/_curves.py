@@ -57,6 +57,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lgsens._brief import brief
 from lgsens._validate import number_field, require
 from lgsens.analysis import Statics
 from lgsens.examples import Stance, wheel_plane
@@ -121,6 +122,8 @@ class WheelCurves(NamedTuple):
     centre_y: Float[Array, "n 2"]
     force: Float[Array, "n 2"]
 
+    __repr__ = brief
+
 
 class AxleCurves(NamedTuple):
     """The outputs of one sweep, ISO 8855 axes and signs; None: what this axle or sweep does not have.
@@ -168,6 +171,8 @@ class AxleCurves(NamedTuple):
     anti_dive: Float[Array, " n"] | None = None
     anti_lift: Float[Array, " n"] | None = None
     anti_squat: Float[Array, " n"] | None = None
+
+    __repr__ = brief
 
 
 def axle_curves(found: Statics, stances: Stance, vehicle: Vehicle) -> AxleCurves:
