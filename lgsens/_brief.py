@@ -9,13 +9,32 @@ import numpy as np
 
 from lgsens._validate import is_concrete
 
-_WIDTH, _LINES, _ENTRIES = 110, 30, 6
+_WIDTH, _LINES, _ENTRIES = 110, 30, 9
 
 
 def brief(self: Any) -> str:
     """The repr of a result: `__repr__ = brief` in a named tuple or a dataclass."""
     known = getattr(self, "_fields", None) or [field.name for field in dataclasses.fields(self) if field.repr]
     return listed(type(self).__name__, {name: shown(getattr(self, name)) for name in known})
+
+
+def as_called(self: Any) -> str:
+    """The repr of an element: the call that makes it, with its numbers; `__repr__ = as_called` in a dataclass."""
+    fields = {field.name: field.default for field in dataclasses.fields(self) if field.repr}
+    values = {name: getattr(self, name) for name in fields}
+    given = [
+        f"{name}={shown(value)}" for name, value in values.items() if value is not None or fields[name] is not None
+    ]
+    line, head = ", ".join(given), f"{type(self).__name__}("
+    if len(head + line) < _WIDTH:
+        return f"{head}{line})"
+    lines = [""]
+    for text in (f"{text}," for text in given):
+        if len(lines[-1]) + len(text) < _WIDTH - 3:
+            lines[-1] += f" {text}"
+        else:
+            lines.append(f" {text}")
+    return "\n".join([head, *(_cut(f" {text}") for text in lines), ")"])
 
 
 def listed(head: str, fields: Mapping[str, str]) -> str:
@@ -51,7 +70,8 @@ def _array(value: Any) -> str:
         return f"traced {kind}"
     array = np.asarray(value)
     if array.size <= _ENTRIES:
-        return " ".join(np.array2string(array, precision=6, separator=", ").split())
+        tidy = array + 0.0 if array.dtype.kind == "f" else array  # no −0
+        return " ".join(np.array2string(tidy, precision=6, separator=", ").split())
     if array.dtype.kind == "b":
         return f"{kind}, {int(array.sum())} true"
     if array.dtype.kind not in "fiu":

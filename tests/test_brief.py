@@ -102,3 +102,24 @@ def test_says_what_one_wants_to_know():
     jax.jit(lambda run: said.append(repr(run)))(trajectory(model))
     assert "traced float64[101]" in said[0] and "result  traced" in said[0]
     assert isinstance(model.summary(), Summary) and "coordinates  12" in repr(model.summary())
+
+
+def test_elements_are_shown_as_they_are_made():
+    """With their numbers, in lines that fit; of traced ones and of many their shapes."""
+    hinge = lg.RevoluteJoint(None, "door", at=(0.0, 0.25, 0.0), axis=(0.0, 0.0, 1.0))
+    assert repr(hinge) == "RevoluteJoint(a=None, b='door', at=[0. , 0.25, 0. ], axis=[0., 0., 1.])"
+    ends = {"at_a": (1 / 3, 2 / 3, 1 / 7), "at_b": (-0.0, 0.0, 1.0)}
+    spring = lg.SpringDamper("a", "door", **ends, stiffness=3.0, damping=0.5, preload=7.0)
+    lines = repr(spring).splitlines()
+    assert lines[0] == "SpringDamper(" and lines[-1] == ")" and all(len(line) <= 110 for line in lines)
+    for part in ("a='a', b='door',", "at_b=[0., 0., 1.],", "damping=0.5,", "preload=7.,"):
+        assert part in repr(spring)
+    assert "free_length" not in repr(spring)
+    assert "orientation=[[1., 0., 0.], [0., 1., 0.], [0., 0., 1.]]" in repr(lg.RigidBody(2.0, (0.1, 0.2, 0.3)))
+    said = []
+    jax.jit(lambda joint: said.append(repr(joint)))(hinge)
+    assert said == ["RevoluteJoint(a=None, b='door', at=traced float64[3], axis=traced float64[3])"]
+    many = jax.vmap(lambda x: lg.Harmonic(amplitude=x, frequency=1.0))(jnp.arange(20.0))
+    assert "amplitude=float64[20], 0 to 19" in repr(many)
+    motor = lg.RotationDriver(None, "door", axis=(0.0, 0.0, 1.0), value=lg.Polynomial((0.0, 2.0)))
+    assert "value=Polynomial(coefficients=[0., 2.])" in repr(motor)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lgsens._brief import as_called
 from lgsens._validate import as_float, require
 from lgsens.model._beam_outlines import AbstractOutline, Rectangle, Ring, Stack
 
@@ -41,6 +42,8 @@ class BeamSection(eqx.Module):
     inertia: Float[Array, "3"]
     damping: Float[Array, ""]
     outline: AbstractOutline | None
+
+    __repr__ = as_called
 
     def __init__(self, stiffness, mass, inertia, damping=0.0, outline: AbstractOutline | None = None):
         if outline is not None and not isinstance(outline, AbstractOutline):

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lgsens._brief import as_called
 from lgsens._validate import as_count, as_float, is_concrete, point_field, require
 from lgsens.model._beam_load import element
 from lgsens.model._beam_sections import BeamSection
@@ -115,6 +116,8 @@ class Beam(eqx.Module):
     section: BeamSection
     points: Float[Array, "n 3"]
     axes: Float[Array, "n 3 3"]
+
+    __repr__ = as_called
 
     def __init__(self, name: str, section: BeamSection, points, *, elements: int | None = None, up=(0.0, 0.0, 1.0)):
         if not isinstance(section, BeamSection):

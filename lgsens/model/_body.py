@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lgsens._brief import as_called
 from lgsens._validate import as_float, require, shaped
 from lgsens.model._frames import Frame
 from lgsens.model._free import ALL_FREE, ROTATIONS, TRANSLATIONS, Free, as_free, is_along, places, single_rotation
@@ -62,6 +63,8 @@ class RigidBody(eqx.Module):
     angular_velocity: Float[Array, "3"] = eqx.field(metadata=shaped(3))
     pivot: Float[Array, "3"] | None = eqx.field(metadata=shaped(3))
     free: Free = eqx.field(static=True)
+
+    __repr__ = as_called
 
     def __init__(
         self,

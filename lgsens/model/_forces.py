@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lgsens._brief import as_called
 from lgsens._validate import number_field, point_field, require_positive
 from lgsens.model._body import RigidBody
 from lgsens.model._contacts import TyreLoad
@@ -58,6 +59,8 @@ class AbstractForce(eqx.Module):
     preload_rates: ClassVar[Any] = None
     on_merged: ClassVar[bool] = False
     reads: ClassVar[Any] = None
+
+    __repr__ = as_called
 
     @property
     @abc.abstractmethod

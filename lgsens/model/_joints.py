@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lgsens._brief import as_called
 from lgsens._validate import axis_field, point_field, require
 from lgsens.liegroups import cross
 from lgsens.model._constraints import AbstractRows, Coincidence, Distance, InPlane, Orthogonality
@@ -62,6 +63,8 @@ class AbstractJoint(eqx.Module):
     distance: ClassVar[bool] = False
     coordinates: ClassVar[tuple[Coordinate, ...]] = ()
     slips: ClassVar[tuple[int, ...]] = ()
+
+    __repr__ = as_called
 
     @property
     def others(self) -> tuple[str, ...]:

@@ -33,6 +33,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens._brief import as_called
 from lgsens._validate import as_float, number_field, require, shaped
 
 _KINDS = ("linear", "cubic", "monotone")
@@ -54,6 +55,8 @@ class AbstractSignal(eqx.Module):
             return self.amplitude * jnp.sin(jnp.pi * self.rate * t**2)
     ```
     """
+
+    __repr__ = as_called
 
     @property
     def straight(self) -> bool:
