@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import says, some_quick
+from helpers import says
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from suspension_closures import Closure, changed, corner_of
@@ -272,7 +272,8 @@ def at_the_design(model):
     return system.residual(q, rest, rest, lam, 0.0), system.constraint_jacobian(q, 0.0)
 
 
-@pytest.mark.parametrize("name", some_quick(["twist_beam", "multi_link"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["twist_beam", "multi_link"])
 def test_its_forces_are_in_balance(name):
     """Joints can bear what bushings, springs, tyres and weights leave: by least squares of NumPy; half to each tyre."""
     model = pushed(Axle.load(name))

@@ -255,6 +255,7 @@ def test_what_no_beam_with_corners_is(corners, sections, message):
         lg.BentBeam("it", section if sections == 1 else [section] * sections, corners)
 
 
+@pytest.mark.slow
 def test_a_leaf_spring_and_a_twist_beam_axle():
     """A leaf on its eye and its shackle: F L³/48EI, and shear. Two trailing arms with a beam between them, c behind
     their pivots, one wheel held, the other pushed up by 2 l φ: G J (2φ)²/2L of twist and, as ends of the beam do not

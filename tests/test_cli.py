@@ -189,6 +189,7 @@ def test_bad_arguments_give_one_line(arguments, message, tmp_path, capsys):
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_travel_out_of_reach_names_its_option(tmp_path, capsys):
     status, _, err = run(capsys, "curves", "quarter-car", "--travel", "0.9", "--points", "3", "--out", tmp_path / "out")
     assert status == 2 and err.count("\n") == 1 + err.count("compiling")

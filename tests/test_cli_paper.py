@@ -195,6 +195,7 @@ def test_a_missing_matplotlib_is_told_before_the_work(tmp_path, capsys, monkeypa
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_the_benchmark_is_the_command(tmp_path):
     script = [sys.executable, str(ROOT / "benchmarks" / "paper.py")]
     done = subprocess.run([*script, "--out", str(tmp_path)], capture_output=True, text=True, check=False)

@@ -48,6 +48,7 @@ def psi(p, criterion=HIGH, times=FIRST, numbers=None, **settings):
     return criterion(run, p)
 
 
+@pytest.mark.slow
 def test_eager_gradients_share_their_programs(compiled):
     """Forward and pull-back are compiled once, whatever a criterion looks at, and cut to the steps that there are."""
     jax.clear_caches()

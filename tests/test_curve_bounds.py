@@ -98,6 +98,7 @@ def test_bad_bounds(car, arguments, message):
         CurveBounds.around(car, **arguments)
 
 
+@pytest.mark.slow
 def test_the_command_draws_lists_and_animates(tmp_path, capsys, car, monkeypatch):
     out = tmp_path / "out"
     arguments = ["curves", "quarter-car", "--out", str(out), "--travel", "0.06", "--points", "5", "--axle", "front"]

@@ -205,6 +205,7 @@ def test_newton_failure_inside_jit():
     np.testing.assert_array_equal(value, jnp.sum(fail(0.0).body("bob").position[:, 0]))
 
 
+@pytest.mark.slow
 def test_derivatives_of_what_came_before_a_failure():
     """Backwards as forwards and as differences; NaN if asked for the rest."""
 

@@ -203,6 +203,7 @@ def formulas(p):
     return jnp.stack([integral + weight * (1.0 + push / mass * rest), 1e7 * integral])
 
 
+@pytest.mark.slow
 def test_a_force_that_jumps():
     """With `breaks` the scheme is exact on the polynomials before and after; without, it must look for the jump.
 

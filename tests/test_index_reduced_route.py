@@ -126,6 +126,7 @@ def end_and_slope(num_steps, integrator):
 EXACT = (80, lg.IndexReducedODE(diffrax.Dopri8()))  # 1e-13 away
 
 
+@pytest.mark.slow
 def test_order_of_the_scheme():
     """Order 5, by slope, of state, accelerations, force, and of their derivatives: 20 of 2⁵ = 32 are asked for."""
     exact = end_and_slope(*EXACT)
@@ -244,6 +245,7 @@ def test_top():
     close(orientation @ jnp.swapaxes(orientation, 1, 2), np.tile(np.eye(3), (81, 1, 1)), 1e3)
 
 
+@pytest.mark.slow
 def test_four_bar():
     """A closed loop: criteria of position and acceleration of the file, by Gregory's rule."""
     reference = load("four_bar_spring")["value"]

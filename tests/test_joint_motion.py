@@ -141,7 +141,8 @@ def test_rates_and_accelerations_are_derivatives_by_time(name):
     assert len(joint.coordinates) == len(values[2]) > 0
 
 
-@pytest.mark.parametrize("rate", [pytest.param(7.0, marks=pytest.mark.slow), -100.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("rate", [7.0, -100.0])
 def test_angle_over_many_turns(rate):
     """ω t, also where a step is more than half a turn (5 rad)."""
     rotor = lg.RigidBody(2.0, (0.3, 0.3, 0.5), position=(0.1, 0.2, 0.0), angular_velocity=(0.0, 0.0, rate))
@@ -457,6 +458,7 @@ def test_joints_are_outputs_of_a_linearization():
     assert c[0, 1] == c[1, 0] == 0.0 and abs(c[0, 0]) > 0.1
 
 
+@pytest.mark.slow
 def test_a_batch_is_asked_one_by_one():
     """Whatever is asked: a body, a point mass, a point, a joint, a force, multipliers, a state."""
 

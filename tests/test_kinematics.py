@@ -347,6 +347,7 @@ def run_hinged(length, *, planar):
     return lg.kinematics(hinged_four_bar(length, planar=planar), {"motor": angles}, rates={"motor": RATE})
 
 
+@pytest.mark.slow
 def test_redundant_hinges():
     """The motion and what is unique of the forces are those of the same mechanism without the equations too many."""
     found = run_hinged(0.0, planar=False)

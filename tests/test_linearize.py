@@ -323,6 +323,7 @@ def test_pendulum_on_a_driven_pivot():
     np.testing.assert_allclose(found, by_hand, rtol=1e-11, atol=1e-11 * np.abs(by_hand).max())
 
 
+@pytest.mark.slow
 def test_driven_base_with_damping_and_a_state():
     """m z'' + Z(s) (z − u) = F over a driven base, Z = k + c s + κ s/(s + κ/d) with a Maxwell element (κ, d) beside the
     spring: an input whose rate drives the motion, one that is a force, and the three zeros of a cubic.

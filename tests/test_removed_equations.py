@@ -76,9 +76,10 @@ def test_what_is_left_out_of_hinges():
 SLOW = pytest.mark.slow  # programs of their own
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "integrator",
-    [pytest.param(EXACT, marks=SLOW), STABILIZED, pytest.param(RADAU, marks=SLOW)],
+    [EXACT, STABILIZED, RADAU],
     ids=["alpha", "stabilized", "radau"],
 )
 def test_the_motion_is_that_of_the_planar_mechanism(integrator):

@@ -110,6 +110,7 @@ PLACES = ("travel", "steer", "camber", "contact_x", "contact_y")
 places = lambda test: np.stack([getattr(test.sweeps["parallel"].wheels, name) for name in PLACES])
 
 
+@pytest.mark.slow
 def test_rigid_axles_are_kinematics(rigid):
     """Statics of rigid joints are at the positions of `lg.kinematics`."""
     model, centres = small_axle(compliant=False)

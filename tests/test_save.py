@@ -88,15 +88,16 @@ def in_a_module(a):
     return Weighted(jnp.array([a, a**2, 3.0]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("save", "derivative"),
     [
         (in_a_closure, lambda f: jax.jit(jax.grad(f))),
-        pytest.param(in_a_closure, jax.grad, marks=pytest.mark.slow),
-        pytest.param(in_a_closure, jax.jacfwd, marks=pytest.mark.slow),
-        pytest.param(in_a_module, lambda f: jax.jit(jax.jacfwd(f)), marks=pytest.mark.slow),
-        pytest.param(in_a_module, jax.grad, marks=pytest.mark.slow),
-        pytest.param(in_a_closure, lambda f: lambda a: jax.vmap(jax.grad(f))(a[None])[0], marks=pytest.mark.slow),
+        (in_a_closure, jax.grad),
+        (in_a_closure, jax.jacfwd),
+        (in_a_module, lambda f: jax.jit(jax.jacfwd(f))),
+        (in_a_module, jax.grad),
+        (in_a_closure, lambda f: lambda a: jax.vmap(jax.grad(f))(a[None])[0]),
     ],
 )
 def test_traced_numbers_in_what_is_asked_have_derivatives(save, derivative):

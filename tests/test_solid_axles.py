@@ -263,6 +263,7 @@ def test_a_file_of_the_right_side_is_the_same_axle(load):
     jax.tree.map(np.testing.assert_array_equal, dataclasses.replace(axle, left=left), expected)
 
 
+@pytest.mark.slow
 def test_a_subframe_may_carry_it_on_bushings(load):
     """Four links along and a rod across bind, but for bushings, wherever these are; asymmetric links have no half."""
     own = FILE["solid_axle"]["links"]
@@ -288,6 +289,7 @@ def test_motion_ratios_are_of_both_wheels(rigid):
     assert float(of["wheel_rate"]) == pytest.approx(27e3 * float(of["spring_motion_ratio"]) ** 2, rel=0.02)
 
 
+@pytest.mark.slow
 def test_half_of_it_has_no_roll_centre(load):
     curves = load(scene(), QuarterCar).curves([-0.02, 0.0, 0.02])
     assert np.isnan(curves.roll_centre_height).all() and not np.isnan(curves.spring_motion_ratio).any()

@@ -145,6 +145,7 @@ def test_trailing_arms_in_closed_form():
     np.testing.assert_allclose(middle.roll_rate, 2 * half * force / roll, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_steering_axis_meets_the_road_beside_the_contact_centre():
     model, centres = small_axle(compliant=False)
     test = rigs.kc(turned(model, AXES), centres, {"steering": STANDARD["steering"]}, points=3)
@@ -218,6 +219,7 @@ def test_angles_are_numbers_of_a_design(load):
     assert float(moved.left.wheel.camber) == pytest.approx(np.radians(-1.2))
 
 
+@pytest.mark.slow
 def test_the_roll_angle_is_that_of_the_wheel_centres():
     """Wheels that lean out from a shaft which turns about x: the camber changes by the roll angle, which no static
     camber changes, nor the stiffness over it."""
@@ -238,6 +240,7 @@ def test_the_roll_angle_is_that_of_the_wheel_centres():
         np.testing.assert_allclose(found["roll_rate"], 2 * 4e4 * 0.5**2, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_wheels_are_drawn_as_they_stand():
     """On the rig, and on a road: round their centres, on the contact centre, in the plane that the spin axis says."""
     axle = leaning(Axle.load("solid_axle").left)

@@ -177,6 +177,7 @@ def test_bad_input(arguments, message):
         lg.statics(model, **settings)
 
 
+@pytest.mark.slow
 def test_a_fixed_moment_is_a_load():
     """About the axis of a hinge it turns the bar as the moment that turns with it does, and both add to a force."""
     axis, fixed = {"axis": (0.0, 1.0, 0.0)}, {"fixed_moment": (0.0, 1.0, 0.0)}
@@ -209,6 +210,7 @@ def test_points_that_start_anew_are_told_from_the_first():
         lg.statics(model, driven={"drive": angles})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("thickness", [0.01, 1e-4])
 def test_a_beam_that_is_bent_by_three_radians_at_once(thickness):
     """To an arc, of which the end is known; along the tangent it would be stretched by half of its length."""

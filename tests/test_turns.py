@@ -92,6 +92,7 @@ def test_a_pendulum_that_turns_over_is_not_resolved():
     assert found.result == lg.RESULTS.turn_not_resolved
 
 
+@pytest.mark.slow
 def test_error_control_resolves_turns_whatever_the_tolerance():
     """An error of 1000 rad and steps of any length are allowed."""
     settings = lg.AdaptiveSteps(tolerance=1e3, longest=1.0)

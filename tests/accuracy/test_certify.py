@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import says, some_quick
+from helpers import says
 from oscillator import CRITERION, T1, P, build, exact
 
 import lgsens as lg
@@ -36,9 +36,8 @@ def test_errors_are_those_of_the_closed_form(oscillator):
     assert not oscillator.warnings
 
 
-@pytest.mark.parametrize(
-    "integrator", some_quick([lg.IndexReducedODE(), lg.RadauIIA(), lg.GeneralizedAlpha(stabilized=True)])
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", [lg.IndexReducedODE(), lg.RadauIIA(), lg.GeneralizedAlpha(stabilized=True)])
 def test_of_other_schemes(integrator):
     """By a second run; to the next term again, O(ω²h²) with ωh = 0.45."""
     found = certify(CRITERION, build, P, t1=T1, num_steps=10, integrator=integrator)
@@ -329,6 +328,7 @@ def test_differentiate_refuses_it_before_it_computes():
         jax.jit(lambda p: lg.differentiate(HEIGHT, build, p, t1=1.0, num_steps=100, certificate=True).value)(P)
 
 
+@pytest.mark.slow
 def test_round_off_of_a_uniform_motion_is_resolved():
     """A rotor that is driven at constant speed: its angular acceleration is round-off, and changes as much as that."""
     rotor = lg.RigidBody(1.0, (0.1, 0.1, 0.2))

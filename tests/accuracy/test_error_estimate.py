@@ -158,6 +158,7 @@ def in_steps(*sizes):
     return lg.simulate(build(P), t1=T1, num_steps=4, integrator=lg.GivenSteps(jnp.asarray(sizes)))
 
 
+@pytest.mark.slow
 def test_what_is_not_by_the_scheme_is_nan_under_jit():
     equal, uneven = in_steps(1.0, 1.0, 1.0, 1.0), in_steps(2.0, 3.0, 2.0, 3.0)
     traced = jax.jit(error_estimate)

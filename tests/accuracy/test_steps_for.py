@@ -55,6 +55,7 @@ def test_steps_are_where_the_criterion_looks(early):
     )  # sizes change between plateaus only
 
 
+@pytest.mark.slow
 def test_expected_errors_are_the_true_ones_and_far_below_those_of_equal_steps(early):
     """They have 3 % of what adds up regardless of signs on top: from above, within a factor of 5 where signs cancel."""
     true = relative_errors(early.integrator, early.num_steps)

@@ -297,6 +297,7 @@ def test_a_stiff_beam_bends_far():
     np.testing.assert_allclose(found, path.body("arm.2").position[-1], atol=1e-9)  # EA eps of 1e4 N on 1e5 N/m
 
 
+@pytest.mark.slow
 def test_a_joint_between_two_bodies_on_stiff_springs():
     """Both sink by their weight over the sum of the rates, and the joint bears what one weighs more than its spring."""
     at, rates = ([0.0, 0.0, 0.0], [0.3, 0.0, 0.0]), (1e9, 3e8)

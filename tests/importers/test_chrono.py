@@ -402,6 +402,7 @@ def test_bad_input(name, tmp_path):
         chrono(tmp_path / "file.json")
 
 
+@pytest.mark.slow
 def test_the_command_line_reports_and_animates(tmp_path, capsys):
     assert (
         main(["import", str(DATA / "RigidPinnedAxle.json"), "--simulate", "0.05", "--out", str(tmp_path / "out")]) == 0

@@ -220,6 +220,7 @@ EQUALITIES = """
 """
 
 
+@pytest.mark.slow
 def test_equalities_of_joints():
     """q_b − 0.1 = 0.5 q_a + 0.2 q_a² and q_c = 0.3, from a configuration that satisfies them."""
     qpos = np.array([0.4, 0.1 + 0.5 * 0.4 + 0.2 * 0.4**2, 0.3])

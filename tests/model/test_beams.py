@@ -278,6 +278,7 @@ def test_derivatives_of_a_loaded_beam():
         np.testing.assert_allclose(jnp.sum(direct[name] * along), difference, rtol=0, atol=1e-6 * size + 1e-8)
 
 
+@pytest.mark.slow
 def test_free_flight_keeps_momenta():
     """A soft beam thrown: a rigid motion leaves strains at round-off, forces between nodes move no centre of mass."""
     beam = lg.Beam("b", UNIT, [[0, 0, 0], [2.0, 0, 0]], elements=3)

@@ -150,6 +150,7 @@ def test_lag_is_that_of_the_closed_form():
     np.testing.assert_allclose(lg.initial_state(slider(3.0, 0.2)).v[-1], 3.0)  # in equilibrium with its command
 
 
+@pytest.mark.slow
 def test_relaxation_under_a_held_length_is_exponential():
     """Of a spring whose damper creeps, stretched and held: F = F_0 exp(−k t/c)."""
     k, c, stretch = 100.0, 20.0, 0.1

@@ -58,9 +58,10 @@ def coupled(rotor=0.7, coefficients=(1.0,), linear_solver=None, merged=False):
     return lg.Model(bodies, joints, forces, linear_solver=linear_solver, merge_fixed=merged)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
-    [{}, pytest.param({"linear_solver": lg.BlockSparse()}, marks=SLOW), pytest.param({"merged": True}, marks=SLOW)],
+    [{}, {"linear_solver": lg.BlockSparse()}, {"merged": True}],
 )
 def test_a_rotor_is_an_inertia_of_the_hinge(options):
     """(J + m l² + ρ² J_r) θ̈ = m g l sin θ₀ + k θ_f + M with the ratio ρ of the rotor."""
@@ -95,6 +96,7 @@ def test_many_turns():
     assert rate > 6.0 * np.pi
 
 
+@pytest.mark.slow
 def test_planetary_gear_on_a_carrier():
     """Sun and ring on one axis in a carrier that turns: ω_s − ω_c = −(z_r/z_s)(ω_r − ω_c) (Willis), their moments are
     as 1 : z_r/z_s, and the carrier's is minus their sum; over eight turns of the sun."""

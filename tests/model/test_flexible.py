@@ -80,6 +80,7 @@ def cantilever(load, elements=3):
     return lg.Model(beam.bodies, clamp, beam.forces | {"push": push}), beam
 
 
+@pytest.mark.slow
 def test_a_beam_that_bears_its_load_in_the_reference_configuration():
     """N = P₁, shear and bending moment of the load about the middle of each element, where its strain is the mean."""
     model, beam = cantilever((50.0, -20.0, 30.0))

@@ -171,6 +171,7 @@ def test_derivatives_of_partly_free_bodies_with_states():
     assert np.abs(direct).min() > 1e-6
 
 
+@pytest.mark.slow
 def test_states_of_both_say_the_same():
     """`Trajectory.of_bodies` of a motion, and of a start: consistent in velocities and accelerations."""
     model = four_bar()

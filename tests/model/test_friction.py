@@ -88,7 +88,8 @@ def rubbed(load, slip):
     return -MU * load * slip / np.sqrt(slip @ slip + W_0**2)
 
 
-@pytest.mark.parametrize("names", some_quick([(FEW,), (EVERY,)]))
+@pytest.mark.slow
+@pytest.mark.parametrize("names", [FEW, EVERY])
 def test_accelerations_of_what_rubs(names):
     model = rubbing(names)
     state = eqx.filter_jit(lg.initial_state)(model)
@@ -318,7 +319,8 @@ def test_bad_input():
         lg.simulate(bar, t1=0.1, num_steps=2, integrator=lg.IndexReducedODE())
 
 
-@pytest.mark.parametrize("mass", [0.01, pytest.param(100.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mass", [0.01, 100.0])
 def test_it_holds_bodies_of_any_mass(mass):
     """A block slides down a slope by g (sin α − μ cos α) t²/2, however light: ε is relative to its weight."""
     axis, speed, mu, t1 = np.array([np.cos(0.5), 0.0, -np.sin(0.5)]), 1e-3, 0.3, 0.2

@@ -340,6 +340,7 @@ class NetForce(AbstractForce):
         return (Attached(self.load, None, "a"),)
 
 
+@pytest.mark.slow
 def test_a_network_as_a_force():
     """Its arrays are leaves and the rest is static; the message says so where it is given as it is."""
     net = eqx.nn.MLP(9, 3, 4, 1, activation=jnp.tanh, key=jax.random.key(0))

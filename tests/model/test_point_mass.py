@@ -70,6 +70,7 @@ def test_unknowns_are_those_of_translations():
     assert len(jax.tree.leaves(bodies["bead"])) == len(jax.tree.leaves(bodies["top"])) - 1
 
 
+@pytest.mark.slow
 def test_points_are_merged():
     """Two points on a massless bar in a guide are one that translates."""
     bodies = {"a": point(), "b": point(mass=1.0, position=X, velocity=(0.0, 0.0, 3.0))}

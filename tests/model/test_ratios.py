@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import close, moved, random_rotation, says, some_quick
+from helpers import close, moved, random_rotation, says
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
@@ -309,7 +309,8 @@ def test_couplings_over_whole_turns(name):
     close(moved, 5.0 * ratio * TIMES, 1e3, scale=10.0)
 
 
-@pytest.mark.parametrize("name", some_quick(JUMPING))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", JUMPING)
 def test_couplings_that_poses_do_not_tell_have_failed_at_half_a_turn(name):
     """π/5 s, after position 12 of 0.05 s each: the load of a winch jumped by 2πr there."""
     model = JUMPING[name]()

@@ -217,7 +217,8 @@ def workshop(solver=None):
     return lg.Model(bodies, joints, forces, linear_solver=solver)
 
 
-@pytest.mark.parametrize("solver", some_quick([lg.DenseLU(), None, lg.BlockSparse()]))
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [lg.DenseLU(), None, lg.BlockSparse()])
 def test_accelerations_of_the_workshop(solver):
     model = workshop(solver)
     state = eqx.filter_jit(lg.initial_state)(model)

@@ -54,6 +54,7 @@ INTEGRATORS = {
 }
 
 
+@pytest.mark.slow
 def test_a_clock_spring_unwinds():
     p = jnp.array([STIFFNESS, WOUND])
     value, gradient = jax.value_and_grad(end)(p, torsion, STEPS)
@@ -115,6 +116,7 @@ def test_a_spring_that_passes_half_a_turn_has_failed():
         assert lg.simulate(passed, t1=T1, num_steps=STEPS).result == lg.RESULTS.successful
 
 
+@pytest.mark.slow
 def test_so_it_has_where_no_trajectory_is_kept():
     build = lambda k: scene(torsion(k, 0.0), angular_velocity=(0.0, 0.0, 13.0))
     angle = lambda instant: instant.force("spring").angle

@@ -74,6 +74,7 @@ def parallel_bands(x):
 BOX = {"lower": jnp.asarray(-1.0), "upper": jnp.asarray(1.0), "progress": False}
 
 
+@pytest.mark.slow
 def test_a_stiff_valley_of_bands():
     """By the conditions of an optimum; the gradients of reverse mode do not get there."""
     found = minimize(parallel_bands, jnp.zeros(8), **BOX, num_steps=60)

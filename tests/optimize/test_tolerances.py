@@ -93,6 +93,7 @@ def test_several_bands():
     )  # of a search that stops at 1e-14 of the cost
 
 
+@pytest.mark.slow
 def test_of_a_simulation():
     """The top's criterion by tilt and length: T is that of its gradient."""
     from lgsens.examples import spinning_top

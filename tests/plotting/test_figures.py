@@ -300,6 +300,7 @@ def test_work_precision():
         plotting.work_precision({"free": plotting.WorkPrecision([0.0], [1.0])})
 
 
+@pytest.mark.slow
 def test_sensitivities_along_a_trajectory():
     """w, v′ and λ′ of the top against differences of two simulations: w is the rotation from one to the other."""
 

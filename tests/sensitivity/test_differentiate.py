@@ -253,6 +253,7 @@ def door(p):
     return lg.Model({"door": body}, {"upper": hinge(0.5), "lower": hinge(-0.5)})
 
 
+@pytest.mark.slow
 def test_a_criterion_of_multipliers_that_are_not_unique():
     criterion = {"pull": lg.Criterion(integrand=lambda s, p: s.multiplier("upper")[0] ** 2)}
     with pytest.raises(ValueError, match=says("pull", "multipliers", "not unique", "lower", "upper")):

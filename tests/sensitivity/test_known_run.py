@@ -53,6 +53,7 @@ def test_both_modes_are_those_of_the_trajectory(scheme):
     alike(*found(state0, parameters, d, c))
 
 
+@pytest.mark.slow
 def test_sweeps_at_given_parameters():
     """d None is d = 0, of both sweeps and of the product, by rows everywhere."""
     scheme = lg.GeneralizedAlpha(0.9)

@@ -154,6 +154,7 @@ SPEED_AND_FORCE = {
 }
 
 
+@pytest.mark.slow
 def test_by_the_signal_of_a_driver():
     """Closed forms of ẋ, −m ẍ and ∫ m² ẍ²: Φ̇ has the part Φ_t, and Φ̈ its derivatives, which depend on f."""
     f, t1, w = 1.5, 0.3, 2.0 * np.pi * 1.5

@@ -107,6 +107,7 @@ def test_reverse_and_forward(scene):
     np.testing.assert_allclose(pulled_back, weights @ jacobian, rtol=0, atol=1e-11 * scale)
 
 
+@pytest.mark.slow
 def test_vmap(scene):
     """vmap(grad) lane by lane, and grad(vmap): the same numbers as one by one."""
     designs = scene.x[None, :] * jnp.array([[1.0, 1.0], [1.02, 1.0], [1.0, 0.97]])
