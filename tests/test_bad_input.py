@@ -262,6 +262,10 @@ CONSTRUCTORS = {
         lambda: lg.static_preload(lg.Model(TWO, {}, {"g": lg.Gravity(X), "coil": spring()}), ("g",)),
         ("`static_preload`: 'g' is not one of ['coil']",),
     ),
+    "preload of a spring without a direction": (
+        lambda: lg.static_preload(lg.Model(TWO, {}, {"coil": spring(at_b=ORIGIN)}), ("coil",)),
+        ("does not determine the preloads of ['coil']", "a spring of no length"),
+    ),
     # the integrator
     **{
         f"rho_inf = {value!r}": (

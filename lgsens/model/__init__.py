@@ -29,7 +29,6 @@ from lgsens.model._coordinates import (
     CoordinateCoupling as CoordinateCoupling,
     CoordinateForce as CoordinateForce,
     CoordinateMeasure as CoordinateMeasure,
-    RotationalSpringDamper as RotationalSpringDamper,
 )
 from lgsens.model._curves import CurveSpringDamper as CurveSpringDamper
 from lgsens.model._drivers import (
@@ -140,5 +139,6 @@ from lgsens.model._vehicle_forces import (
     BumpStop as BumpStop,
     Drag as Drag,
     PlaneContact as PlaneContact,
+    RotationalSpringDamper as RotationalSpringDamper,
     TorsionSpringDamper as TorsionSpringDamper,
 )

@@ -12,18 +12,25 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens._brief import brief
-from lgsens._validate import as_count, as_float, number_field, point_field, require, require_setting, suggestion
-from lgsens.liegroups import SO3, skew, turn_back
+from lgsens._validate import as_count, as_float, number_field, require, require_setting, suggestion
+from lgsens.liegroups import skew, turn_back
 from lgsens.model._constraints import AbstractClosedFormConstraint
-from lgsens.model._forces import AbstractConnection, AbstractForce, Attached, _frame
+from lgsens.model._forces import AbstractForce, Attached, _frame
 from lgsens.model._frames import BODY_DIM, Frame
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._loads import AbstractClosedFormLoad, LoadTangents
 from lgsens.model._relative import Coordinate, but_for_turns
 from lgsens.model._signal_fields import prescribed_field
 from lgsens.model._signals import Prescribed, at_time, prepared
-from lgsens.model._turning_loads import BallLoad
-from lgsens.model._turns import CountedTurns, acting, branch_of, force_along, require_half_a_turn, unless_whole
+from lgsens.model._turns import (
+    CountedTurns,
+    acting,
+    branch_of,
+    force_along,
+    require_half_a_turn,
+    unless_whole,
+    within_half_a_turn,
+)
 
 
 def _seen(a: Frame, b: Frame, on_a: Frame, on_b: Frame) -> Frame:
@@ -168,35 +175,9 @@ class CoordinateForce(AbstractForce):
         ends = _attached(self.joint, *(_frame(bodies, name, self.stiffness.dtype) for name in self.bodies))
         motor = None if self.motor is None else prepared(self.motor)
         coordinate = _coordinate("CoordinateForce", self.joint, self.coordinate)
-        load = CoordinateLoad(*ends, self.stiffness, self.damping, self.free, motor, coordinate)
+        free = within_half_a_turn(self.free) if coordinate.periodic and not self.turns else self.free
+        load = CoordinateLoad(*ends, self.stiffness, self.damping, free, motor, coordinate)
         return (Attached(CountedTurns(load) if self.turns else load, *self.bodies),)
-
-
-class RotationalSpringDamper(AbstractConnection):
-    """Spring and damper against all rotations between two bodies, of a ball joint say: the moment −k φ − c ω on b.
-
-    φ is the rotation vector of `b` in `a`, |φ| < π, and ω their relative angular velocity. A `Bushing` has a stiffness
-    about each of three axes.
-
-    Arguments:
-        a, b: names of the two bodies; None is the ground.
-        stiffness: k [N m/rad], shape ().
-        damping: c [N m s/rad], shape ().
-        turned: φ in the reference configuration [rad], inertial frame, shape (3,).
-
-    Raises `ValueError` for wrong shapes. Source: that of a ball joint in MuJoCo ("Computation": passive forces); φ and
-    its energy: Géradin & Cardona, Flexible Multibody Dynamics (2001), ch. 4.
-    """
-
-    a: str | None = eqx.field(static=True)
-    b: str | None = eqx.field(static=True)
-    stiffness: Float[Array, ""] = number_field("stiffness", default=0.0)
-    damping: Float[Array, ""] = number_field("damping", default=0.0)
-    turned: Float[Array, "3"] = point_field("turned", default=(0.0, 0.0, 0.0))
-
-    def load(self, a, b):
-        triad_b = b.orientation.T @ SO3().exp(self.turned)
-        return BallLoad(a.orientation.T, triad_b, self.stiffness, self.damping)
 
 
 class Coupled(AbstractClosedFormConstraint):

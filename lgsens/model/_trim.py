@@ -10,7 +10,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float, suggestion
+from lgsens._validate import as_float, require, suggestion
 from lgsens.dynamics import full_jacobian
 from lgsens.model._model import Model
 
@@ -36,7 +36,8 @@ def static_preload(model: Model, forces: Sequence[str], *, t0=0.0) -> tuple[Mode
         t0: the time at which time-dependent forces are taken [s].
 
     Returns the model and the largest force [N] or moment [N m] that remains unbalanced. Differentiable: a gradient
-    through it keeps the static equilibrium. Raises `ValueError` for a name that is not a spring.
+    through it keeps the static equilibrium. Raises `ValueError` for a name that is not a spring, and for preloads that
+    are not determined.
     """
     springs = [name for name, force in model.forces.items() if force.preload_shape is not None]
     for name in forces:
@@ -44,6 +45,12 @@ def static_preload(model: Model, forces: Sequence[str], *, t0=0.0) -> tuple[Mode
             raise ValueError(f"`static_preload`: {suggestion(name, springs)}.")
 
     values, unbalanced = _solve(model, tuple(forces), as_float(t0, (), "`t0`"))
+    require(
+        np.isfinite,
+        f"`static_preload`: the reference configuration does not determine the preloads of {list(forces)}: one has no "
+        "direction there (a spring of no length), or several and the joints hold the same. Name others.",
+        unbalanced,
+    )
     return _preloaded(model, forces, values), unbalanced
 
 

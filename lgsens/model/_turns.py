@@ -70,14 +70,20 @@ def branch_of(load: AlongCoordinate, a: Frame, b: Frame) -> Float[Array, ""]:
     return jnp.where(load.stiffness == 0.0, 0.0, load.value(a, b)[0])
 
 
-def require_half_a_turn(what: str, name: str, free: Float[Array, ""]) -> None:
+def require_half_a_turn(what: str, name: str, free: Float[Array, "*n"]) -> None:
     """Raise `ValueError` for a spring that is free where it is not before its bodies have turned."""
+    further = "" if free.ndim else "; a spring that is wound up further counts whole turns, `turns=True`"
     require(
-        lambda angle: abs(angle) <= np.pi,
-        f"{what}: `{name}` must be within half a turn, as its angle is, got {free} rad (not degrees); a spring that is "
-        "wound up further counts whole turns, `turns=True`.",
+        lambda angle: np.linalg.norm(angle) <= np.pi,
+        f"{what}: `{name}` must be within half a turn, as its angle is, got {free} rad (not degrees){further}.",
         free,
     )
+
+
+def within_half_a_turn(free: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The same of a number that is traced: one that is larger is none (`invalid_numbers`), as the spring would pull the
+    other way."""
+    return jnp.where(jnp.sum(free * free) <= (1.0 + 1e-6) * np.pi**2, free, jnp.nan)
 
 
 class CountedTurns(AbstractDynamicLoad):

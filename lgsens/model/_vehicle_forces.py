@@ -15,14 +15,15 @@ from lgsens._validate import (
     require_positive,
     require_setting,
 )
+from lgsens.liegroups import SO3
 from lgsens.model._contacts import PlaneContactLoad
 from lgsens.model._curves import CurveLoad
 from lgsens.model._forces import AbstractConnection, AbstractForce, Attached, _distance
 from lgsens.model._frames import normals
 from lgsens.model._signal_fields import prescribed_field
 from lgsens.model._signals import AbstractSignal, Prescribed, prepared
-from lgsens.model._turning_loads import DragLoad, TorsionLoad
-from lgsens.model._turns import CountedTurns, require_half_a_turn
+from lgsens.model._turning_loads import BallLoad, DragLoad, TorsionLoad
+from lgsens.model._turns import CountedTurns, require_half_a_turn, within_half_a_turn
 
 
 def _torsion(a, b, force, stiffness, free_angle=None, preload=None, motor=None) -> TorsionLoad:
@@ -86,8 +87,39 @@ class TorsionSpringDamper(AbstractConnection):
 
     def load(self, a, b):
         motor = None if self.motor is None else prepared(self.motor)
-        load = _torsion(a, b, self, self.stiffness, self.free_angle, self.preload, motor)
+        free = self.free_angle if self.free_angle is None or self.turns else within_half_a_turn(self.free_angle)
+        load = _torsion(a, b, self, self.stiffness, free, self.preload, motor)
         return CountedTurns(load) if self.turns else load
+
+
+class RotationalSpringDamper(AbstractConnection):
+    """Spring and damper against all rotations between two bodies, of a ball joint say: the moment −k φ − c ω on b.
+
+    φ is the rotation vector of `b` in `a`, |φ| < π, and ω their relative angular velocity. A `Bushing` has a stiffness
+    about each of three axes.
+
+    Arguments:
+        a, b: names of the two bodies; None is the ground.
+        stiffness: k [N m/rad], shape ().
+        damping: c [N m s/rad], shape ().
+        turned: φ in the reference configuration [rad], inertial frame, shape (3,), |φ| ≤ π.
+
+    Raises `ValueError` for wrong shapes and a larger φ. Source: that of a ball joint in MuJoCo ("Computation": passive
+    forces); φ and its energy: Géradin & Cardona, Flexible Multibody Dynamics (2001), ch. 4.
+    """
+
+    a: str | None = eqx.field(static=True)
+    b: str | None = eqx.field(static=True)
+    stiffness: Float[Array, ""] = number_field("stiffness", default=0.0)
+    damping: Float[Array, ""] = number_field("damping", default=0.0)
+    turned: Float[Array, "3"] = point_field("turned", default=(0.0, 0.0, 0.0))
+
+    def __check_init__(self):
+        require_half_a_turn("RotationalSpringDamper", "turned", self.turned)
+
+    def load(self, a, b):
+        triad_b = b.orientation.T @ SO3().exp(within_half_a_turn(self.turned))
+        return BallLoad(a.orientation.T, triad_b, self.stiffness, self.damping)
 
 
 class AntiRollBar(AbstractConnection):

@@ -373,6 +373,10 @@ BAD = {
         lambda: lg.TorsionSpringDamper("a", "b", axis=X, free_angle=0.0, preload=1.0),
         "`free_angle` or `preload`, not both",
     ),
+    "turned": (
+        lambda: lg.RotationalSpringDamper("a", "b", stiffness=1.0, turned=(0.0, 2.0, 3.0)),
+        "`turned` must be within half a turn",
+    ),
     "bore": (lambda: lg.AntiRollBar("a", "b", axis=X, diameter=0.02, bore=0.03, length=1.0), "`diameter` > `bore`"),
     "rounding": (
         lambda: lg.BumpStop("a", "b", at_a=AT, at_b=AT_B, gap=0.0, stiffness=1.0, rounding=0.0),

@@ -210,3 +210,23 @@ def test_springs_against_all_rotations_fail_there_too(name):
         free = run(loose)
         assert free.result == lg.RESULTS.successful
         np.testing.assert_allclose(free.joint("hinge").angle[-1], 0.5 * start, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "spring",
+    [
+        lambda x: torsion(STIFFNESS, x),
+        lambda x: coordinate(STIFFNESS, x),
+        lambda x: lg.RotationalSpringDamper(
+            None, "rotor", stiffness=STIFFNESS, turned=jnp.stack([0.0 * x, 0.0 * x, x])
+        ),
+    ],
+    ids=["torsion", "coordinate", "rotational"],
+)
+def test_half_a_turn_is_the_most_for_traced_numbers_too(spring):
+    """Whether the numbers of a scene are sound; a spring that is wound up by more would pull the other way."""
+    sound = jax.jit(lambda x: scene(spring(x)).system().is_valid())
+    assert sound(np.pi) and not sound(np.pi + 0.01) and not sound(-4.0)
+    slope = jax.jit(jax.grad(lambda x: lg.initial_state(scene(spring(x))).vdot[0]))
+    # J θ̈ = ± k x; one factorization of a scalar
+    np.testing.assert_allclose(abs(slope(1.0)), STIFFNESS / INERTIA, rtol=1e-13)
