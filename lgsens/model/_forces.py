@@ -170,9 +170,8 @@ class SpringDamper(AbstractConnection):
             ℓ₀ is then the reference length.
 
     Give `free_length` or `preload`, not both; with neither the spring is free in the reference
-    configuration. Points that coincide exchange no force, and as reference give ℓ₀ = 0 the derivative zero; if they
-    part from there with a damper between them, the scheme's order is lost: begin a nanometre beside, or take a
-    `Bushing`. Raises `ValueError` for both, or wrong shapes.
+    configuration. Points that coincide at rest exchange no force, and as reference give ℓ₀ = 0 the derivative zero;
+    those that part do in the direction in which they do. Raises `ValueError` for both, or wrong shapes.
     """
 
     a: str | None = eqx.field(static=True)

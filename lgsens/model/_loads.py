@@ -165,8 +165,12 @@ class SpringDamperLoad(AbstractClosedFormLoad):
 
         ∂/∂q = Dᵀ n (k nᵀD + c (sᵀ P D + nᵀS)) + F Dᵀ P D + D_q(Dᵀ f)|_{f = nF},     ∂/∂v = c Dᵀ n nᵀ D.
 
-    Points that meet give no direction: n = 0 there, and no force. A spring whose tension vanishes with its length pulls
-    with k d all the same: f = (F/|d|) d with F/|d| = k + (F₀ − k ℓ₀ + c ḋ·n)/|d|, and 1/|d| taken as 0 at d = 0.
+    Points that meet give no direction but that in which they part: n = ḋ/|ḋ| there, kept in derivatives; 0, and no
+    force, at rest. A spring whose tension vanishes with its length pulls with k d all the same: the force on b is −f,
+
+        f = F n = k d + (F₀ − k ℓ₀ + c ḋ·n) n,     F P/|d| = (k + (F₀ − k ℓ₀ + c ḋ·n)/|d|) (I − n nᵀ),
+
+    with 1/|d| taken as 0 at d = 0.
     """
 
     point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
@@ -183,37 +187,40 @@ class SpringDamperLoad(AbstractClosedFormLoad):
         return "spring" if float(self.stiffness) > 0 else "damper"
 
     def _line(self, a, b, va, vb):
-        """d, 1/|d| and the rate of |d|."""
+        """d, 1/|d|, n and the rate of |d|."""
         d = b.point(self.point_b) - a.point(self.point_a)
-        square = jnp.sum(d * d)
-        meet = square == 0.0
-        inverse = jnp.where(meet, 0.0, lax.rsqrt(jnp.where(meet, 1.0, square)))
         speed_a, speed_b = (
             v[: ROTATION.start] + frame.axis(cross(v[ROTATION], point))
             for v, frame, point in ((va, a, self.point_a), (vb, b, self.point_b))
         )
-        return d, inverse, inverse * jnp.sum(d * (speed_b - speed_a))
+        speed = speed_b - speed_a
+        meet = jnp.sum(d * d) == 0.0
+        along = jnp.where(meet, lax.stop_gradient(speed), d)
+        square = jnp.sum(along * along)
+        inverse = jnp.where(square == 0.0, 0.0, lax.rsqrt(jnp.where(square == 0.0, 1.0, square)))
+        n = inverse * along
+        return d, jnp.where(meet, 0.0, inverse), n, jnp.sum(n * speed)
 
     def measure(self, a, b, va, vb, t) -> LineForce:
-        d, inverse, rate = self._line(a, b, va, vb)
-        length = inverse * jnp.sum(d * d)
+        d, _, n, rate = self._line(a, b, va, vb)
+        length = jnp.sum(n * d)
         tension = self.preload + self.stiffness * (length - self.free_length) + self.damping * rate
         return LineForce(length, rate, tension)
 
-    def _per_length(self, inverse, rate):
-        """F/|d|."""
-        constant = self.preload - self.stiffness * self.free_length
-        return self.stiffness + (constant + self.damping * rate) * inverse
+    def _but_for_length(self, rate):
+        """F − k |d|."""
+        return self.preload - self.stiffness * self.free_length + self.damping * rate
 
     def force(self, a, b, va, vb, t):
-        d, inverse, rate = self._line(a, b, va, vb)
-        return -separation_force(a, b, self.point_a, self.point_b, self._per_length(inverse, rate) * d)
+        d, _, n, rate = self._line(a, b, va, vb)
+        force = self.stiffness * d + self._but_for_length(rate) * n
+        return -separation_force(a, b, self.point_a, self.point_b, force)
 
     def tangents(self, a, b, va, vb, t):
-        _, inverse, rate = self._line(a, b, va, vb)
+        _, inverse, n, rate = self._line(a, b, va, vb)
         d, gradient = separation(a, b, self.point_a, self.point_b)
-        n, per_length = inverse * d, self._per_length(inverse, rate)
-        along = n @ gradient
+        more = self._but_for_length(rate)
+        along, per_length = n @ gradient, self.stiffness + more * inverse
         speed = gradient @ jnp.concatenate([va, vb])
         turning_a = a.orientation @ skew(cross(self.point_a, va[ROTATION]))
         turning_b = b.orientation @ skew(cross(self.point_b, vb[ROTATION]))
@@ -223,7 +230,7 @@ class SpringDamperLoad(AbstractClosedFormLoad):
         position = (
             jnp.outer(along, self.stiffness * along + self.damping * rate_gradient)
             + per_length * (gradient.T @ across)
-            + separation_stiffness(a, b, self.point_a, self.point_b, per_length * d)
+            + separation_stiffness(a, b, self.point_a, self.point_b, self.stiffness * d + more * n)
         )
         return LoadTangents(-position, -self.damping * jnp.outer(along, along))
 

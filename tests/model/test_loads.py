@@ -261,11 +261,11 @@ def test_moment_of_an_applied_force_is_fixed_in_the_body():
 
 
 def test_spring_of_coinciding_points_is_finite():
-    """No direction, no force; value, tangents and the derivative by every number are finite."""
+    """At rest no direction, no force; value, tangents and the derivative by every number are finite."""
     zero, one = jnp.zeros(3), jnp.ones(())
     load = SpringDamperLoad(zero, zero, one, one, one, one)
     frame, twist, t = Frame(zero, jnp.eye(3)), jnp.ones(6), jnp.zeros(())
-    np.testing.assert_array_equal(load.force(frame, frame, twist, -twist, t), np.zeros(12))
+    np.testing.assert_array_equal(load.force(frame, frame, twist, twist, t), np.zeros(12))
 
     def everything(load, frame):
         return load.force(frame, frame, twist, -twist, t), load.tangents(frame, frame, twist, -twist, t)
@@ -273,6 +273,46 @@ def test_spring_of_coinciding_points_is_finite():
     derivative = jax.jit(jax.jacrev(everything))(load, frame)
     values = jax.tree.leaves((everything(load, frame), derivative))
     assert all(np.all(np.isfinite(leaf)) for leaf in values)
+
+
+def test_points_that_meet_and_part_have_the_force_of_a_moment_later():
+    """Value and tangents are those at a distance along the way, to that distance: F₀ + k (0 − ℓ₀) + c |ḋ| along ḋ; and
+    of the force by autodiff at the point itself."""
+    rng = np.random.default_rng(3)
+    arms, numbers = jnp.asarray(rng.normal(size=(2, 3))), jnp.asarray([7.0, 3.0, 0.2, 0.9])
+    load = SpringDamperLoad(*arms, *numbers)
+    a, b = (Frame(jnp.zeros(3), jnp.asarray(random_rotation(rng))) for _ in range(2))
+    for _ in range(2):  # the second removes the round-off of the first
+        b = Frame(b.position + (a.point(arms[0]) - b.point(arms[1])), b.orientation)
+    assert np.all(a.point(arms[0]) == b.point(arms[1]))
+    va, vb, none = jnp.asarray(rng.normal(size=6)), jnp.asarray(rng.normal(size=6)), jnp.zeros(())
+    speed = b.orientation @ jnp.cross(vb[3:], arms[1]) + vb[:3] - a.orientation @ jnp.cross(va[3:], arms[0]) - va[:3]
+    size, n = np.linalg.norm(speed), speed / np.linalg.norm(speed)
+    found = load.measure(a, b, va, vb, none)
+    expected = 0.9 - 7.0 * 0.2 + 3.0 * size
+    np.testing.assert_allclose([found.length, found.rate, found.tension], [0.0, size, expected], rtol=1e-14)
+    force = load.force(a, b, va, vb, none)
+    np.testing.assert_allclose(force[6:9], -expected * n, rtol=0, atol=1e-13)
+    later = Frame(b.position + 1e-7 * n, b.orientation)
+    np.testing.assert_allclose(load.force(a, later, va, vb, none), force, rtol=0, atol=1e-5)
+    by_autodiff = jax.jacfwd(lambda v: load.force(a, b, va, v, none))(vb)
+    np.testing.assert_allclose(load.tangents(a, b, va, vb, none).velocity[:, 6:], by_autodiff, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("start", [0.0, 1e-9])
+def test_a_damper_between_points_that_part_keeps_the_order(start):
+    """m ẍ + c ẋ + k x = 0 from x = 0 with ẋ = 1: e^(−2t) sin(√96 t)/√96, in steps of 5 and 2.5 ms: h² times 5."""
+
+    def end(steps):
+        body = lg.RigidBody(2.0, None, velocity=(1.0, 0.0, 0.0), position=(start, 0.0, 0.0), free="x")
+        ends = {"at_a": (0.0, 0.0, 0.0), "at_b": (start, 0.0, 0.0)}
+        spring = lg.SpringDamper(None, "b", **ends, free_length=0.0, stiffness=200.0, damping=8.0)
+        run = lg.simulate(lg.Model({"b": body}, forces={"spring": spring}), t1=0.25, num_steps=steps)
+        return run.body("b").position[-1, 0]
+
+    exact = np.exp(-0.5) * np.sin(np.sqrt(96.0) / 4) / np.sqrt(96.0)
+    coarse, fine = (abs(end(steps) - exact) for steps in (50, 100))
+    assert coarse < 5 * 0.005**2 and 3.8 < coarse / fine < 4.2
 
 
 def test_spring_of_no_length_has_its_tangent_where_its_points_meet():
