@@ -48,9 +48,8 @@ def defect_densities(
 
     The first of the k rows is η_n/|Ψ|; the squares of the others add up to that of dη_n/dp over |dΨ/dp|.
     """
-    motion = unpacked(
-        known_motion(build, start, p, t0, t1, num_steps, scheme)
-    )  # of this program: what is refused is so
+    # in this program, so that what is refused is so before anything is compiled
+    motion = unpacked(known_motion(build, start, p, t0, t1, num_steps, scheme))
     known = motion.known
     flat, unravel = ravel_pytree(p)
 

@@ -68,7 +68,8 @@ def repeated_equations(system: MultibodySystem) -> Equations:
         for owner, place, own in zip(stack.owners, stack.places, rows):
             equations |= {int(row): (owner, place, i) for i, row in enumerate(own) if row >= 0}
     repeating = redundant_names(found.jacobian, system.constraint_names)
-    if conflicts := [name for name in repeating if _prescribes(system.joints[name])]:
+    prescribing = {name for name, of in zip(system.constraint_names, driven) if of}
+    if conflicts := [name for name in repeating if name in prescribing]:
         raise ValueError(
             f"Model: redundant='remove': {conflicts} prescribe what the other joints determine already; leave one out "
             f"of {repeating}."

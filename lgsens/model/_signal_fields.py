@@ -59,15 +59,15 @@ def prescribed_field(name: str, *, positional: bool = False, driven: bool = Fals
     positions follow, and so velocities and accelerations its derivatives."""
 
     def convert(value: Any) -> Prescribed | None:
-        if driven and isinstance(value, AbstractSignal) and value.straight:
-            raise ValueError(
-                f"`{name}` follows straight lines between samples: at each the velocity would jump, and no force is "
-                'large enough for that. Give Sampled(…, kind="cubic"), or "monotone".'
-            )
-        if callable(value) and not isinstance(value, AbstractSignal):
-            raise _no_signal(name, "a number or a signal", value)
         if isinstance(value, AbstractSignal):
+            if driven and value.straight:
+                raise ValueError(
+                    f"`{name}` follows straight lines between samples: at each the velocity would jump, and no force "
+                    'is large enough for that. Give Sampled(…, kind="cubic"), or "monotone".'
+                )
             return _a_number(name, value)
+        if callable(value):
+            raise _no_signal(name, "a number or a signal", value)
         return None if value is None else as_float(value, (), f"`{name}`")
 
     return eqx.field(converter=convert, kw_only=not positional, default=None, metadata={"prescribed": True})
