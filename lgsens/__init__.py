@@ -47,6 +47,7 @@ from lgsens.criteria import (
 from lgsens.dynamics import RESULTS as RESULTS, AbstractSystem as AbstractSystem, State as State
 from lgsens.integrate import (
     AdaptiveSteps as AdaptiveSteps,
+    AlignedSteps as AlignedSteps,
     GeneralizedAlpha as GeneralizedAlpha,
     GivenSteps as GivenSteps,
     IndexReducedODE as IndexReducedODE,

@@ -72,12 +72,12 @@ def run_length(arguments: Any) -> dict[str, Any]:
 def at_accuracy(job: Any, accuracy: float, progress: bool) -> tuple[Any, Reached]:
     """The job in as many steps as Ψ₀ over the bump and its gradient at the start take to have a relative error."""
     problem, fewest = job.problem, max(1, round(FEWEST * float(job.problem.t1)))
-    order = check_accuracy(accuracy, fewest, GeneralizedAlpha(), problem.start)
+    check_accuracy(accuracy, fewest, GeneralizedAlpha(), problem.start)
     build = lambda x: problem.scene(x)  # a key of compiled programs, which a method of a pytree is not
     gradient = partial(differentiate, COMFORT, build, problem.start, t1=problem.t1)
     run = lambda n, throw: gradient(num_steps=n, throw=throw)
     with compiling("the gradient for the number of steps", progress):
-        reached = differentiate_to(run, accuracy, order, fewest, extrapolate=False).reached
+        reached = differentiate_to(run, accuracy, GeneralizedAlpha(), fewest, extrapolate=False).reached
     if progress:
         print(f"Psi_0 and its gradient at the start: {reached.brief}", file=sys.stderr, flush=True)
     return job._replace(problem=dataclasses.replace(problem, num_steps=reached.num_steps)), reached

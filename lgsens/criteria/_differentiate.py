@@ -1,13 +1,11 @@
 """`differentiate`: the value and the gradient of criteria, by any method through one call."""
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
@@ -19,10 +17,11 @@ from lgsens.criteria._by_parts import Parts, reverse_by_parts, unique
 from lgsens.criteria._certify import certify, check_certifiable
 from lgsens.criteria._criterion import Criterion, stacked
 from lgsens.criteria._criterion_use import Use, checked_for
+from lgsens.criteria._index_reduced_method import by_index_reduced
 from lgsens.criteria._reference_methods import STENCIL, FiniteDifferences, IndexReduced
 from lgsens.criteria._to_accuracy import differentiate_to
 from lgsens.dynamics import RESULTS, AbstractSystem, State, Turns
-from lgsens.integrate import AbstractIntegrator, AdaptiveSteps, EqualGrid, GeneralizedAlpha, UnevenGrid
+from lgsens.integrate import AbstractIntegrator, EqualGrid, GeneralizedAlpha, UnevenGrid
 from lgsens.model import Model
 from lgsens.sensitivity import (
     AbstractSensitivity,
@@ -36,6 +35,7 @@ from lgsens.sensitivity import (
 from lgsens.simulation import (
     Begin,
     Reached,
+    aligned,
     as_system,
     begin,
     check_accuracy,
@@ -105,7 +105,8 @@ def differentiate(
         accuracy: take as many steps as the criteria take to have this error, outside of `jit`, and extrapolate where
             that is less work: the largest relative error of a value and of a gradient, of this by its norm, as far as
             runs in n, 2n, 4n, … steps tell. `reached` says what was reached and how. `num_steps` is then the first
-            number of steps, 64 by default: enough of them to see the shortest event (the bump of a road).
+            number of steps, 64 by default: enough of them to see the shortest event. Edges of roads and signals are
+            seen, and steps end there (`AlignedSteps`; not with a certificate, which is of equal steps).
         certificate: also say what value and gradient are worth, outside of `jit`: their errors, what may spoil them,
             and whether they are good to `accuracy`, or to 1e-3 (`certify`; a run of its own where a `method` is given
             or an `accuracy`). Runs are not extrapolated then.
@@ -137,11 +138,14 @@ def differentiate(
     if accuracy is not None:
         if not throw:
             raise ValueError("`accuracy` raises where it is not reached; leave `throw` out.")
-        order = check_accuracy(accuracy, num_steps, integrator, (p, t0, t1))
-        if certificate:
+        check_accuracy(accuracy, num_steps, integrator, (p, t0, t1))
+        if certificate:  # which is of equal steps
             check_certifiable(integrator, None, (p, t0, t1))
-        run = lambda n, throw: differentiate(criteria, build, p, num_steps=n, method=method, throw=throw, **settings)
-        found = differentiate_to(run, float(accuracy), order, num_steps, extrapolate=not certificate)
+        else:
+            integrator, num_steps = aligned(integrator, build(as_parameters(p)), t0, t1, num_steps)
+        settings |= {"method": method, "integrator": integrator}
+        run = lambda n, throw: differentiate(criteria, build, p, num_steps=n, throw=throw, **settings)
+        found = differentiate_to(run, float(accuracy), integrator, num_steps, extrapolate=not certificate)
         return found._replace(certificate=worth(num_steps=found.reached.num_steps, tolerance=float(accuracy)))
     num_steps = as_count(num_steps, "num_steps", " (it is static), unless `accuracy` is given")
     check_integrator(integrator, num_steps)
@@ -167,7 +171,7 @@ def differentiate(
     task = _Task(leaves, build, state0, None, integrator, num_steps, t0, t1)
     details, labels, note = None, (), ""
     if isinstance(method, IndexReduced):
-        value, gradient = _index_reduced(task, p, method)
+        value, gradient = by_index_reduced(task, p, method)
         result = jnp.zeros((), jnp.int32)
     else:
         with tracing():
@@ -188,36 +192,6 @@ def differentiate(
 def _flies(method: Method, integrator: AbstractIntegrator) -> bool:
     """Whether criteria are differentiated on the fly."""
     return isinstance(method, DirectDifferentiation) and not (integrator.extrapolated or integrator.scheme.has_stages)
-
-
-def _index_reduced(task: "_Task", p, method: IndexReduced):
-    from lgsens.criteria._index_reduced import integrate_index_reduced  # diffrax takes its time to import
-
-    if task.start is not None:
-        raise ValueError("IndexReduced starts from the consistent initial state of the model; leave `state0` out.")
-    flat, unravel = ravel_pytree(p)
-    shapes = tuple(leaf.shape for leaf in jax.tree.leaves(p))
-    scene = (task.criteria, task.build, jax.tree.structure(p), shapes)
-    rate, final, system = (_functions if _hashable(scene) else _functions.__wrapped__)(*scene)
-    settings = {"rtol": method.rtol, "atol": method.atol, "breaks": method.breaks}
-    found = integrate_index_reduced(rate, final, system, flat, task.t0, task.t1, **settings)
-    return tuple(found.value), tuple(unravel(row) for row in found.gradient)
-
-
-def _hashable(scene) -> bool:
-    """False of a method of a pytree, which has numbers: that scene compiles anew."""
-    try:
-        hash(scene)
-    except TypeError:
-        return False
-    return True
-
-
-@functools.lru_cache(maxsize=64)
-def _functions(criteria, build, structure, shapes):
-    """F, G and the system as functions of the flat vector; the same ones for the same scene, so compiled once."""
-    _, unravel = ravel_pytree(jax.tree.unflatten(structure, [np.zeros(shape) for shape in shapes]))
-    return *stacked(criteria, unravel), lambda p: as_system(build(unravel(p)))
 
 
 class _Task(NamedTuple):
@@ -314,7 +288,7 @@ def _continuous_adjoint(task: _Task, p, method: ContinuousAdjoint, uses: list[Us
         return system, begun.start.state.q, begun.consistent_v
 
     (system, q0, _), pull_back = jax.vjp(initial, p)
-    if isinstance(task.integrator, AdaptiveSteps):
+    if task.integrator.by_motion:
         raise ValueError(
             "ContinuousAdjoint integrates backwards from t1, where the steps that error control has left over are "
             "empty: give it the grid found, `GivenSteps.of(trajectory)`, or take DirectDifferentiation() or "

@@ -39,7 +39,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from lgsens._validate import as_count, as_float, is_concrete, require
-from lgsens.dynamics import RESULTS, AbstractSystem, State, accelerations, initial_state
+from lgsens.dynamics import RESULTS, AbstractSystem, State, accelerations, breaks_of, initial_state
 from lgsens.simulation import SimulationError, throw_if_failed
 
 Pointwise = Callable[[Array, AbstractSystem, State, Array], Float[Array, " c"]]
@@ -79,8 +79,8 @@ def integrate_index_reduced(
         t0, t1: initial and final time [s], shape (); t1 > t0.
         rtol, atol: tolerances of one step, for each entry of the motion, the integrals and their derivatives.
         max_steps: steps to try; static.
-        breaks: the times at which forces are not smooth in t (both ends of a bump): no step crosses one. Forces
-            must be continuous there if the time depends on p.
+        breaks: the times at which forces are not smooth in t, beside those that signals of the system tell (both ends
+            of a bump): no step crosses one. Forces must be continuous there if the time depends on p.
 
     Compiled once for each triple of functions, told apart by identity: define them outside a loop. All numbers may
     change, also those in a callable `equinox.Module`. Can be called inside `jit` and under `vmap`; the result is not
@@ -130,6 +130,7 @@ def _run(rate, final, build, p, t0, t1, tolerances, max_steps, jumps):
     (numbers, initial), push = jax.linearize(start, p)
     varied_numbers, varied = jax.vmap(push)(directions)
     system = eqx.combine(numbers, rest)
+    jumps = jnp.concatenate([jumps, breaks_of(system).astype(p.dtype)])
     zeros = _no_integrals(rate, final, p, system, initial.state, t0)
     y, unravel = ravel_pytree((initial.state.q, initial.state.v, zeros))
     eta = jax.vmap(lambda state: ravel_pytree((state.q, state.v, zeros))[0])(varied.state)

@@ -35,7 +35,7 @@ class IndexReduced(eqx.Module):
 
     Arguments:
         rtol, atol: tolerances, relative and absolute.
-        breaks: times [s] at which a force is not smooth (where a bump begins or ends).
+        breaks: times [s] at which a force is not smooth, beside those that signals tell (where a bump begins or ends).
 
     Raises `ValueError` for tolerances that are not positive.
     """

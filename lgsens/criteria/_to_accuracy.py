@@ -7,11 +7,17 @@ import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from lgsens.integrate import AbstractIntegrator
 from lgsens.simulation import richardson, to_accuracy
 
 
 def differentiate_to(
-    run: Callable[[int, bool], Any], accuracy: float, order: int, fewest: int | None, *, extrapolate: bool
+    run: Callable[[int, bool], Any],
+    accuracy: float,
+    integrator: AbstractIntegrator,
+    fewest: int | None,
+    *,
+    extrapolate: bool,
 ) -> Any:
     """The `Sensitivities` that have it, with `reached`; `run`: number of steps, whether to raise ↦ `Sensitivities`."""
 
@@ -24,8 +30,8 @@ def differentiate_to(
         value, gradient = richardson(lambda _: next(two), 1).value
         return fine._replace(value=value, gradient=gradient)
 
-    how = extrapolated if extrapolate and order == 2 else None
-    found, reached = to_accuracy(run, distance, how, accuracy, order, fewest)
+    how = extrapolated if extrapolate and integrator.scheme.convergence_order == 2 else None
+    found, reached = to_accuracy(run, distance, how, accuracy, integrator, fewest)
     return found._replace(reached=reached)
 
 

@@ -124,6 +124,10 @@ class AbstractGrid(eqx.Module):
         """The size of the step to which the state at t0 belongs."""
 
     @abc.abstractmethod
+    def halved(self) -> "AbstractGrid":
+        """Each step divided into two."""
+
+    @abc.abstractmethod
     def segments(self, count: int, length: int) -> "AbstractGrid":
         """The grids of successive parts of `length` steps each, stacked; what they have too many are any steps."""
 
@@ -180,6 +184,10 @@ class EqualGrid(AbstractGrid):
     @property
     def first_size(self):
         return self.h
+
+    def halved(self):
+        count = None if self.count is None else 2.0 * self.count
+        return EqualGrid(self.t0, self.h / 2.0, 2 * self.num_steps, count)
 
     def segments(self, count, length):
         n = length * jnp.arange(count, dtype=self.h.dtype)
@@ -271,6 +279,9 @@ class UnevenGrid(AbstractGrid):
 
     def empty(self, place):
         return place.size == 0.0
+
+    def halved(self):
+        return UnevenGrid(self.t0, jnp.repeat(self.h / 2.0, 2), self.before / 2.0, self.room)
 
     def segments(self, count, length):
         h = jnp.concatenate([self.h, jnp.zeros(count * length - self.num_steps, self.h.dtype)]).reshape(count, length)

@@ -89,7 +89,15 @@ class Laid(NamedTuple):
 
 
 class AbstractIntegrator(eqx.Module):
-    """A scheme, and how its steps are laid."""
+    """A scheme, and how its steps are laid.
+
+    Attributes:
+        any_number: whether there may be any number of steps, as data too (`Steps`), twice as many being their halves.
+        by_motion: whether the motion decides where steps end.
+    """
+
+    any_number: ClassVar[bool] = True
+    by_motion: ClassVar[bool] = False
 
     @property
     @abc.abstractmethod
@@ -110,7 +118,7 @@ class AbstractIntegrator(eqx.Module):
         """Raise `ValueError` for a number of steps that these are not."""
 
     def lay(self, system: AbstractSystem, start: Start, t0, t1, num_steps) -> Laid:
-        """The grid of a run from t0 to t1: here equal steps. `num_steps`: an int, or `Steps` where steps are equal."""
+        """The grid of a run from t0 to t1: here equal steps. `num_steps`: an int, or `Steps`."""
         return Laid(EqualGrid.between(t0, t1, num_steps))
 
     def as_data(self, dtype) -> "AbstractIntegrator":

@@ -30,7 +30,7 @@ Mathematics 185 (2006), doi:10.1016/j.cam.2005.03.008 (limiter).
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -47,6 +47,7 @@ from lgsens.integrate._generalized_alpha import GeneralizedAlpha
 from lgsens.integrate._grid import UnevenGrid, with_first, without_round_off
 from lgsens.integrate._linearized import Node
 from lgsens.integrate._march import Progress, Walk, selected
+from lgsens.integrate._pieces import PieceEnds
 from lgsens.integrate._scheme import AbstractIntegrator, AbstractScheme, Laid, Start, Stats, scheme_of
 
 _AIM = 0.5  # θ: few steps are rejected
@@ -74,6 +75,7 @@ class GivenSteps(AbstractIntegrator):
     Raises `ValueError` for fractions of another shape or sign.
     """
 
+    any_number: ClassVar[bool] = False
     fractions: Float[Array, " n"]
     integrator: AbstractScheme = eqx.field(static=True, default=GeneralizedAlpha())
 
@@ -148,9 +150,11 @@ class AdaptiveSteps(AbstractIntegrator):
         tolerance: the error that a step may add to a configuration, relative to 1 rad or the length of the scene.
             Global errors of generalized-α fall as tolerance^(2/3): a thousandth of it, a hundredth of them, in ten
             times the steps. Those of Radau IIA fall as its power 1 to 5/4, in stiff scenes 3/4.
-        longest: the longest step, as a fraction of the interval t1 − t0; for Radau IIA, whose steps are few, 1. A
-            system at rest does not see ahead: no longer than half the shortest event that comes then, the bump of a
-            road.
+        longest: the longest step, as a fraction of the interval t1 − t0; for Radau IIA, whose steps are few, 1.
+
+    Steps end where a signal or a derivative of it jumps (`AbstractSignal.breaks`), of which there may be 256, and there
+    are three at least between two such times. Of other events a system at rest does not see ahead: let `longest` be no
+    more than half the shortest one that comes then.
 
     `num_steps` of `simulate` is the largest number of steps. The trajectory has so many rows; those after the last step
     repeat t1 and the state there, so that integrals and `state(-1)` are right, and its `stats` are `ControlledStats`.
@@ -166,6 +170,8 @@ class AdaptiveSteps(AbstractIntegrator):
     All static and hashable. Raises `ValueError` for settings out of range.
     """
 
+    any_number: ClassVar[bool] = False
+    by_motion: ClassVar[bool] = True
     integrator: AbstractScheme = eqx.field(static=True, default=GeneralizedAlpha())
     tolerance: float = eqx.field(static=True, default=1e-6, kw_only=True)
     longest: float = eqx.field(static=True, default=0.02, kw_only=True)
@@ -244,20 +250,23 @@ def _controlled_steps(
     scheme, total = settings.integrator, num_steps * h
     walk, scale, power = Walk.of(scheme, system), system.coordinate_scale(), scheme.error_power
     tolerance = max(settings.tolerance, 16 * float(jnp.finfo(h.dtype).eps))
+    pieces = PieceEnds.of(system, t0, total)
 
     def relative(c, h):
         return h**power * jnp.max(jnp.abs(c) / scale) / tolerance
 
-    def fitted(h, remaining):
+    def fitted(h, remaining, longest):
         """A whole number of such steps for what remains: none at the end that differs from those before."""
-        least = remaining / (settings.longest * total)
+        most = settings.longest * total
+        least = remaining / (most if longest is None else jnp.minimum(most, longest))
         return remaining / jnp.ceil(jnp.maximum(remaining / h - 0.1, least * (1.0 - 1e-9)))
 
     def step(carry, n):
         progress, size, proposed, before, elapsed = carry
         active = progress.running & (elapsed < total)
-        remaining = jnp.where(active, total - elapsed, h)
-        wanted = fitted(proposed, remaining)
+        until, longest = pieces.after(elapsed)
+        remaining = jnp.where(active, until - elapsed, h)
+        wanted = fitted(proposed, remaining, longest)
         resize = lambda: scheme.resized(system, progress.state, t0 + elapsed)
         shapes = jax.eval_shape(resize)
         none_yet = alike(jax.tree.map(jnp.zeros_like, shapes), shapes)
@@ -312,7 +321,7 @@ def _controlled_steps(
         keeps = (grown > _KEPT[0] * trial.h) & (grown < _KEPT[1] * trial.h)
         longest = 0.8 * _TURN / unsteady_rate(system, progress.state.v, progress.state.vdot)
         proposed = jnp.minimum(jnp.where(keeps, trial.h, grown), longest)
-        elapsed = jnp.where(active, jnp.where(trial.h >= remaining, total, elapsed + trial.h), elapsed)
+        elapsed = jnp.where(active, jnp.where(trial.h >= remaining, until, elapsed + trial.h), elapsed)
         h_taken = jnp.where(active | ~progress.running, trial.h, 0.0)
         carry = (progress, jnp.where(active, trial.h, size), proposed, error, elapsed)
         return carry, (h_taken, progress.state, trial.stats, trial.error * tolerance, trial.rejected)

@@ -87,6 +87,10 @@ class BumpRoad(AbstractSignal):
             self.duration,
         )
 
+    @property
+    def breaks(self):
+        return jnp.stack([self.start, self.start + self.duration])
+
     def __call__(self, t):
         phase = (t - self.start) / self.duration
         on_bump = (phase >= 0) & (phase <= 1)
@@ -113,6 +117,10 @@ class SampledRoad(AbstractSignal):
     @property
     def straight(self):
         return True
+
+    @property
+    def breaks(self):
+        return self.times
 
     @staticmethod
     def random(key: Key[Array, ""], times, *, roughness, speed, wave_number=0.1) -> "SampledRoad":

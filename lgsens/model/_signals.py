@@ -35,11 +35,12 @@ from jaxtyping import Array, Float
 
 from lgsens._brief import as_called
 from lgsens._validate import as_float, number_field, require, shaped
+from lgsens.dynamics import AbstractTimeFunction
 
 _KINDS = ("linear", "cubic", "monotone")
 
 
-class AbstractSignal(eqx.Module):
+class AbstractSignal(AbstractTimeFunction):
     """A scalar function of time: what drivers, rods, roads and forces follow.
 
     A signal of one's own has leaves for its numbers and `__call__`, so that it can be differentiated by them and
@@ -54,6 +55,8 @@ class AbstractSignal(eqx.Module):
         def __call__(self, t):
             return self.amplitude * jnp.sin(jnp.pi * self.rate * t**2)
     ```
+
+    One that is not smooth says where in `breaks`, so that steps can end there (`AlignedSteps`).
     """
 
     __repr__ = as_called
@@ -146,6 +149,10 @@ class Ramp(AbstractSignal):
             lambda duration: duration > 0, f"Ramp: `duration` must be positive, got {self.duration} s.", self.duration
         )
 
+    @property
+    def breaks(self):
+        return jnp.stack([self.t_start, self.t_start + self.duration])
+
     def __call__(self, t):
         # the polynomial has zero slope and curvature at 0 and 1, whatever JAX says of those of `clip` there
         x = jnp.clip((t - self.t_start) / self.duration, 0.0, 1.0)
@@ -179,6 +186,10 @@ class Sampled(AbstractSignal):
     def straight(self):
         return self.kind == "linear"
 
+    @property
+    def breaks(self):
+        return self.times
+
     def __call__(self, t):
         return jnp.interp(t, self.times, self.values) if self.kind == "linear" else prepared(self)(t)
 
@@ -189,6 +200,10 @@ class _Spline(AbstractSignal):
     times: Float[Array, " n"]
     values: Float[Array, " n"]
     curvatures: Float[Array, " n"]  # m
+
+    @property
+    def breaks(self):
+        return self.times
 
     @classmethod
     def through(cls, sampled: Sampled) -> "_Spline":
@@ -222,6 +237,10 @@ class _Monotone(AbstractSignal):
     times: Float[Array, " n"]
     values: Float[Array, " n"]
     slopes: Float[Array, " n"]  # d
+
+    @property
+    def breaks(self):
+        return self.times
 
     @classmethod
     def through(cls, sampled: Sampled) -> "_Monotone":

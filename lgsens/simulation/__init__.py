@@ -34,7 +34,7 @@ from lgsens.simulation._start import (
     equilibrium as equilibrium,
     initial_state as initial_state,
 )
-from lgsens.simulation._to_accuracy import to_accuracy as to_accuracy
+from lgsens.simulation._to_accuracy import aligned as aligned, to_accuracy as to_accuracy
 from lgsens.simulation._trajectory import (
     AbstractMotion as AbstractMotion,
     AbstractRun as AbstractRun,

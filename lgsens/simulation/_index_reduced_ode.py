@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens._xla import scan
-from lgsens.dynamics import AbstractSystem, Inertia, State, factorized_accelerations
+from lgsens.dynamics import AbstractSystem, Inertia, State, breaks_of, factorized_accelerations
 from lgsens.integrate import EqualGrid, IndexReducedODE, Stats, ended, with_first
 
 
@@ -40,6 +40,7 @@ def _adaptive(settings: IndexReducedODE, problem: _Problem, q, v, t, h, running)
     """From one output time to the next under error control; nowhere unless `running`."""
     import diffrax  # takes its time to import
 
+    jumps = jax.lax.stop_gradient(breaks_of(problem.system).astype(h.dtype))
     rtol = 0.0 if settings.rtol is None else settings.rtol
     atol = rtol if settings.atol is None else settings.atol
     reverse = diffrax.RecursiveCheckpointAdjoint(checkpoints=settings.max_steps)
@@ -48,7 +49,9 @@ def _adaptive(settings: IndexReducedODE, problem: _Problem, q, v, t, h, running)
         diffrax.Tsit5() if settings.solver is None else settings.solver,
         *(t, jnp.where(running, t + h, t), h, _Local(jnp.zeros_like(v), v), (problem, q)),
         # the largest entry, so that more bodies do not loosen the control
-        stepsize_controller=diffrax.PIDController(rtol, atol, norm=_largest),
+        stepsize_controller=diffrax.ClipStepSizeController(
+            diffrax.PIDController(rtol, atol, norm=_largest), jump_ts=jumps if jumps.size else None
+        ),
         adjoint=reverse if settings.mode == "reverse" else diffrax.ForwardMode(),
         max_steps=settings.max_steps,
         throw=False,

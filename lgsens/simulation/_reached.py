@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+from lgsens.integrate import AbstractIntegrator
+
 
 class Reached(NamedTuple):
     """The accuracy of a result; `print` it.
@@ -11,6 +13,7 @@ class Reached(NamedTuple):
         error: the estimated error, in the same measure.
         num_steps: the number of steps, of the finer run where two are extrapolated.
         extrapolated: whether two runs are, of num_steps/2 and num_steps steps.
+        integrator: that of each run, in `AlignedSteps` where the scene has breaks that equal steps miss.
         tried: the numbers of steps of all runs and the distances of each from the one before.
     """
 
@@ -18,13 +21,16 @@ class Reached(NamedTuple):
     error: float
     num_steps: int
     extrapolated: bool
+    integrator: AbstractIntegrator
     tried: tuple[tuple[int, float], ...]
 
     @property
     def brief(self) -> str:
         """In a line."""
-        how = f"{self.num_steps // 2} and {self.num_steps} steps, extrapolated" if self.extrapolated else ""
-        return f"error {self.error:.1e}, asked {self.asked:g}, in {how or f'{self.num_steps} steps'}"
+        steps = "steps" if self.integrator.equal_steps else "aligned steps"
+        runs = f"{self.num_steps // 2} and {self.num_steps}" if self.extrapolated else f"{self.num_steps}"
+        how = ", extrapolated" if self.extrapolated else ""
+        return f"error {self.error:.1e}, asked {self.asked:g}, in {runs} {steps}{how}"
 
     def __str__(self) -> str:
         runs = ", ".join(f"{n}: {distance:.1e}" if distance < float("inf") else f"{n}" for n, distance in self.tried)

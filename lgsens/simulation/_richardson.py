@@ -28,7 +28,6 @@ from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
@@ -36,7 +35,7 @@ from jaxtyping import PyTree
 from lgsens._brief import brief
 from lgsens._validate import as_count
 from lgsens.dynamics import RESULTS, AbstractSystem, State
-from lgsens.integrate import AbstractIntegrator, AbstractScheme, GeneralizedAlpha, scheme_of
+from lgsens.integrate import AbstractIntegrator, GeneralizedAlpha, scheme_of
 from lgsens.simulation._trajectory import Saved, StateError, Trajectory
 
 
@@ -46,7 +45,8 @@ class Richardson(AbstractIntegrator):
         x ≈ x_{h/2} + (x_{h/2} − x_h)/3   for v, v̇, λ,       q ≈ q_{h/2} exp(log(q_h⁻¹ q_{h/2})~/3)
 
     Arguments:
-        integrator: the scheme of both runs, `GeneralizedAlpha` or another one of second order.
+        integrator: that of both runs: `GeneralizedAlpha` or another scheme of second order, in equal steps, or in
+            `AlignedSteps` or `GivenSteps`, which are divided into two for the finer run.
 
     The trajectory has the n + 1 times of the coarser run; `Trajectory.error` is what was added to the finer run, an
     estimate of its error, and more than what is left. `Trajectory.order` is 4: criteria that are integrals need
@@ -60,13 +60,19 @@ class Richardson(AbstractIntegrator):
     order of w². The cost is that of 3n steps. Start from the consistent initial state of the model, or from a `state0`
     at rest: that of another run brings the a of its own step size, and one order is lost.
 
-    Raises `ValueError` for anything but a scheme in equal steps.
+    Raises `ValueError` for anything else.
     """
 
-    integrator: AbstractScheme = eqx.field(static=True, default=GeneralizedAlpha())
+    integrator: AbstractIntegrator = GeneralizedAlpha()
 
     def __check_init__(self):
-        if scheme_of("Richardson", self.integrator).order != 2:
+        given = self.integrator
+        if not isinstance(given, AbstractIntegrator) or given.extrapolated or given.by_motion:
+            raise ValueError(
+                "Richardson: `integrator` must be a scheme of second order, GeneralizedAlpha(), or one in steps that "
+                f"are known before (AlignedSteps(), GivenSteps(…)), got {given!r}."
+            )
+        if scheme_of("Richardson", given.scheme).order != 2:
             raise ValueError(
                 f"Richardson: `integrator` must be of second order, as GeneralizedAlpha, got {self.integrator!r}; take "
                 "it as it is, in more steps."
@@ -74,7 +80,17 @@ class Richardson(AbstractIntegrator):
 
     @property
     def scheme(self):
-        return self.integrator
+        return self.integrator.scheme
+
+    @property
+    def equal_steps(self):
+        return self.integrator.equal_steps
+
+    def check(self, num_steps):
+        self.integrator.check(num_steps)
+
+    def lay(self, system, start, t0, t1, num_steps):
+        return self.integrator.lay(system, start, t0, t1, num_steps)
 
     @property
     def extrapolated(self):

@@ -41,22 +41,22 @@ def interval(t0, t1):
     return t0, t1
 
 
-def check_accuracy(accuracy: Any, num_steps: int | None, integrator: Any, arrays: Any) -> int:
-    """The order of a scheme that is to reach an accuracy; `ValueError` for what cannot."""
+def check_accuracy(accuracy: Any, num_steps: int | None, integrator: Any, arrays: Any) -> None:
+    """Raise `ValueError` for what cannot reach an accuracy."""
     if not (isinstance(accuracy, float | int) and 0.0 < accuracy < 1.0):
         raise ValueError(f"`accuracy` must be a number between 0 and 1, got {accuracy!r}; 1e-4 is four digits.")
     first = 1 if num_steps is None else as_count(num_steps, "num_steps", " (the first one that is tried)")
     if not by_diffrax(integrator):
         check_integrator(integrator, first)
     order = None if by_diffrax(integrator) or integrator.extrapolated else integrator.scheme.convergence_order
-    if order is None or not integrator.equal_steps:
+    if order is None or not integrator.any_number:
         raise ValueError(
-            f"`accuracy` needs a scheme in equal steps that says its order, as GeneralizedAlpha or RadauIIA; got "
-            f"{integrator!r}, which chooses its steps or extrapolates itself."
+            "`accuracy` needs a scheme that says its order, as GeneralizedAlpha or RadauIIA, in any number of steps; "
+            f"got {integrator!r}, which chooses its steps or extrapolates itself."
         )
     if not is_concrete(jax.tree.map(primal_value, arrays)):
         raise ValueError(
             "`accuracy` needs numbers, and chooses steps outside of `jit` and `vmap`. Call it once before, and give "
-            "`found.reached.num_steps`, with `Richardson()` and half as many where `found.reached.extrapolated`."
+            "`found.reached.num_steps` and `found.reached.integrator`, that with half as many steps in `Richardson` "
+            "where `found.reached.extrapolated`."
         )
-    return order

@@ -93,7 +93,8 @@ def simulate(
             largest number of steps.
         integrator: the scheme and its Newton settings, `GeneralizedAlpha`. `Richardson` extrapolates two such runs,
             of n and 2n steps, to nearly fourth order. `IndexReducedODE`: an explicit Runge–Kutta scheme of high order.
-            `AdaptiveSteps`: generalized-α under error control; `GivenSteps`: with steps of given sizes.
+            `AdaptiveSteps`: generalized-α under error control; `GivenSteps`: with steps of given sizes;
+            `AlignedSteps`: with steps that end at edges of roads and signals.
         sensitivity: how the trajectory is differentiated. `DirectDifferentiation` supports every JAX
             transformation; `AdjointVariable` is reverse mode, and forward over it (`jax.hessian`); `AssociativeScan`
             takes all steps at once, for accelerators.
@@ -112,7 +113,8 @@ def simulate(
             where that is less work: the largest error of a configuration, relative to 1 rad or the length of the scene,
             and of a velocity, relative to the largest, as far as runs in n, 2n, 4n, … steps tell. `Trajectory.reached`
             says what was reached and how. `num_steps` is then the first number of steps, 64 by default: enough of them
-            to see the shortest event (the bump of a road). Derivatives go through the last run.
+            to see the shortest event. Edges of roads and signals are seen, and steps end there (`AlignedSteps`).
+            Derivatives go through the last run.
         throw: raise if the simulation fails; inside `jit` and `vmap`, where nothing can be raised, all data are NaN and
             `Trajectory.result` says why (`raise_if_failed`). With False it says so, and the data are finite up to the
             step that failed and NaN from there on, and so are derivatives in both modes (with `checkpoints` those in
@@ -175,8 +177,7 @@ def for_any_number(
 ) -> tuple[int | Steps, AbstractIntegrator]:
     """Steps and integrator with their numbers as data, where a program of its own serves them: outside of `jit`, where
     all `arrays` have values (and derivatives at most); else as they are."""
-    equal = type(integrator).lay is AbstractIntegrator.lay
-    if not equal or integrator.extrapolated or by_diffrax(integrator):
+    if not integrator.any_number or integrator.extrapolated or by_diffrax(integrator):
         return num_steps, integrator
     leaves = jax.tree.leaves(arrays)
     traced = any(isinstance(primal_value(leaf), Tracer) for leaf in leaves)
@@ -265,20 +266,29 @@ def run(
     save: Output | None = None,
 ) -> tuple[Any, dict[str, Any]]:
     """`simulate` without its checks: the trajectory or what is saved of it, and what the message of a failure needs."""
-    one = lambda num_steps: _single_run(system, begun, t0, t1, num_steps, integrator, sensitivity, save)
-    if not integrator.extrapolated or isinstance(num_steps, Steps):
-        return one(num_steps)
-    (coarse, of_coarse), (fine, of_fine) = (one(n) for n in (num_steps, 2 * num_steps))
+    one = lambda **halved: _single_run(system, begun, t0, t1, num_steps, integrator, sensitivity, save, **halved)
+    if not integrator.extrapolated:
+        return one()
+    (coarse, of_coarse), (fine, of_fine) = one(), one(halved=True)
     failed = coarse.result != RESULTS.successful
     details = jax.tree.map(lambda first, second: jnp.where(failed, first, second), of_coarse, of_fine)
     return extrapolate_runs(system, coarse, fine), details | {"run": jnp.where(failed, 1, 2)}
 
 
 def _single_run(
-    system, begun: Begin, t0, t1, num_steps: int | Steps, integrator: AbstractIntegrator, sensitivity, save
+    system,
+    begun: Begin,
+    t0,
+    t1,
+    num_steps: int | Steps,
+    integrator: AbstractIntegrator,
+    sensitivity,
+    save,
+    halved=False,
 ):
     scheme: Any = integrator.scheme
     laid = integrator.lay(system, begun.start, t0, t1, num_steps)
+    laid = Laid(laid.grid.halved()) if halved else laid
     grid: Any = laid.grid
     t = grid.times()
     state0, parameters = begun.start.at(system, grid.first_size), Parameters(system, grid)

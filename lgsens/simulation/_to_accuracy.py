@@ -33,10 +33,11 @@ import numpy as np
 from jax.core import Tracer
 
 from lgsens.dynamics import RESULTS, AbstractSystem, State
+from lgsens.integrate import FEWEST, MANY, AbstractIntegrator, AlignedSteps, piece_lengths
 from lgsens.simulation._errors import SimulationError, primal_value
 from lgsens.simulation._reached import Reached
 from lgsens.simulation._richardson import Richardson, extrapolate_runs
-from lgsens.simulation._settings import check_accuracy
+from lgsens.simulation._settings import check_accuracy, interval
 from lgsens.simulation._trajectory import Trajectory
 
 _FEWEST = 64
@@ -45,6 +46,7 @@ _MOST_SINGLE = 2**13  # in single precision: changes of a pendulum do not fall a
 _CLEAR = (0.7, 1.5)  # of 2^p
 _SAFETY = 2.0  # of what the order of extrapolated runs says
 _LEAST = 1.4  # below that runs do not converge
+_ON_TIME = 1e-6  # of a step
 _COARSE = (RESULTS.newton_failed, RESULTS.turn_not_resolved, RESULTS.singular_configuration)  # more steps may help
 
 
@@ -53,7 +55,7 @@ def to_accuracy(
     distance: Callable[[Any, Any], float],
     extrapolated: Callable[[Any, Any], Any] | None,
     accuracy: float,
-    order: int,
+    integrator: AbstractIntegrator,
     fewest: int | None = None,
 ) -> tuple[Any, Reached]:
     """What `run` gives where it is accurate enough, and how it got there.
@@ -63,7 +65,7 @@ def to_accuracy(
         distance: of a result from a finer one, relative as `accuracy` is.
         extrapolated: of two results, the second in twice as many steps; None: not possible.
         accuracy: the largest error.
-        order: p.
+        integrator: the scheme in its steps, of order p.
         fewest: the first number of steps.
 
     Raises `SimulationError` if it is not reached.
@@ -76,7 +78,7 @@ def to_accuracy(
         if int(found.result) == RESULTS.successful:
             results = [*results[-3:], found]
             tried.append((n, distance(*results[-2:]) if len(results) > 1 else np.inf))
-            reached = _reached(results, tried, distance, extrapolated, accuracy, order)
+            reached = _reached(results, tried, distance, extrapolated, accuracy, integrator)
             if reached is not None:
                 return reached
         elif int(found.result) in _COARSE:
@@ -93,8 +95,9 @@ def to_accuracy(
     )
 
 
-def _reached(results, tried, distance, extrapolated, accuracy: float, order: int) -> tuple[Any, Reached] | None:
+def _reached(results, tried, distance, extrapolated, accuracy: float, integrator) -> tuple[Any, Reached] | None:
     """The result that is accurate enough, if there is one."""
+    order = integrator.scheme.convergence_order
     distances = [d for _, d in tried if np.isfinite(d)]
     if len(results) < 3 or len(distances) < 2:
         return None
@@ -111,7 +114,7 @@ def _reached(results, tried, distance, extrapolated, accuracy: float, order: int
         ratio = min(ratio, earlier)
     error = last / (min(ratio, 2.0**order) - 1.0) if ratio <= _CLEAR[1] * 2.0**order else last
     if error <= accuracy:
-        return results[-1], Reached(accuracy, float(error), n, False, history)
+        return results[-1], Reached(accuracy, float(error), n, False, integrator, history)
     if extrapolated is None or not clear:
         return None
     coarse, fine = (extrapolated(*pair) for pair in itertools.pairwise(results[-3:]))
@@ -119,7 +122,7 @@ def _reached(results, tried, distance, extrapolated, accuracy: float, order: int
     if len(results) > 3 and _clear(distances[-3] / before, order) and error > 0.0:
         ratio = distance(extrapolated(*results[:2]), coarse) / error
         error = _SAFETY * error / (min(ratio, 2.0**4) - 1.0) if _clear(ratio, 4) else error
-    return (fine, Reached(accuracy, float(error), n, True, history)) if error <= accuracy else None
+    return (fine, Reached(accuracy, float(error), n, True, integrator, history)) if error <= accuracy else None
 
 
 def _clear(ratio: float, order: int) -> bool:
@@ -129,8 +132,10 @@ def _clear(ratio: float, order: int) -> bool:
 
 def simulate_to(simulate: Callable[..., Any], accuracy, model, num_steps: int | None, settings: dict) -> Trajectory:
     """`simulate` with `accuracy`: the numbers without derivatives decide, and the run with them follows."""
-    order = check_accuracy(accuracy, num_steps, settings["integrator"], (model, settings))
+    check_accuracy(accuracy, num_steps, settings["integrator"], (model, settings))
     fixed, at = jax.tree.map(primal_value, (model, settings))
+    integrator, fewest = aligned(settings["integrator"], fixed, at["t0"], at["t1"], num_steps)
+    settings, at = settings | {"integrator": integrator}, at | {"integrator": integrator}
 
     def distance(coarse: Trajectory, fine: Trajectory) -> float:
         """The largest change of a configuration and of a velocity at common times, as `accuracy` is."""
@@ -138,13 +143,26 @@ def simulate_to(simulate: Callable[..., Any], accuracy, model, num_steps: int | 
         return float(_distance(system, coarse.states, jax.tree.map(lambda leaf: leaf[::stride], fine.states)))
 
     run = lambda n, throw: simulate(fixed, num_steps=n, throw=throw, **at)
-    extrapolated = (lambda coarse, fine: extrapolate_runs(coarse.system, coarse, fine)) if order == 2 else None
-    found, reached = to_accuracy(run, distance, extrapolated, float(accuracy), order, num_steps)
+    extrapolated = lambda coarse, fine: extrapolate_runs(coarse.system, coarse, fine)
+    extrapolated = extrapolated if integrator.scheme.convergence_order == 2 else None
+    found, reached = to_accuracy(run, distance, extrapolated, float(accuracy), integrator, fewest)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((model, settings))):
-        two = {"integrator": Richardson(settings["integrator"]), "num_steps": reached.num_steps // 2}
+        two = {"integrator": Richardson(integrator), "num_steps": reached.num_steps // 2}
         one = {"num_steps": reached.num_steps}
         found = simulate(model, **(settings | (two if reached.extrapolated else one)))
     return dataclasses.replace(found, reached=reached)
+
+
+def aligned(integrator: AbstractIntegrator, scene: Any, t0, t1, fewest: int | None):
+    """The integrator in steps that end at the breaks of the scene, and the first number of them. Both are as given
+    where equal steps do so too, four times as many, and where breaks are too many for that."""
+    t0, t1 = interval(t0, t1)
+    lengths = np.asarray(piece_lengths(scene, t0, t1))
+    lengths, first = lengths[lengths > 0.0], fewest or _FEWEST
+    ends = 4 * first * np.cumsum(lengths) / lengths.sum()
+    if lengths.size > MANY or np.all(np.abs(ends - np.round(ends)) < _ON_TIME) or not integrator.equal_steps:
+        return integrator, fewest
+    return AlignedSteps(integrator.scheme), max(first, FEWEST, lengths.size)
 
 
 @eqx.filter_jit

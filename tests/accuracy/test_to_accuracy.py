@@ -49,7 +49,7 @@ def sequence(error):
 )
 def test_never_worse_than_asked(error, accuracy):
     try:
-        found, reached = to_accuracy(*sequence(error), accuracy, 2)
+        found, reached = to_accuracy(*sequence(error), accuracy, lg.GeneralizedAlpha())
     except lg.SimulationError as failure:  # of first order 1e-6 takes more steps than there are
         assert error(2**17) > accuracy / 4.0
         assert "is not reached in 131072 steps" in str(failure)
@@ -61,7 +61,7 @@ def test_never_worse_than_asked(error, accuracy):
 
 def test_no_more_steps_than_the_order_of_extrapolated_runs_says():
     error = lambda n: -30.0 / n**2 + 2e3 / n**4
-    found, reached = to_accuracy(*sequence(error), 3e-8, 2)
+    found, reached = to_accuracy(*sequence(error), 3e-8, lg.GeneralizedAlpha())
     left = abs(found.value - 1.0)
     assert reached.extrapolated and left <= 3e-8 < 16.0 * left  # half as many steps would not do
     np.testing.assert_allclose(reached.error, 2.0 * left, rtol=0.02)  # twice what it is; of h⁶ there is nothing
@@ -76,7 +76,7 @@ def test_coarse_runs_that_fail_are_no_answer():
         found = run(n, throw)
         return found if n >= 512 else SimpleNamespace(value=np.nan, result=RESULTS.newton_failed)
 
-    _, reached = to_accuracy(failing, *rest, 1e-4, 2)
+    _, reached = to_accuracy(failing, *rest, 1e-4, lg.GeneralizedAlpha())
     assert asked[:4] == [(64, False), (128, False), (256, False), (512, False)]
     assert [n for n, _ in reached.tried] == [512, 1024, 2048]
     assert str(reached).startswith(f"error {reached.error:.1e}, asked 0.0001, in 2048 steps; steps and change from")

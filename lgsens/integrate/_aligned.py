@@ -1,0 +1,90 @@
+"""Steps that end where the equations of motion break.
+
+A force that has a kink inside of a step costs the scheme its order there: what it adds to the error depends on where in
+the step the kink is, so errors do not fall evenly, and neither extrapolation nor a scheme of high order has anything to
+gain. Where a signal says when it breaks (`breaks`: the ends of a bump, of a ramp, the samples of a table), steps can
+end there, and are of one size from one break to the next.
+
+Numbers of steps. The K pieces of lengths L_j have one step each, and the N − K others are theirs in proportion to
+length, by rounding what adds up: with S_j = L_1 + … + L_j
+
+    m_1 + … + m_j = j + round((N − K) S_j/S_K).
+
+So that 2n steps are the halves of n, this is done for N = n/2^r, as small as it may be and still 48 or more and as many
+as there are pieces; each of these is divided into 2^r. With fewer steps than pieces, all are equal.
+
+Where steps end is constant for derivatives, as with `AdaptiveSteps`: criteria do not know the derivative of a grid.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lgsens.integrate._generalized_alpha import GeneralizedAlpha
+from lgsens.integrate._grid import Steps, UnevenGrid
+from lgsens.integrate._pieces import piece_lengths, pieces_within
+from lgsens.integrate._scheme import AbstractIntegrator, AbstractScheme, Laid, scheme_of
+from lgsens.integrate._uneven import GivenSteps
+
+FEWEST = 48  # steps that are not divided any further: pieces are in proportion to within a few per cent
+_HALVINGS = 24
+
+
+class AlignedSteps(AbstractIntegrator):
+    """Steps that end at the breaks of a scene, and are equal between them: an integrator of `simulate`.
+
+    Breaks are the times at which a signal, or a derivative of it, jumps, as far as the signals of the scene say so
+    (`AbstractSignal.breaks`): both ends of a `BumpRoad` and of a `Ramp`, the samples of a `SampledRoad` and of
+    `Sampled`. What is computed in so many steps has the full order of the scheme there, and can be extrapolated:
+    `Richardson(AlignedSteps())`. Breaks at times that depend on the motion (a contact that opens) are not known.
+
+    Arguments:
+        integrator: the scheme, `GeneralizedAlpha` or another one.
+
+    `num_steps` steps are shared among the pieces between breaks in proportion to their lengths, and each piece has at
+    least one. Where there are more pieces than steps, all steps are equal, and so they are where nothing breaks. Twice
+    as many steps are the halves of these, from 48 steps on. Under `vmap` each design has its own. The derivative is
+    that on the grid of these numbers, exactly; by the times of breaks, which move the grid, finite differences agree
+    with it on the same grid (`GivenSteps.of`).
+
+    Raises `ValueError` for what is no scheme in steps.
+    """
+
+    integrator: AbstractScheme = eqx.field(static=True, default=GeneralizedAlpha())
+
+    def __check_init__(self):
+        scheme_of("AlignedSteps", self.integrator)
+
+    @property
+    def scheme(self):
+        return self.integrator
+
+    @property
+    def equal_steps(self):
+        return False
+
+    def lay(self, system, start, t0, t1, num_steps):
+        counted = isinstance(num_steps, Steps)
+        steps, room = (num_steps.count, num_steps.room) if counted else (jnp.asarray(num_steps, t0.dtype), num_steps)
+        lengths = jax.lax.stop_gradient(piece_lengths(system, t0, t1))
+        fractions = aligned_sizes(lengths / jnp.sum(lengths), jax.lax.stop_gradient(steps), room)
+        return Laid(UnevenGrid.first(t0, (t1 - t0) * fractions, room=counted))
+
+    def frozen(self, trajectory):
+        return GivenSteps.of(trajectory, self.integrator)
+
+
+def aligned_sizes(lengths: Float[Array, " k"], count: Float[Array, ""], room: int) -> Float[Array, " room"]:
+    """The sizes of `count` steps through pieces of these lengths, whose sum is 1, then zeros; more pieces than steps:
+    equal ones."""
+    share, pieces = jnp.cumsum(lengths), pieces_within(lengths)
+    divided = count / 2.0 ** jnp.arange(_HALVINGS, dtype=count.dtype)
+    halvings = jnp.sum((divided == jnp.floor(divided)) & (divided >= jnp.maximum(pieces[-1], FEWEST))) - 1
+    each = 2.0 ** jnp.maximum(halvings, 0).astype(count.dtype)
+    last = each * (pieces + jnp.round((count / each - pieces[-1]) * share))  # the number of steps up to each end
+    n = jnp.arange(room, dtype=count.dtype)
+    piece = jnp.minimum(jnp.searchsorted(last, n, side="right"), last.size - 1)
+    taken = jnp.diff(last, prepend=0.0)[piece]
+    sizes = jnp.where(pieces[-1] <= count, lengths[piece] / jnp.where(taken > 0.0, taken, 1.0), 1.0 / count)
+    return jnp.where(n < count, sizes, 0.0)

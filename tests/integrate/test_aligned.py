@@ -1,0 +1,204 @@
+"""Steps that end where a signal breaks, of a mass on a spring whose foot follows a signal, against its convolution."""
+
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from differences import central
+from helpers import says
+
+import lgsens as lg
+from lgsens.dynamics import breaks_of
+from lgsens.integrate import MANY, piece_lengths
+
+MASS, STIFFNESS, T1 = 2.0, 200.0, 1.0
+OMEGA = np.sqrt(STIFFNESS / MASS)
+START, DURATION = 0.313, 0.171  # on no time of 50, 100, … equal steps
+EDGES = (START, START + DURATION)
+BUMP = lg.BumpRoad(height=0.1, duration=DURATION, start=START)
+
+
+def on(road) -> lg.Model:
+    """At rest, without gravity."""
+    tyre = lg.TyreSpring("mass", at=(0.0, 0.0, 0.0), stiffness=STIFFNESS, road=road)
+    return lg.Model({"mass": lg.RigidBody(mass=MASS, inertia=None, free="z")}, forces={"tyre": tyre})
+
+
+def height(t, s, t0, length, top=0.1):
+    """x(t) = ω ∫ sin ω(t − s) z(s) ds over the bump, by Gauss' rule on 40 points: to round-off."""
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    at = t0 + length * (nodes + 1.0) / 2.0
+    return OMEGA * length / 2.0 * np.sum(weights * np.sin(OMEGA * (t - at)) * s(at, t0, length, top))
+
+
+def sin2(at, t0, length, top):
+    return top * np.sin(np.pi * (at - t0) / length) ** 2
+
+
+END = height(T1, sin2, START, DURATION)
+
+
+def end(integrator, num_steps, road=BUMP, **settings):
+    run = lg.simulate(on(road), t1=T1, num_steps=num_steps, integrator=integrator, **settings)
+    return run.body("mass").position[-1, 2], run
+
+
+def laid(road, num_steps):
+    return np.diff(np.asarray(end(lg.AlignedSteps(), num_steps, road)[1].t))
+
+
+def test_steps_end_at_breaks_and_are_equal_between_them():
+    sizes = laid(BUMP, 100)
+    t = np.cumsum(sizes)
+    for edge in EDGES:
+        assert np.abs(t - edge).min() < 1e-15 * 100  # a sum of 100 sizes
+    pieces = [
+        sizes[t < EDGES[0] + 1e-9],
+        sizes[(t > EDGES[0] + 1e-9) & (t < EDGES[1] + 1e-9)],
+        sizes[t > EDGES[1] + 1e-9],
+    ]
+    for piece, length in zip(pieces, (START, DURATION, T1 - EDGES[1])):
+        np.testing.assert_allclose(piece, piece[0], rtol=1e-12)
+        assert abs(len(piece) - 100 * length) < 4.0  # of 50 steps one each, the others by rounding; then halved
+    np.testing.assert_allclose(np.repeat(sizes / 2.0, 2), laid(BUMP, 200), rtol=1e-12)
+    np.testing.assert_allclose(np.repeat(sizes / 4.0, 4), laid(BUMP, 400), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "road",
+    [
+        lg.FlatRoad(height=0.0),
+        lg.BumpRoad(height=0.1, duration=0.2, start=1.1),
+        lg.SampledRoad(np.linspace(0.0, 1.0, 40), np.zeros(40)),
+    ],
+    ids=["none", "later", "more pieces than steps"],
+)
+def test_equal_steps_where_there_is_nothing_to_end_at(road):
+    np.testing.assert_allclose(laid(road, 30), 1.0 / 30.0, rtol=1e-12)
+
+
+def test_breaks_are_those_of_all_signals_of_a_scene():
+    class Sum(lg.AbstractSignal):
+        parts: tuple
+
+        def __call__(self, t):
+            return sum(part(t) for part in self.parts)
+
+    ramp = lg.Ramp(end=0.1, t_start=0.2, duration=0.3)
+    table = lg.Sampled([0.0, 0.4, 0.9], [0.0, 1.0, 0.5], kind="cubic")
+    both = Sum((ramp, lg.Harmonic(amplitude=0.1, frequency=1.0), table))
+    np.testing.assert_allclose(np.sort(both.breaks), [0.0, 0.2, 0.4, 0.5, 0.9])
+    model = on(BUMP)
+    model = lg.Model(
+        model.bodies | {"cart": lg.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0))},
+        {
+            "rail": lg.PrismaticJoint(None, "cart", at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0)),
+            "drive": lg.TranslationDriver(None, "cart", at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0), value=both),
+        },
+        model.forces,
+    )
+    for scene in (model, lg.simulate(model, t1=0.1, num_steps=2).system):  # as it is given, and assembled
+        np.testing.assert_allclose(np.unique(breaks_of(scene)), [0.0, 0.2, START, 0.4, EDGES[1], 0.5, 0.9])
+    lengths = np.asarray(piece_lengths(model, jnp.asarray(0.25), jnp.asarray(0.45)))
+    np.testing.assert_allclose(lengths[lengths > 0.0], [START - 0.25, 0.4 - START, 0.05])
+
+
+def test_extrapolation_has_its_order_at_edges():
+    """Errors of h⁴, where equal steps have the kinks inside of them."""
+    aligned, equal = (
+        [abs(float(end(lg.Richardson(kind), n)[0]) - END) for n in (50, 100, 200)]
+        for kind in (lg.AlignedSteps(), lg.GeneralizedAlpha())
+    )
+    assert all(coarse > 10.0 * fine for coarse, fine in itertools.pairwise(aligned)), aligned  # 16, less h³ of ρ∞ = 0.9
+    assert equal[2] > 5.0 * aligned[2]
+    # the same two runs, the finer one in the halves of the steps of the other
+    t = np.asarray(end(lg.Richardson(lg.AlignedSteps()), 30)[1].t)
+    given = end(lg.Richardson(lg.GivenSteps(np.diff(t))), 30)[0]
+    np.testing.assert_allclose(given, end(lg.Richardson(lg.AlignedSteps()), 30)[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("accuracy", [1e-4, 1e-7])
+def test_an_accuracy_is_reached_by_them(accuracy):
+    run = lg.simulate(on(BUMP), t1=T1, accuracy=accuracy)
+    assert run.reached.integrator == lg.AlignedSteps() and "aligned steps" in str(run.reached)
+    length = float(jnp.max(run.system.coordinate_scale()))
+    assert abs(float(run.body("mass").position[-1, 2]) - END) <= accuracy * length
+    assert run.reached.num_steps <= 1024  # in equal steps 1e-7 takes 32768
+    on_time = lg.BumpRoad(height=0.1, duration=0.125, start=0.25)  # equal steps end there as well
+    assert lg.simulate(on(on_time), t1=T1, accuracy=accuracy).reached.integrator == lg.GeneralizedAlpha()
+
+
+CONTROLLED = {
+    "generalized-α": (lg.AdaptiveSteps(tolerance=1e-7), 1000, 1e-3),
+    "Radau IIA": (lg.AdaptiveSteps(lg.RadauIIA(), tolerance=1e-8, longest=1.0), 200, 1e-6),
+    "diffrax": (lg.IndexReducedODE(rtol=1e-9), 3, 1e-6),
+}
+
+
+@pytest.mark.parametrize("name", CONTROLLED)
+def test_error_control_sees_what_comes(name):
+    """A bump of 20 ms in 10 s, before which nothing moves: no step of its own would look at it."""
+    integrator, num_steps, tolerance = CONTROLLED[name]
+    road = lg.BumpRoad(height=0.1, duration=0.02, start=5.013)
+    run = lg.simulate(on(road), t1=5.5, num_steps=num_steps, integrator=integrator)
+    expected = height(5.5, sin2, 5.013, 0.02)
+    swing = 0.1 * OMEGA * 0.02 / 2.0
+    assert abs(float(run.body("mass").position[-1, 2]) - expected) < tolerance * swing
+    if name != "diffrax":
+        for edge in (5.013, 5.033):
+            assert np.abs(np.asarray(run.t) - edge).min() < 1e-12
+
+
+def test_tables_of_many_samples_are_left_to_the_error_control():
+    n = MANY + 10
+    road = lg.SampledRoad(np.linspace(0.0, 1.0, n), 1e-3 * np.sin(np.linspace(0.0, 6.0, n)))
+    run = end(lg.AdaptiveSteps(tolerance=1e-4), 200, road)[1]
+    assert int(run.stats.steps) < 100
+
+
+def of_road(p, integrator, num_steps=60, **settings):
+    """A number of the motion that all parameters change: height and begin of a bump."""
+    road = lg.BumpRoad(height=p[0], duration=DURATION, start=p[1])
+    return jnp.sum(end(integrator, num_steps, road, **settings)[1].body("mass").position[:, 2] ** 2)
+
+
+@pytest.mark.parametrize(
+    "integrator",
+    [lg.AlignedSteps(), pytest.param(lg.Richardson(lg.AlignedSteps()), marks=pytest.mark.slow)],
+    ids=["one", "two"],
+)
+def test_derivatives_are_those_on_the_grid(integrator):
+    p = jnp.array([0.1, START])
+    run = end(integrator, 60)[1]
+    fixed = lg.GivenSteps(np.diff(np.asarray(run.t)))
+    fixed = lg.Richardson(fixed) if integrator.extrapolated else fixed
+    value, adjoint = jax.value_and_grad(functools.partial(of_road, integrator=integrator))(p)
+    adjoint = jax.grad(functools.partial(of_road, integrator=integrator, sensitivity=lg.AdjointVariable()))(p)
+    forward = jax.jacfwd(functools.partial(of_road, integrator=integrator))(p)
+    np.testing.assert_allclose(forward, adjoint, rtol=1e-10)
+    np.testing.assert_allclose(of_road(p, fixed), value, rtol=1e-12)
+    differences = [central(lambda s, e=e: of_road(p + s * e, fixed), 1e-5) for e in jnp.eye(2)]
+    # at an edge the second derivative of the road jumps: of first order in the distance, h π² δ/T beside 2 h/T
+    np.testing.assert_allclose(forward, differences, rtol=1e-3)
+
+
+def test_each_lane_has_its_own_steps():
+    begins = jnp.array([START, 0.42])
+    of = lambda begin: end(lg.AlignedSteps(), 60, lg.BumpRoad(height=0.1, duration=DURATION, start=begin))[1]
+    runs = jax.vmap(of)(begins)
+    for lane, begin in enumerate(begins):
+        np.testing.assert_allclose(runs.t[lane], of(begin).t, rtol=1e-12)
+        assert np.abs(np.asarray(runs.t[lane]) - float(begin)).min() < 1e-13
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match=says("AlignedSteps", "must be a scheme", "Richardson")):
+        lg.AlignedSteps(lg.Richardson())
+    for wrong in (lg.AdaptiveSteps(), lg.Richardson(), "given"):
+        with pytest.raises(ValueError, match=says("Richardson: `integrator`", "AlignedSteps()", repr(wrong))):
+            lg.Richardson(wrong)
+    with pytest.raises(ValueError, match=says("`num_steps` = 3", "has 2")):
+        end(lg.Richardson(lg.GivenSteps([1.0, 2.0])), 3)
