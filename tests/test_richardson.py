@@ -261,6 +261,16 @@ def test_gregory_is_exact_for_cubics():
         np.testing.assert_allclose(lg.time_integral(t, f, order=4), wanted, rtol=16 * EPS)
 
 
+def test_gregory_is_exact_for_cubics_in_pieces():
+    """Two steps in a piece do; the slope may jump from one to the next."""
+    for n, m in ((2, 2), (2, 5), (4, 3)):
+        t = np.concatenate([np.linspace(1.0, 1.7, n + 1), np.linspace(1.7, 3.0, m + 1)[1:]])
+        f = np.where(t < 1.7, t**3, 1.7**3 - 2.0 * (t - 1.7) ** 2)
+        exact = (1.7**4 - 1.0) / 4.0 + 1.3 * 1.7**3 - 2.0 * 1.3**3 / 3.0
+        np.testing.assert_allclose(lg.time_integral(t, f, order=4), exact, rtol=16 * EPS)
+        np.testing.assert_allclose(jax.jit(lambda f, t=t: lg.time_integral(t, f, order=4))(f), exact, rtol=16 * EPS)
+
+
 def test_order_of_gregory():
     """∫ exp on [0, 1] by slope, and a slope of the integrand that jumps at a time: a kink costs nothing there."""
     smooth, kinked = [], []

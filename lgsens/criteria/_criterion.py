@@ -110,17 +110,18 @@ def time_integral(t: Float[Array, " n"], f: Float[Array, " n ..."], *, order: in
     """∫ f dt: by the trapezoidal rule, second order like the integrator, or by Gregory's rule of fourth order.
 
         order 2:  T = Σ_n (t_{n+1} − t_n) (f_n + f_{n+1})/2
-        order 4:  T − h/12 (∇f_N − Δf_0) − h/24 (∇²f_N + Δ²f_0)
+        order 4:  T − h/12 (∇f_N − Δf_0) − h/24 (∇²f_N + Δ²f_0)   for each piece of equal steps, from 0 to N
 
     Arguments:
         t: times [s], shape (n,), `Trajectory.t`.
         f: the integrand at these times, shape (n, …).
         order: 2 or 4, static; `Trajectory.order` says what the states deserve. 4 needs equidistant times, three at
-            least, and an integrand with a continuous slope; with a slope that jumps between two times both
-            rules are of second order. Unlike Simpson's rule it weighs all times in the interior alike.
+            least, or pieces of such (`AlignedSteps`), and an integrand whose slope jumps from one piece to the next
+            only; with a slope that jumps elsewhere both rules are of second order. Unlike Simpson's rule it weighs all
+            times inside of a piece alike.
 
     Returns the integral [unit of f × s], shape (…). Raises `ValueError` for lengths that differ, another order, and for
-    order 4 with too few times or times that are not equidistant. Sources: Sonneville & Brüls (2014), eq. (31);
+    order 4 with too few times, or a step that is equal to none beside it. Sources: Sonneville & Brüls (2014), eq. (31);
     Hildebrand, Introduction to Numerical Analysis (1974), §5.8 (Gregory).
     """
     t, f = as_float(t, None, "`t`"), as_float(f, None, "`f`")
@@ -130,21 +131,38 @@ def time_integral(t: Float[Array, " n"], f: Float[Array, " n ..."], *, order: in
         )
     if order not in (2, 4):
         raise ValueError(f"`time_integral`: `order` must be 2 (trapezoidal) or 4 (Gregory), got {order!r}.")
-    weight = jnp.diff(t).reshape((-1,) + (1,) * (f.ndim - 1))
-    trapezoidal = jnp.sum(jnp.broadcast_to(weight, f[1:].shape) * (f[1:] + f[:-1]), axis=0) / 2
+    h = jnp.diff(t)
+    as_factor = lambda sizes: sizes.reshape((-1,) + (1,) * (f.ndim - 1))
+    trapezoidal = jnp.sum(jnp.broadcast_to(as_factor(h), f[1:].shape) * (f[1:] + f[:-1]), axis=0) / 2
     if order == 2:
         return trapezoidal
     if t.shape[0] < 3:
         raise ValueError(f"`time_integral`: order 4 needs at least 3 times, got {t.shape[0]}; order=2 does with fewer.")
     require(
-        lambda t: np.ptp(np.diff(t)) <= 1e-6 * (t[-1] - t[0]) / (len(t) - 1) + 16 * np.spacing(np.abs(t).max()),
-        "`time_integral`: order 4 needs equidistant times `t`, as `Trajectory.t`; use order=2 for others.",
+        lambda t: _in_pieces(np.asarray(t)),
+        "`time_integral`: order 4 needs times `t` that are equidistant, or pieces of such, as `Trajectory.t`; use "
+        "order=2 for others.",
         t,
     )
-    first, last = f[:3], f[:-4:-1]  # from either end inwards: ∇ of the end is −Δ seen from there
-    slopes = (first[1] - first[0]) + (last[1] - last[0])
-    bends = (first[2] - 2.0 * first[1] + first[0]) + (last[2] - 2.0 * last[1] + last[0])
-    return trapezoidal + (t[-1] - t[0]) / (t.shape[0] - 1) * (slopes / 12.0 - bends / 24.0)
+    equal = _equal_to_next(jax.lax.stop_gradient(t))  # of the steps from t_n and t_{n+1}
+    begins = jnp.where(equal & ~jnp.pad(equal, (1, 0))[:-1], h[:-1], 0.0)
+    ends = jnp.where(equal & ~jnp.pad(equal, (0, 1))[1:], h[1:], 0.0)
+    slopes, bends = jnp.diff(f, axis=0), jnp.diff(f, 2, axis=0)
+    corrected = as_factor(begins) * (slopes[:-1] / 12.0 - bends / 24.0)
+    return trapezoidal + jnp.sum(corrected - as_factor(ends) * (slopes[1:] / 12.0 + bends / 24.0), axis=0)
+
+
+def _equal_to_next(t):
+    """Whether each step is as long as the next, up to round-off of their times."""
+    xp = np if isinstance(t, np.ndarray) else jnp
+    h = xp.diff(t)
+    return xp.abs(xp.diff(h)) <= 1e-6 * h[1:] + 32 * float(np.finfo(t.dtype).eps) * xp.max(xp.abs(t))
+
+
+def _in_pieces(t: np.ndarray) -> bool:
+    """Whether each step is as long as one beside it."""
+    equal = _equal_to_next(t)
+    return bool(np.all(np.pad(equal, (1, 0)) | np.pad(equal, (0, 1))))
 
 
 def soft_maximum(values: Float[Array, " n"], sharpness: float | Float[Array, ""]) -> Float[Array, ""]:
