@@ -67,9 +67,10 @@ class AlignedSteps(AbstractIntegrator):
     def lay(self, system, start, t0, t1, num_steps):
         counted = isinstance(num_steps, Steps)
         steps, room = (num_steps.count, num_steps.room) if counted else (jnp.asarray(num_steps, t0.dtype), num_steps)
-        lengths = jax.lax.stop_gradient(piece_lengths(system, t0, t1))
-        fractions = aligned_sizes(lengths / jnp.sum(lengths), jax.lax.stop_gradient(steps), room)
-        return Laid(UnevenGrid.first(t0, (t1 - t0) * fractions, room=counted))
+        lengths, steps = jax.lax.stop_gradient((piece_lengths(system, t0, t1), steps))
+        fractions = aligned_sizes(lengths / jnp.sum(lengths), steps, room)
+        count = steps if counted else None
+        return Laid(UnevenGrid.first(t0, (t1 - t0) * fractions, room=counted, count=count))
 
     def frozen(self, trajectory):
         return GivenSteps.of(trajectory, self.integrator)

@@ -227,14 +227,14 @@ class UnevenGrid(AbstractGrid):
     h: Float[Array, " n"]
     before: Float[Array, ""]  # the size of the step that led to t0, to which the state there belongs
     room: bool = eqx.field(static=True, default=False)  # whether there may be many empty places at the end
+    count: Float[Array, ""] | None = None  # of the steps that are not empty, where it is known
     resizes: ClassVar[bool] = True
     num_steps: ClassVar[Any] = property(lambda self: self.h.shape[-1])  # no argument, where the base has a field
-    count: ClassVar[None] = None
 
     @classmethod
-    def first(cls, t0, h, *, room: bool = False) -> "UnevenGrid":
+    def first(cls, t0, h, *, room: bool = False, count=None) -> "UnevenGrid":
         """From a state at t0 that belongs to the first step."""
-        return cls(t0, h, h[0], room)
+        return cls(t0, h, h[0], room, count)
 
     @property
     def first_size(self):
@@ -242,8 +242,8 @@ class UnevenGrid(AbstractGrid):
 
     @property
     def taken(self):
-        if not self.room:
-            return None
+        if self.count is not None or not self.room:
+            return self.count
         last = jnp.max(jnp.where(self.h != 0.0, jnp.arange(1, self.num_steps + 1, dtype=self.h.dtype), 0.0))
         return most_of_lanes(jax.lax.stop_gradient(last))
 
@@ -281,7 +281,8 @@ class UnevenGrid(AbstractGrid):
         return place.size == 0.0
 
     def halved(self):
-        return UnevenGrid(self.t0, jnp.repeat(self.h / 2.0, 2), self.before / 2.0, self.room)
+        count = None if self.count is None else 2.0 * self.count
+        return UnevenGrid(self.t0, jnp.repeat(self.h / 2.0, 2), self.before / 2.0, self.room, count)
 
     def segments(self, count, length):
         h = jnp.concatenate([self.h, jnp.zeros(count * length - self.num_steps, self.h.dtype)]).reshape(count, length)
