@@ -1,5 +1,6 @@
 """`differentiate` to an accuracy of values and gradients."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -27,29 +28,39 @@ def differentiate_to(
         value, gradient = richardson(lambda _: next(two), 1).value
         return fine._replace(value=value, gradient=gradient)
 
+    run = functools.cache(run)
     how = extrapolated if extrapolate and integrator.scheme.convergence_order == 2 else None
     found, reached = to_accuracy(run, _distance, how, accuracy, integrator, fewest)
-    found, reached = _in_fewer(run, extrapolated, found, reached)
+    found, reached = _in_less_work(run, how, found, reached)
     return found._replace(reached=reached)
 
 
-def _in_fewer(run, extrapolated, found, reached: Reached) -> tuple[Any, Reached]:
-    """Three quarters of the steps, where they have the accuracy too: their error is their distance from what was found,
-    and the error of that. Numbers of steps are doubled in the search, and in loops the last one is taken again. Not where
-    a program would be compiled for that."""
-    n = 3 * reached.num_steps // 4
-    order = 4 if reached.extrapolated else reached.integrator.scheme.convergence_order
-    compiled = Steps.of(n, float).room == Steps.of(reached.num_steps, float).room
-    if n % 4 or not compiled or (4 / 3) ** order * reached.error > reached.asked:
-        return found, reached
-    runs = [run(k, False) for k in ((n // 2, n) if reached.extrapolated else (n,))]
-    if any(int(one.result) != RESULTS.successful for one in runs):
-        return found, reached
-    fewer = extrapolated(*runs) if reached.extrapolated else runs[0]
-    apart = _distance(fewer, found)
-    if apart + reached.error > reached.asked:
-        return found, reached
-    return fewer, reached._replace(error=apart + reached.error, num_steps=n, tried=(*reached.tried, (n, apart)))
+def _in_less_work(run, extrapolated, found, reached: Reached) -> tuple[Any, Reached]:
+    """The cheapest of the runs that have the accuracy too, as what was found tells in the end: their error is their
+    distance from that, and its own. In loops this setting is taken again and again, so three quarters of its steps are
+    tried as well, unless a program were compiled for them."""
+
+    def accurate(n: int, two: bool) -> tuple[Any, Reached] | None:
+        runs = [run(k, False) for k in ((n // 2, n) if two else (n,))]
+        if any(int(one.result) != RESULTS.successful for one in runs):
+            return None
+        result = extrapolated(*runs) if two else runs[0]
+        error = _distance(result, found) + reached.error
+        now = reached._replace(error=error, num_steps=n, extrapolated=two)
+        return (result, now) if error <= reached.asked else None
+
+    work = lambda n, two: 1.5 * n if two else float(n)
+    numbers = [n for n, _ in reached.tried]
+    every = [(n, two) for n in numbers for two in (False, True) if not two or (extrapolated and n // 2 in numbers)]
+    own = work(reached.num_steps, reached.extrapolated)
+    less = sorted((setting for setting in every if work(*setting) < own), key=lambda setting: work(*setting))
+    best = next((one for setting in less if (one := accurate(*setting)) is not None), (found, reached))
+    n, two = best[1].num_steps, best[1].extrapolated
+    compiled = n % 4 == 0 and Steps.of(3 * n // 4, float).room == Steps.of(n, float).room
+    order = 4 if two else reached.integrator.scheme.convergence_order
+    if compiled and (4 / 3) ** order * best[1].error <= reached.asked:
+        return accurate(3 * n // 4, two) or best
+    return best
 
 
 def _distance(coarse, fine) -> float:

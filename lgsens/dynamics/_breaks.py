@@ -1,10 +1,10 @@
 """Times at which the equations of motion are not smooth, as far as what they follow in time knows them."""
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -20,7 +20,18 @@ class AbstractTimeFunction(eqx.Module):
 
 
 def breaks_of(tree: Any) -> Float[Array, " k"]:
-    """The breaks of all functions of time in a pytree, a system say, one or many of a kind."""
-    is_one = lambda node: isinstance(node, AbstractTimeFunction)
-    found = [jnp.ravel(node.breaks) for node in jax.tree.leaves(tree, is_leaf=is_one) if is_one(node)]
+    """The breaks of all functions of time in a pytree, a system say, one or many of a kind. What is a function of
+    something else (`over` in the metadata of its field) has none."""
+    found = list(_breaks(tree))
     return jnp.concatenate(found) if found else jnp.zeros(0)
+
+
+def _breaks(node: Any) -> Iterator[Array]:
+    if isinstance(node, AbstractTimeFunction):
+        yield jnp.ravel(node.breaks)
+    elif dataclasses.is_dataclass(node) and not isinstance(node, type):
+        fields = [field for field in dataclasses.fields(node) if field.metadata.get("over", "time") == "time"]
+        yield from _breaks([getattr(node, field.name) for field in fields])
+    elif isinstance(node, tuple | list | dict):
+        for part in node.values() if isinstance(node, dict) else node:
+            yield from _breaks(part)

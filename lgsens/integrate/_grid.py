@@ -234,7 +234,7 @@ class UnevenGrid(AbstractGrid):
     @classmethod
     def first(cls, t0, h, *, room: bool = False, count=None) -> "UnevenGrid":
         """From a state at t0 that belongs to the first step."""
-        return cls(t0, h, h[0], room, count)
+        return cls(t0=t0, h=h, before=h[0], room=room, count=count)
 
     @property
     def first_size(self):
@@ -282,13 +282,14 @@ class UnevenGrid(AbstractGrid):
 
     def halved(self):
         count = None if self.count is None else 2.0 * self.count
-        return UnevenGrid(self.t0, jnp.repeat(self.h / 2.0, 2), self.before / 2.0, self.room, count)
+        h = jnp.repeat(self.h / 2.0, 2)
+        return UnevenGrid(t0=self.t0, h=h, before=self.before / 2.0, room=self.room, count=count)
 
     def segments(self, count, length):
         h = jnp.concatenate([self.h, jnp.zeros(count * length - self.num_steps, self.h.dtype)]).reshape(count, length)
         sizes = jnp.concatenate([self.before[None], self.places().h])
         begins = length * np.arange(count)
-        return UnevenGrid(self.times()[begins], h, sizes[begins])
+        return UnevenGrid(t0=self.times()[begins], h=h, before=sizes[begins])
 
 
 def later(states: Tree) -> Tree:

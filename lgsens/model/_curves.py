@@ -22,8 +22,8 @@ class CurveLoad(AbstractClosedFormLoad):
 
     point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
     point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
-    spring: AbstractSignal | None
-    damper: AbstractSignal | None
+    spring: AbstractSignal | None = eqx.field(metadata={"over": "length"})
+    damper: AbstractSignal | None = eqx.field(metadata={"over": "rate"})
     free_length: Float[Array, ""]
     preload: Float[Array, ""]
 
@@ -74,8 +74,8 @@ class CurveSpringDamper(AbstractConnection):
     b: str | None = eqx.field(static=True)
     at_a: Float[Array, "3"] = point_field("at_a")
     at_b: Float[Array, "3"] = point_field("at_b")
-    spring: Prescribed | None = prescribed_field("spring")
-    damper: Prescribed | None = prescribed_field("damper")
+    spring: Prescribed | None = prescribed_field("spring", over="length")
+    damper: Prescribed | None = prescribed_field("damper", over="rate")
     free_length: Float[Array, ""] | None = number_field("free_length", default=None)
     preload: Float[Array, ""] = number_field("preload", default=0.0)
 

@@ -40,7 +40,7 @@ class Advance(AbstractClosedFormConstraint):
     second_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
     first_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
     ratio: Prescribed  # ρ [m], for each `per` radians
-    travel: AbstractSignal | None  # f [m] over θ [rad]
+    travel: AbstractSignal | None = eqx.field(metadata={"over": "angle"})  # f [m] over θ [rad]
     per: float = eqx.field(static=True)
 
     drawn = None

@@ -54,9 +54,9 @@ def signal_field(name: str, **default: Any) -> Any:
     return eqx.field(converter=convert, kw_only=True, **default)
 
 
-def prescribed_field(name: str, *, positional: bool = False, driven: bool = False) -> Any:
+def prescribed_field(name: str, *, positional: bool = False, driven: bool = False, over: str = "time") -> Any:
     """A scalar leaf or signal of an element, None by default, keyword-only unless `positional`; `driven`: of which
-    positions follow, and so velocities and accelerations its derivatives."""
+    positions follow, and so velocities and accelerations its derivatives; `over`: what a signal is a function of."""
 
     def convert(value: Any) -> Prescribed | None:
         if isinstance(value, AbstractSignal):
@@ -70,4 +70,6 @@ def prescribed_field(name: str, *, positional: bool = False, driven: bool = Fals
             raise _no_signal(name, "a number or a signal", value)
         return None if value is None else as_float(value, (), f"`{name}`")
 
-    return eqx.field(converter=convert, kw_only=not positional, default=None, metadata={"prescribed": True})
+    return eqx.field(
+        converter=convert, kw_only=not positional, default=None, metadata={"prescribed": True, "over": over}
+    )

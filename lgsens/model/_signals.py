@@ -56,7 +56,8 @@ class AbstractSignal(AbstractTimeFunction):
             return self.amplitude * jnp.sin(jnp.pi * self.rate * t**2)
     ```
 
-    One that is not smooth says where in `breaks`, so that steps can end there (`AlignedSteps`).
+    One that is not smooth says where in `breaks`, so that steps can end there (`AlignedSteps`). An element of one's own
+    that takes a signal over anything but time says so in its field: `eqx.field(metadata={"over": "angle"})`.
     """
 
     __repr__ = as_called

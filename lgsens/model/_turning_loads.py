@@ -53,8 +53,8 @@ class CurveBushingLoad(AbstractClosedFormLoad):
 
     linear: BushingLoad
     triad: Float[Array, "3 3"]
-    springs: Curves | None
-    dampers: Curves | None
+    springs: Curves | None = eqx.field(metadata={"over": "length"})
+    dampers: Curves | None = eqx.field(metadata={"over": "rate"})
 
     balanced = True
     drawn = "joint"
@@ -141,8 +141,8 @@ class RotationLoad(AbstractClosedFormLoad):
     stiffness: Float[Array, "3"]
     damping: Float[Array, "3"]
     preload: Float[Array, "3"]
-    springs: Curves | None = None
-    dampers: Curves | None = None
+    springs: Curves | None = eqx.field(default=None, metadata={"over": "angle"})
+    dampers: Curves | None = eqx.field(default=None, metadata={"over": "rate"})
 
     balanced = True
     drawn = None

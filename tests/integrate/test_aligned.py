@@ -115,6 +115,25 @@ def test_breaks_are_those_of_all_signals_of_a_scene():
     np.testing.assert_allclose(lengths[lengths > 0.0], [START - 0.25, 0.4 - START, 0.05])
 
 
+def test_curves_over_anything_but_time_have_none():
+    curve = lg.Sampled([-0.3, 0.2, 0.5], [-30.0, 20.0, 60.0], kind="monotone")
+    at, far, x = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
+    body = lambda: lg.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0))
+    axes = (curve, None, None)
+    forces = {
+        "curve": lg.CurveSpringDamper(None, "a", at_a=far, at_b=at, spring=curve, damper=curve),
+        "bushing": lg.Bushing(
+            None, "b", at=at, springs=axes, dampers=axes, rotational_springs=axes, rotational_dampers=axes
+        ),
+        "straight": lg.Bushing(None, "b", at=at, springs=axes),
+        "stop": lg.BumpStop(None, "a", at_a=far, at_b=at, gap=0.3, stiffness=1e4, rounding=1e-3),
+    }
+    screw = lg.ScrewJoint(None, "c", at=at, axis=x, pitch=0.1, travel=curve)
+    model = lg.Model({"a": body(), "b": body(), "c": body()}, {"screw": screw}, forces)
+    for scene in (model, model.system()):
+        assert breaks_of(scene).size == 0
+
+
 def test_extrapolation_has_its_order_at_edges():
     """Errors of h⁴, where equal steps have the kinks inside of them."""
     aligned, equal = (
