@@ -57,7 +57,7 @@ def _in_less_work(run, extrapolated, found, reached: Reached) -> tuple[Any, Reac
     best = next((one for setting in less if (one := accurate(*setting)) is not None), (found, reached))
     n, two = best[1].num_steps, best[1].extrapolated
     compiled = n % 4 == 0 and Steps.of(3 * n // 4, float).room == Steps.of(n, float).room
-    order = 4 if two else reached.integrator.scheme.convergence_order
+    order: Any = 4 if two else reached.integrator.scheme.convergence_order
     if compiled and (4 / 3) ** order * best[1].error <= reached.asked:
         return accurate(3 * n // 4, two) or best
     return best
