@@ -74,6 +74,7 @@ from lgsens.model import (
     CoordinateForce as CoordinateForce,
     CurveSpringDamper as CurveSpringDamper,
     CylindricalJoint as CylindricalJoint,
+    Delayed as Delayed,
     DistanceJoint as DistanceJoint,
     Drag as Drag,
     FixedJoint as FixedJoint,

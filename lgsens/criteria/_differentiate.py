@@ -143,8 +143,8 @@ def differentiate(
             check_certifiable(integrator, None, (p, t0, t1))
         else:
             integrator, num_steps = aligned(integrator, build(as_parameters(p)), t0, t1, num_steps)
-        settings |= {"method": method, "integrator": integrator}
-        run = lambda n, throw: differentiate(criteria, build, p, num_steps=n, throw=throw, **settings)
+        own = settings | {"method": method, "integrator": integrator}
+        run = lambda n, throw: differentiate(criteria, build, p, num_steps=n, throw=throw, **own)
         found = differentiate_to(run, float(accuracy), integrator, num_steps, extrapolate=not certificate)
         return found._replace(certificate=worth(num_steps=found.reached.num_steps, tolerance=float(accuracy)))
     num_steps = as_count(num_steps, "num_steps", " (it is static), unless `accuracy` is given")

@@ -6,7 +6,11 @@ from lgsens.dynamics._accelerations import (
     equations_of_motion as equations_of_motion,
     factorized_accelerations as factorized_accelerations,
 )
-from lgsens.dynamics._breaks import AbstractTimeFunction as AbstractTimeFunction, breaks_of as breaks_of
+from lgsens.dynamics._breaks import (
+    AbstractTimeFunction as AbstractTimeFunction,
+    breaks_of as breaks_of,
+    told_breaks as told_breaks,
+)
 from lgsens.dynamics._constraints import (
     constraint_acceleration as constraint_acceleration,
     constraint_velocity as constraint_velocity,

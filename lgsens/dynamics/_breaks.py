@@ -8,6 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lgsens._validate import as_float
+
 
 class AbstractTimeFunction(eqx.Module):
     """What a system follows in time."""
@@ -19,6 +21,12 @@ class AbstractTimeFunction(eqx.Module):
         return breaks_of([getattr(self, field.name) for field in dataclasses.fields(self)])
 
 
+def told_breaks(function: AbstractTimeFunction) -> Float[Array, " *k"]:
+    """What `breaks` says, which may be numbers, and a method; of many of a kind those of each along the last axis."""
+    breaks = function.breaks() if callable(function.breaks) else function.breaks
+    return as_float(breaks, None, f"`breaks` of a {type(function).__name__}")
+
+
 def breaks_of(tree: Any) -> Float[Array, " k"]:
     """The breaks of all functions of time in a pytree, a system say, one or many of a kind. What is a function of
     something else (`over` in the metadata of its field) has none."""
@@ -28,7 +36,7 @@ def breaks_of(tree: Any) -> Float[Array, " k"]:
 
 def _breaks(node: Any) -> Iterator[Array]:
     if isinstance(node, AbstractTimeFunction):
-        yield jnp.ravel(node.breaks)
+        yield jnp.ravel(told_breaks(node))
     elif dataclasses.is_dataclass(node) and not isinstance(node, type):
         fields = [field for field in dataclasses.fields(node) if field.metadata.get("over", "time") == "time"]
         yield from _breaks([getattr(node, field.name) for field in fields])

@@ -1,6 +1,6 @@
 """Schemes, grids, and the march through time (paper, §4)."""
 
-from lgsens.integrate._aligned import FEWEST as FEWEST, AlignedSteps as AlignedSteps
+from lgsens.integrate._aligned import FEWEST as FEWEST, LEAST as LEAST, AlignedSteps as AlignedSteps
 from lgsens.integrate._alpha import AbstractAlpha as AbstractAlpha
 from lgsens.integrate._explicit import IndexReducedODE as IndexReducedODE
 from lgsens.integrate._explicit_step import ended as ended

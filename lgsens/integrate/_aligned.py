@@ -5,13 +5,13 @@ the step the kink is, so errors do not fall evenly, and neither extrapolation no
 gain. Where a signal says when it breaks (`breaks`: the ends of a bump, of a ramp, the samples of a table), steps can
 end there, and are of one size from one break to the next.
 
-Numbers of steps. The K pieces of lengths L_j have one step each, and the N − K others are theirs in proportion to
-length, by rounding what adds up: with S_j = L_1 + … + L_j
+Numbers of steps. The K pieces of lengths L_j have two steps each, which Gregory's rule takes (`time_integral`), and the
+N − 2 K others are theirs in proportion to length, by rounding what adds up: with S_j = L_1 + … + L_j
 
-    m_1 + … + m_j = j + round((N − K) S_j/S_K).
+    m_1 + … + m_j = 2 j + round((N − 2 K) S_j/S_K).
 
-So that 2n steps are the halves of n, this is done for N = n/2^r, as small as it may be and still 48 or more and as many
-as there are pieces; each of these is divided into 2^r. With fewer steps than pieces, all are equal.
+So that 2n steps are the halves of n, this is done for N = n/2^r, as small as it may be and still 48 or more and 2 K or
+more; each of these is divided into 2^r. With fewer than 2 K steps, all are equal.
 
 Where steps end is constant for derivatives, as with `AdaptiveSteps`: criteria do not know the derivative of a grid.
 """
@@ -28,6 +28,7 @@ from lgsens.integrate._scheme import AbstractIntegrator, AbstractScheme, Laid, s
 from lgsens.integrate._uneven import GivenSteps
 
 FEWEST = 48  # steps that are not divided any further: pieces are in proportion to within a few per cent
+LEAST = 2  # steps in each piece
 _HALVINGS = 24
 
 
@@ -36,17 +37,19 @@ class AlignedSteps(AbstractIntegrator):
 
     Breaks are the times at which a signal, or a derivative of it, jumps, as far as the signals of the scene say so
     (`AbstractSignal.breaks`): both ends of a `BumpRoad` and of a `Ramp`, the samples of a `SampledRoad` and of
-    `Sampled`. What is computed in so many steps has the full order of the scheme there, and can be extrapolated:
-    `Richardson(AlignedSteps())`. Breaks at times that depend on the motion (a contact that opens) are not known.
+    `Sampled`. Where derivatives jump, what is computed in so many steps has the order of the scheme, and can be
+    extrapolated: `Richardson(AlignedSteps())`. Where the signal itself jumps, it is of first order, as in any steps,
+    and so are derivatives by the times of samples at which a slope jumps. Breaks at times that depend on the motion (a
+    contact that opens) are not known.
 
     Arguments:
         integrator: the scheme, `GeneralizedAlpha` or another one.
 
-    `num_steps` steps are shared among the pieces between breaks in proportion to their lengths, and each piece has at
-    least one. Where there are more pieces than steps, all steps are equal, and so they are where nothing breaks. Twice
-    as many steps are the halves of these, from 48 steps on. Under `vmap` each design has its own. The derivative is
-    that on the grid of these numbers, exactly; by the times of breaks, which move the grid, finite differences agree
-    with it on the same grid (`GivenSteps.of`).
+    `num_steps` steps are shared among the pieces between breaks in proportion to their lengths, and each piece has two
+    at least. Where there are not so many, all steps are equal, and so they are where nothing breaks. Twice as many
+    steps are the halves of these, from 48 steps on. Under `vmap` each design has its own. The derivative is that on the
+    grid of these numbers, exactly. The times of breaks move the grid, and by whole steps from piece to piece, so a
+    search over them goes better on a grid that stays, `GivenSteps.of(trajectory)`; on that finite differences agree.
 
     Raises `ValueError` for what is no scheme in steps.
     """
@@ -77,15 +80,15 @@ class AlignedSteps(AbstractIntegrator):
 
 
 def aligned_sizes(lengths: Float[Array, " k"], count: Float[Array, ""], room: int) -> Float[Array, " room"]:
-    """The sizes of `count` steps through pieces of these lengths, whose sum is 1, then zeros; more pieces than steps:
-    equal ones."""
-    share, pieces = jnp.cumsum(lengths), pieces_within(lengths)
+    """The sizes of `count` steps through pieces of these lengths, whose sum is 1, then zeros; equal ones, where there
+    are not `LEAST` for each piece."""
+    share, least = jnp.cumsum(lengths), LEAST * pieces_within(lengths)
     divided = count / 2.0 ** jnp.arange(_HALVINGS, dtype=count.dtype)
-    halvings = jnp.sum((divided == jnp.floor(divided)) & (divided >= jnp.maximum(pieces[-1], FEWEST))) - 1
+    halvings = jnp.sum((divided == jnp.floor(divided)) & (divided >= jnp.maximum(least[-1], FEWEST))) - 1
     each = 2.0 ** jnp.maximum(halvings, 0).astype(count.dtype)
-    last = each * (pieces + jnp.round((count / each - pieces[-1]) * share))  # the number of steps up to each end
+    last = each * (least + jnp.round((count / each - least[-1]) * share))  # the number of steps up to each end
     n = jnp.arange(room, dtype=count.dtype)
     piece = jnp.minimum(jnp.searchsorted(last, n, side="right"), last.size - 1)
     taken = jnp.diff(last, prepend=0.0)[piece]
-    sizes = jnp.where(pieces[-1] <= count, lengths[piece] / jnp.where(taken > 0.0, taken, 1.0), 1.0 / count)
+    sizes = jnp.where(least[-1] <= count, lengths[piece] / jnp.where(taken > 0.0, taken, 1.0), 1.0 / count)
     return jnp.where(n < count, sizes, 0.0)

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from lgsens.dynamics import breaks_of
 
 MANY = 256  # pieces: more are the samples of a table, which are many for steps to end at each
-_SHORTEST = 1e-7  # of the interval: a break that is no farther from another one is that
+_SHORTEST = 1e-6  # of the interval: a break that is no farther from another one is that
 _SEEN = 3.0  # steps in a piece, at whose ends something of what happens there is seen
 
 

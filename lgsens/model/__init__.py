@@ -109,6 +109,7 @@ from lgsens.model._shafts import ConstantVelocityJoint as ConstantVelocityJoint,
 from lgsens.model._signals import (
     AbstractSignal as AbstractSignal,
     Constant as Constant,
+    Delayed as Delayed,
     Harmonic as Harmonic,
     Polynomial as Polynomial,
     Ramp as Ramp,

@@ -47,7 +47,7 @@ class Bushing(AbstractConnection):
     With nothing rotational it resists no rotation, and costs nothing for it, nor for curves that it does not have. It
     is as smooth as its curves, its tangents one derivative less. The moments do the work −m·φ̇: on b acts −m but for
     terms of second order in φ. The damper turns with a, and forces act at the point on b: with damping a and b are not
-    to be exchanged where both turn much. A force between bodies that is stiffer by orders than the others makes explicit
+    to be exchanged where both turn much. A force between bodies that is far stiffer than the others makes explicit
     integrators take as many more steps; generalized-α does not mind. Raises `ValueError` for wrong shapes, axes that
     are none, and curves that are not three signals or None. Source: Masarati & Morandini (2010),
     doi:10.1007/s11044-010-9194-y.

@@ -89,7 +89,7 @@ class BumpRoad(AbstractSignal):
 
     @property
     def breaks(self):
-        return jnp.stack([self.start, self.start + self.duration])
+        return jnp.stack([self.start, self.start + self.duration], axis=-1)
 
     def __call__(self, t):
         phase = (t - self.start) / self.duration

@@ -25,6 +25,7 @@ is C¹ and rises where the samples rise, so no force curve has a slope of the wr
 """
 
 import abc
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -35,7 +36,7 @@ from jaxtyping import Array, Float
 
 from lgsens._brief import as_called
 from lgsens._validate import as_float, number_field, require, shaped
-from lgsens.dynamics import AbstractTimeFunction
+from lgsens.dynamics import AbstractTimeFunction, told_breaks
 
 _KINDS = ("linear", "cubic", "monotone")
 
@@ -56,8 +57,10 @@ class AbstractSignal(AbstractTimeFunction):
             return self.amplitude * jnp.sin(jnp.pi * self.rate * t**2)
     ```
 
-    One that is not smooth says where in `breaks`, so that steps can end there (`AlignedSteps`). An element of one's own
-    that takes a signal over anything but time says so in its field: `eqx.field(metadata={"over": "angle"})`.
+    One that is not smooth says where in a property `breaks`, so that steps can end there (`AlignedSteps`). Without it
+    they are those of the signals that it holds, so one that shifts or scales their time must say its own (`Delayed`
+    does). An element of one's own that takes a signal over anything but time says so in its field:
+    `eqx.field(metadata={"over": "angle"})`.
     """
 
     __repr__ = as_called
@@ -152,7 +155,7 @@ class Ramp(AbstractSignal):
 
     @property
     def breaks(self):
-        return jnp.stack([self.t_start, self.t_start + self.duration])
+        return jnp.stack([self.t_start, self.t_start + self.duration], axis=-1)
 
     def __call__(self, t):
         # the polynomial has zero slope and curvature at 0 and 1, whatever JAX says of those of `clip` there
@@ -193,6 +196,35 @@ class Sampled(AbstractSignal):
 
     def __call__(self, t):
         return jnp.interp(t, self.times, self.values) if self.kind == "linear" else prepared(self)(t)
+
+
+class Delayed(AbstractSignal):
+    """Another signal, later: s(t) = signal(t − delay); the rear wheel on the road of the front one.
+
+    Arguments:
+        signal: what it follows.
+        delay: [s], shape ().
+
+    Raises `ValueError` for what is no signal.
+    """
+
+    signal: AbstractSignal
+    delay: Float[Array, ""] = number_field("delay")
+
+    def __check_init__(self):
+        if not isinstance(self.signal, AbstractSignal):
+            raise ValueError(f"Delayed: `signal` must be a signal (BumpRoad, Sampled, …), got {self.signal!r}.")
+
+    @property
+    def straight(self):
+        return self.signal.straight
+
+    @property
+    def breaks(self):
+        return told_breaks(self.signal) + self.delay[..., None]
+
+    def __call__(self, t):
+        return self.signal(t - self.delay)
 
 
 class _Spline(AbstractSignal):
@@ -296,6 +328,8 @@ Prescribed = Float[Array, ""] | AbstractSignal
 
 def prepared(value: Any) -> Any:
     """A number or signal with what can be computed before the time steps."""
+    if isinstance(value, Delayed):
+        return dataclasses.replace(value, signal=prepared(value.signal))
     if not isinstance(value, Sampled) or value.kind == "linear":
         return value
     return (_Spline if value.kind == "cubic" else _Monotone).through(value)

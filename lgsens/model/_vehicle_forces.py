@@ -257,7 +257,7 @@ class PlaneContact(AbstractConnection):
         coefficient: μ of friction [–], shape (), the force μ F u/√(u² + u₀²) against the slip u; None: none.
         slip_speed: u₀ [m/s], shape (), > 0, given with `coefficient`.
 
-    An impact takes about π √(m/k), of which a step may be a small part only: in steps as long as it a point may come off
+    An impact takes about π √(m/k), of which a step may be a small part only: in steps as long as it a point may leave
     faster than it came, which `certify` says. `AdaptiveSteps` finds such steps.
 
     `Trajectory.force` gives F [N]. Raises `ValueError` for wrong shapes, a zero axis, a rounding or speed ≤ 0, other

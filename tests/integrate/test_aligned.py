@@ -3,6 +3,7 @@
 import functools
 import itertools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -71,7 +72,7 @@ def test_steps_end_at_breaks_and_are_equal_between_them():
     ]
     for piece, length in zip(pieces, (START, DURATION, T1 - EDGES[1])):
         np.testing.assert_allclose(piece, piece[0], rtol=1e-12)
-        assert abs(len(piece) - 100 * length) < 4.0  # of 50 steps one each, the others by rounding; then halved
+        assert abs(len(piece) - 100 * length) < 4.0  # of 50 steps two each, the others by rounding; then halved
     np.testing.assert_allclose(np.repeat(sizes / 2.0, 2), laid(BUMP, 200), rtol=1e-12)
     np.testing.assert_allclose(np.repeat(sizes / 4.0, 4), laid(BUMP, 400), rtol=1e-12)
 
@@ -99,7 +100,7 @@ def test_breaks_are_those_of_all_signals_of_a_scene():
     ramp = lg.Ramp(end=0.1, t_start=0.2, duration=0.3)
     table = lg.Sampled([0.0, 0.4, 0.9], [0.0, 1.0, 0.5], kind="cubic")
     both = Sum((ramp, lg.Harmonic(amplitude=0.1, frequency=1.0), table))
-    np.testing.assert_allclose(np.sort(both.breaks), [0.0, 0.2, 0.4, 0.5, 0.9])
+    np.testing.assert_allclose(np.sort(breaks_of(both)), [0.0, 0.2, 0.4, 0.5, 0.9])
     model = on(BUMP)
     model = lg.Model(
         model.bodies | {"cart": lg.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0))},
@@ -113,6 +114,44 @@ def test_breaks_are_those_of_all_signals_of_a_scene():
         np.testing.assert_allclose(np.unique(breaks_of(scene)), [0.0, 0.2, START, 0.4, EDGES[1], 0.5, 0.9])
     lengths = np.asarray(piece_lengths(model, jnp.asarray(0.25), jnp.asarray(0.45)))
     np.testing.assert_allclose(lengths[lengths > 0.0], [START - 0.25, 0.4 - START, 0.05])
+
+
+def test_breaks_of_one_s_own():
+    class Step(lg.AbstractSignal):
+        at: float = eqx.field(static=True)
+
+        @property
+        def breaks(self):
+            return self.at, self.at + 1.0  # numbers, not an array
+
+        def __call__(self, t):
+            return jnp.where(t < self.at, 0.0, 1.0)
+
+    class Wrong(Step):
+        @property
+        def breaks(self):
+            return "at 0.3"
+
+    np.testing.assert_allclose(breaks_of(Step(0.3)), [0.3, 1.3])
+    np.testing.assert_allclose(breaks_of(lg.Delayed(Step(0.3), delay=0.2)), [0.5, 1.5])
+    with pytest.raises(ValueError, match=says("`breaks` of a Wrong", "array of numbers", "at 0.3")):
+        breaks_of(Wrong(0.3))
+
+
+def test_delayed():
+    """Of a bump, a table and many of a kind: the rear wheel on the road of the front one."""
+    for signal in (BUMP, lg.Sampled([0.0, 0.4, 0.9], [0.0, 1.0, 0.5], kind="cubic")):
+        later = lg.Delayed(signal, delay=0.25)
+        for t in (0.1, 0.3, 0.6, 0.9):
+            np.testing.assert_allclose(later(jnp.asarray(t)), signal(jnp.asarray(t - 0.25)), rtol=1e-12)
+    model = on(lg.Delayed(BUMP, delay=0.25))
+    wheels = {"mass": model.bodies["mass"], "other": model.bodies["mass"]}
+    rear = lg.TyreSpring("other", at=(0.0, 0.0, 0.0), stiffness=STIFFNESS, road=lg.Delayed(BUMP, delay=0.4))
+    system = lg.Model(wheels, forces=model.forces | {"rear": rear}).system()
+    np.testing.assert_allclose(np.unique(breaks_of(system)), np.sort([e + d for e in EDGES for d in (0.25, 0.4)]))
+    with pytest.raises(ValueError, match=says("Delayed: `signal`", "0.3")):
+        lg.Delayed(0.3, delay=0.1)
+    assert lg.Delayed(lg.SampledRoad([0.0, 1.0], [0.0, 1.0]), delay=0.1).straight
 
 
 def test_curves_over_anything_but_time_have_none():
