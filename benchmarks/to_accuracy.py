@@ -101,6 +101,7 @@ def rows(name: str) -> list[dict]:
             ),
             flush=True,
         )
+    jax.clear_caches()  # programs hold memory maps, of which a process has only so many
     return found
 
 
