@@ -160,7 +160,8 @@ def aligned(integrator: AbstractIntegrator, scene: Any, t0, t1, fewest: int | No
     lengths = np.asarray(piece_lengths(scene, t0, t1))
     lengths, first = lengths[lengths > 0.0], fewest or _FEWEST
     ends = 4 * first * np.cumsum(lengths) / lengths.sum()
-    if lengths.size > MANY or np.all(np.abs(ends - np.round(ends)) < _ON_TIME) or not integrator.equal_steps:
+    equal = lengths.size > MANY or np.all(np.abs(ends - np.round(ends)) < _ON_TIME)
+    if equal and integrator.equal_steps:
         return integrator, fewest
     return AlignedSteps(integrator.scheme), max(first, FEWEST, LEAST * lengths.size)
 

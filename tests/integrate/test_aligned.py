@@ -13,6 +13,7 @@ from helpers import says
 import lgsens as lg
 from lgsens.dynamics import breaks_of
 from lgsens.integrate import MANY, piece_lengths
+from lgsens.simulation import aligned
 
 MASS, STIFFNESS, T1 = 2.0, 200.0, 1.0
 OMEGA = np.sqrt(STIFFNESS / MASS)
@@ -175,9 +176,9 @@ def test_curves_over_anything_but_time_have_none():
 def test_extrapolation_has_its_order_at_edges():
     """Errors of h⁴, where equal steps have the kinks inside of them."""
     of = lambda kind, n: abs(float(end(lg.Richardson(kind), n)[0]) - END)
-    aligned = [of(lg.AlignedSteps(), n) for n in (100, 200)]
-    assert aligned[0] > 10.0 * aligned[1], aligned  # 16, less h³ of ρ∞ = 0.9
-    assert of(lg.GeneralizedAlpha(), 200) > 5.0 * aligned[1]
+    errors = [of(lg.AlignedSteps(), n) for n in (100, 200)]
+    assert errors[0] > 10.0 * errors[1], errors  # 16, less h³ of ρ∞ = 0.9
+    assert of(lg.GeneralizedAlpha(), 200) > 5.0 * errors[1]
 
 
 @pytest.mark.slow
@@ -202,6 +203,18 @@ def test_an_accuracy_is_reached_by_them(accuracy):
     assert run.reached.num_steps <= 1024  # in equal steps 1e-7 takes 32768
     on_time = lg.BumpRoad(height=0.1, duration=0.125, start=0.25)  # equal steps end there as well
     assert lg.simulate(on(on_time), t1=T1, accuracy=accuracy).reached.integrator == lg.GeneralizedAlpha()
+
+
+def test_where_they_are_taken_and_how_many_at_first():
+    table = lambda n: on(lg.SampledRoad(np.linspace(0.0, 1.0, n), np.zeros(n)))
+    plain, of = lg.GeneralizedAlpha(0.8), lg.AlignedSteps(lg.GeneralizedAlpha(0.8))
+    assert aligned(plain, on(BUMP), 0.0, T1, None) == (of, 64)
+    assert aligned(plain, on(BUMP), 0.0, T1, 200) == (of, 200)
+    assert aligned(plain, on(BUMP), 0.0, 0.2, None) == (plain, None)  # before it
+    assert aligned(plain, table(41), 0.0, T1, 100) == (plain, 100)  # on times of 400 steps
+    assert aligned(plain, table(42), 0.0, T1, None) == (of, 82)  # two for each piece
+    assert aligned(of, table(41), 0.0, T1, 30) == (of, 80)
+    assert aligned(plain, table(MANY + 2), 0.0, T1, None) == (plain, None)
 
 
 CONTROLLED = {
