@@ -30,7 +30,7 @@ def told_breaks(function: AbstractTimeFunction) -> Float[Array, " *k"]:
 def breaks_of(tree: Any) -> Float[Array, " k"]:
     """The breaks of all functions of time in a pytree, a system say, one or many of a kind. What is a function of
     something else (`over` in the metadata of its field) has none."""
-    found = list(_breaks(tree))
+    found = [breaks.astype(float) for breaks in _breaks(tree)]  # whatever the precision of each
     return jnp.concatenate(found) if found else jnp.zeros(0)
 
 
