@@ -24,15 +24,15 @@ from jaxtyping import Array, Float
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
 from lgsens.integrate._grid import Steps, UnevenGrid
 from lgsens.integrate._pieces import piece_lengths, pieces_within
-from lgsens.integrate._scheme import AbstractIntegrator, AbstractScheme, Laid, scheme_of
-from lgsens.integrate._uneven import GivenSteps
+from lgsens.integrate._scheme import AbstractScheme, Laid, scheme_of
+from lgsens.integrate._uneven import AbstractUnevenSteps, GivenSteps
 
 FEWEST = 48  # steps that are not divided any further: pieces are in proportion to within a few per cent
 LEAST = 2  # steps in each piece
 _HALVINGS = 24
 
 
-class AlignedSteps(AbstractIntegrator):
+class AlignedSteps(AbstractUnevenSteps):
     """Steps that end at the breaks of a scene, and are equal between them: an integrator of `simulate`.
 
     Breaks are the times at which a signal, or a derivative of it, jumps, as far as the signals of the scene say so
@@ -58,14 +58,6 @@ class AlignedSteps(AbstractIntegrator):
 
     def __check_init__(self):
         scheme_of("AlignedSteps", self.integrator)
-
-    @property
-    def scheme(self):
-        return self.integrator
-
-    @property
-    def equal_steps(self):
-        return False
 
     def lay(self, system, start, t0, t1, num_steps):
         counted = isinstance(num_steps, Steps)

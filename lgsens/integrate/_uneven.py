@@ -58,7 +58,21 @@ _KEPT = (0.93, 1.2)  # what is asked for, relative to a size that stays
 _LEAST = 1e-6  # errors below this fraction of the tolerance count as so large
 
 
-class GivenSteps(AbstractIntegrator):
+class AbstractUnevenSteps(AbstractIntegrator):
+    """A scheme in steps that are not all equal."""
+
+    integrator: eqx.AbstractVar[AbstractScheme]
+
+    @property
+    def scheme(self):
+        return self.integrator
+
+    @property
+    def equal_steps(self):
+        return False
+
+
+class GivenSteps(AbstractUnevenSteps):
     """Steps of given sizes: an integrator of `simulate`.
 
         t_{n+1} = t_n + (t1 − t0) f_n,   f = fractions/Σ fractions
@@ -117,14 +131,6 @@ class GivenSteps(AbstractIntegrator):
     def num_steps(self) -> int:
         return self.fractions.shape[0]
 
-    @property
-    def scheme(self):
-        return self.integrator
-
-    @property
-    def equal_steps(self):
-        return False
-
     def check(self, num_steps):
         if self.num_steps != num_steps:
             raise ValueError(
@@ -135,7 +141,7 @@ class GivenSteps(AbstractIntegrator):
         return Laid(UnevenGrid.first(t0, (t1 - t0) * (self.fractions / jnp.sum(self.fractions))))
 
 
-class AdaptiveSteps(AbstractIntegrator):
+class AdaptiveSteps(AbstractUnevenSteps):
     """Steps under error control: an integrator of `simulate`.
 
         |e_i| ≤ tolerance s_i,     s = 1 rad or the length of the scene
@@ -182,14 +188,6 @@ class AdaptiveSteps(AbstractIntegrator):
         require_setting(self, "tolerance", valid, "positive", "; try 1e-6")
         valid = isinstance(self.longest, int | float) and 0.0 < self.longest <= 1.0
         require_setting(self, "longest", valid, "in (0, 1]", "; 0.02 is the default")
-
-    @property
-    def scheme(self):
-        return self.integrator
-
-    @property
-    def equal_steps(self):
-        return False
 
     def lay(self, system, start, t0, t1, num_steps):
         mean = (t1 - t0) / num_steps
