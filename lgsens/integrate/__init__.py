@@ -1,6 +1,6 @@
 """Schemes, grids, and the march through time (paper, §4)."""
 
-from lgsens.integrate._aligned import FEWEST as FEWEST, LEAST as LEAST, AlignedSteps as AlignedSteps
+from lgsens.integrate._aligned import AlignedSteps as AlignedSteps, undivided as undivided
 from lgsens.integrate._alpha import AbstractAlpha as AbstractAlpha
 from lgsens.integrate._explicit import IndexReducedODE as IndexReducedODE
 from lgsens.integrate._explicit_step import ended as ended
@@ -31,7 +31,7 @@ from lgsens.integrate._march import (
     march_on as march_on,
     states_of as states_of,
 )
-from lgsens.integrate._pieces import MANY as MANY, piece_lengths as piece_lengths
+from lgsens.integrate._pieces import MANY as MANY, PieceEnds as PieceEnds, piece_lengths as piece_lengths
 from lgsens.integrate._radau import RadauIIA as RadauIIA
 from lgsens.integrate._scheme import (
     AbstractIntegrator as AbstractIntegrator,

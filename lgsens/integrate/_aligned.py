@@ -27,8 +27,8 @@ from lgsens.integrate._pieces import piece_lengths, pieces_within
 from lgsens.integrate._scheme import AbstractScheme, Laid, scheme_of
 from lgsens.integrate._uneven import AbstractUnevenSteps, GivenSteps
 
-FEWEST = 48  # steps that are not divided any further: pieces are in proportion to within a few per cent
-LEAST = 2  # steps in each piece
+_FEWEST = 48  # so that pieces are in proportion to within a few per cent
+_LEAST = 2  # steps in each piece
 _HALVINGS = 24
 
 
@@ -51,7 +51,8 @@ class AlignedSteps(AbstractUnevenSteps):
     grid of these numbers, exactly. The times of breaks move the grid, and by whole steps from piece to piece, so a
     search over them goes better on a grid that stays, `GivenSteps.of(trajectory)`; on that finite differences agree.
 
-    Raises `ValueError` for what is no scheme in steps.
+    Raises `ValueError` for what is no scheme in steps. Source: Hairer, Nørsett & Wanner, Solving Ordinary Differential
+    Equations I (2008), §II.6 (discontinuities).
     """
 
     integrator: AbstractScheme = eqx.field(static=True, default=GeneralizedAlpha())
@@ -71,12 +72,18 @@ class AlignedSteps(AbstractUnevenSteps):
         return GivenSteps.of(trajectory, self.integrator)
 
 
+def undivided(pieces):
+    """The least number of steps through so many pieces that is not halved any further."""
+    return jnp.maximum(_LEAST * pieces, _FEWEST)
+
+
 def aligned_sizes(lengths: Float[Array, " k"], count: Float[Array, ""], room: int) -> Float[Array, " room"]:
     """The sizes of `count` steps through pieces of these lengths, whose sum is 1, then zeros; equal ones, where there
-    are not `LEAST` for each piece."""
-    share, least = jnp.cumsum(lengths), LEAST * pieces_within(lengths)
+    are not two for each piece."""
+    share, pieces = jnp.cumsum(lengths), pieces_within(lengths)
+    least = _LEAST * pieces
     divided = count / 2.0 ** jnp.arange(_HALVINGS, dtype=count.dtype)
-    halvings = jnp.sum((divided == jnp.floor(divided)) & (divided >= jnp.maximum(least[-1], FEWEST))) - 1
+    halvings = jnp.sum((divided == jnp.floor(divided)) & (divided >= undivided(pieces[-1]))) - 1
     each = 2.0 ** jnp.maximum(halvings, 0).astype(count.dtype)
     last = each * (least + jnp.round((count / each - least[-1]) * share))  # the number of steps up to each end
     n = jnp.arange(room, dtype=count.dtype)

@@ -105,7 +105,8 @@ class IndexReducedODE(AbstractScheme):
     `Trajectory.order` is 4, so integrals need `time_integral(…, order=4)`. Without `rtol` a `Criterion` of the
     trajectory integrates over the stages instead (`Trajectory.stages`), and is of the order of the scheme. Times at
     which forces are not smooth should be output times (`AlignedSteps`); with `rtol` steps end at those that signals
-    tell. Joints hold to the square of the error of a step at every output
+    tell, unless they are more than a quarter of `max_steps` in an interval.
+    Joints hold to the square of the error of a step at every output
     time, rotations to round-off; no body may turn by half a revolution in an output interval. a is v̇.
 
     **Step size.** An explicit scheme is stable up to |h ω| of about 3 for the fastest mode. The steps also integrate

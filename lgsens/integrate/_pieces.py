@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import breaks_of
@@ -25,14 +26,14 @@ def pieces_within(lengths: Float[Array, " k"]) -> Float[Array, " k"]:
 
 
 class PieceEnds(NamedTuple):
-    """Where steps under error control are to end, from t0 on: at breaks, of which there are `MANY` at most."""
+    """Where steps under error control are to end, from t0 on: at breaks, unless there are too many of them."""
 
     ends: Float[Array, " k"]
 
     @classmethod
-    def of(cls, scene: Any, t0, total) -> "PieceEnds":
+    def of(cls, scene: Any, t0, total, most: int = MANY) -> "PieceEnds":
         lengths = piece_lengths(scene, t0, t0 + total)
-        ends, taken = jnp.cumsum(lengths), pieces_within(lengths)[-1] <= MANY
+        ends, taken = jnp.cumsum(lengths), pieces_within(lengths)[-1] <= most
         return cls(jnp.where((ends < ends[-1]) & taken, ends, total))
 
     def after(self, elapsed) -> tuple[Any, Any]:
@@ -42,3 +43,10 @@ class PieceEnds(NamedTuple):
         i = jnp.minimum(jnp.searchsorted(self.ends, elapsed, side="right"), self.ends.size - 1)
         begin = jnp.where(i > 0, self.ends[i - 1], 0.0)
         return self.ends[i], (self.ends[i] - begin) / _SEEN
+
+    def inside(self, t0) -> Array | None:
+        """The times of breaks, as `jump_ts` of diffrax: others are behind the end; None: there are none."""
+        if self.ends.size == 1:
+            return None
+        between = (self.ends > 0.0) & (self.ends < self.ends[-1])
+        return lax.stop_gradient(t0 + jnp.where(between, self.ends, 2.0 * self.ends[-1]))

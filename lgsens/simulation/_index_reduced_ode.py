@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens._xla import scan
-from lgsens.dynamics import AbstractSystem, Inertia, State, breaks_of, factorized_accelerations
-from lgsens.integrate import EqualGrid, IndexReducedODE, Stats, ended, with_first
+from lgsens.dynamics import AbstractSystem, Inertia, State, factorized_accelerations
+from lgsens.integrate import EqualGrid, IndexReducedODE, PieceEnds, Stats, ended, with_first
 
 
 class _Local(NamedTuple):
@@ -40,7 +40,7 @@ def _adaptive(settings: IndexReducedODE, problem: _Problem, q, v, t, h, running)
     """From one output time to the next under error control; nowhere unless `running`."""
     import diffrax  # takes its time to import
 
-    jumps = jax.lax.stop_gradient(breaks_of(problem.system).astype(h.dtype))
+    jumps = PieceEnds.of(problem.system, t, h, settings.max_steps // 4).inside(t)  # each takes a step at least
     rtol = 0.0 if settings.rtol is None else settings.rtol
     atol = rtol if settings.atol is None else settings.atol
     reverse = diffrax.RecursiveCheckpointAdjoint(checkpoints=settings.max_steps)
@@ -50,7 +50,7 @@ def _adaptive(settings: IndexReducedODE, problem: _Problem, q, v, t, h, running)
         *(t, jnp.where(running, t + h, t), h, _Local(jnp.zeros_like(v), v), (problem, q)),
         # the largest entry, so that more bodies do not loosen the control
         stepsize_controller=diffrax.ClipStepSizeController(
-            diffrax.PIDController(rtol, atol, norm=_largest), jump_ts=jumps if jumps.size else None
+            diffrax.PIDController(rtol, atol, norm=_largest), jump_ts=jumps
         ),
         adjoint=reverse if settings.mode == "reverse" else diffrax.ForwardMode(),
         max_steps=settings.max_steps,

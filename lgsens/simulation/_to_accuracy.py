@@ -33,7 +33,7 @@ import numpy as np
 from jax.core import Tracer
 
 from lgsens.dynamics import RESULTS, AbstractSystem, State
-from lgsens.integrate import FEWEST, LEAST, MANY, AbstractIntegrator, AlignedSteps, piece_lengths
+from lgsens.integrate import MANY, AbstractIntegrator, AlignedSteps, piece_lengths, undivided
 from lgsens.simulation._errors import SimulationError, primal_value
 from lgsens.simulation._reached import Reached
 from lgsens.simulation._richardson import Richardson, extrapolate_runs
@@ -163,7 +163,7 @@ def aligned(integrator: AbstractIntegrator, scene: Any, t0, t1, fewest: int | No
     equal = lengths.size > MANY or np.all(np.abs(ends - np.round(ends)) < _ON_TIME)
     if equal and integrator.equal_steps:
         return integrator, fewest
-    return AlignedSteps(integrator.scheme), max(first, FEWEST, LEAST * lengths.size)
+    return AlignedSteps(integrator.scheme), max(first, int(undivided(lengths.size)))
 
 
 @eqx.filter_jit

@@ -243,6 +243,8 @@ def test_tables_of_many_samples_are_left_to_the_error_control():
     road = lg.SampledRoad(np.linspace(0.0, 1.0, n), 1e-3 * np.sin(np.linspace(0.0, 6.0, n)))
     run = end(lg.AdaptiveSteps(tolerance=1e-4), 200, road)[1]
     assert int(run.stats.steps) < 100
+    run = end(lg.IndexReducedODE(rtol=1e-6), 2, lg.Sampled(road.times, road.heights, kind="cubic"))[1]
+    assert int(np.max(run.stats.steps)) < n // 2
 
 
 def of_road(p, integrator, num_steps=60, **settings):
