@@ -4,10 +4,10 @@
 
 Eight reference problems × 1e-2 … 1e-8: value and gradient of their criteria by `differentiate(…, accuracy=…)`. True
 errors (of values, and of gradients by their norm) are those against an explicit scheme of order 8 on the index-reduced
-equations. Beside it the cheapest settings that meet the accuracy by their true errors, of three ladders: one or two
-extrapolated runs of generalized-α in 64, 96, 128, 192, … equal steps, the same in `AlignedSteps`, and `RadauIIA` in
-16, 24, 32, … aligned steps. Times are medians of 5 calls after a warm-up, of the settings alone; `work` is what the
-search takes in steps, in those of the setting found. Writes to_accuracy.json and prints a table.
+equations. Beside it the cheapest settings that meet the accuracy by their true errors, of three ladders: one run of
+generalized-α, or two or three that are extrapolated, in 64, 96, 128, 192, … equal steps, the same in `AlignedSteps`,
+and `RadauIIA` in 16, 24, 32, … aligned steps. Times are medians of 5 calls after a warm-up, of the settings alone;
+`work` is what the search takes in steps, in those of the setting found. Writes to_accuracy.json and prints a table.
 """
 
 import functools
@@ -33,8 +33,8 @@ NAMES = (
     "five_link_quarter_car",
 )
 ASKED = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
-EQUAL = sorted((n, two) for k in (64, 96) for i in range(11) for n in (k * 2**i,) for two in (False, True) if n > 64)
-RADAU = sorted((k * 2**i, False) for k in (16, 24) for i in range(7))
+EQUAL = [(k * 2**i, runs) for k in (64, 96) for i in range(11) for runs in (1, 2, 3) if k * 2 ** (i + 1 - runs) >= 64]
+RADAU = [(k * 2**i, 1) for k in (16, 24) for i in range(7)]
 LADDERS = {
     "equal": (lg.GeneralizedAlpha(), EQUAL),
     "aligned": (lg.AlignedSteps(), EQUAL),
@@ -50,6 +50,11 @@ def error(found, true) -> float:
     return max(less(part[key], of[key]) for part, of in zip(found[:2], true[:2]) for key in of)
 
 
+def work_of(num_steps: int, runs: int) -> float:
+    """In steps: n + n/2 + …."""
+    return num_steps * (2.0 - 2.0 ** (1 - runs))
+
+
 def rows(name: str) -> list[dict]:
     problem = PROBLEMS[name]
     of = functools.partial(lg.differentiate, problem.criteria, problem.build, problem.parameters, t1=problem.t1)
@@ -59,19 +64,20 @@ def rows(name: str) -> list[dict]:
     def run(integrator, n):
         return of(num_steps=n, integrator=integrator, throw=False)
 
-    def setting(integrator, n: int, two: bool):
-        each = lambda k: of(num_steps=k, integrator=integrator)[:2]
-        return lg.richardson(each, n // 2).value if two else each(n)
+    def extrapolated(each, n: int, runs: int):
+        return lg.richardson(each, n // 2 ** (runs - 1), runs).value if runs > 1 else each(n)
+
+    def setting(integrator, n: int, runs: int):
+        return extrapolated(lambda k: of(num_steps=k, integrator=integrator)[:2], n, runs)
 
     @functools.cache
-    def error_of(integrator, n: int, two: bool) -> float:
-        each = lambda k: run(integrator, k)[:2]
-        return error(lg.richardson(each, n // 2).value if two else each(n), true)
+    def error_of(integrator, n: int, runs: int) -> float:
+        return error(extrapolated(lambda k: run(integrator, k)[:2], n, runs), true)
 
     def cheapest(ladder: str, asked: float):
-        """In the order of their work: an extrapolated run of n steps takes another one of n/2."""
+        """In the order of their work."""
         integrator, settings = LADDERS[ladder]
-        ordered = sorted(settings, key=lambda each: each[0] * (1.5 if each[1] else 1.0))
+        ordered = sorted(settings, key=lambda each: work_of(*each))
         return next(((integrator, *each) for each in ordered if error_of(integrator, *each) <= asked), None)
 
     ladders = [ladder for ladder in LADDERS if ladder != "aligned" or name in WITH_EDGES]
@@ -85,20 +91,18 @@ def rows(name: str) -> list[dict]:
             continue
         own = reached.reached
         best = {ladder: at for ladder in ladders if (at := cheapest(ladder, asked)) is not None}
-        settings = [(own.integrator, own.num_steps, own.extrapolated), *best.values()]
+        settings = [(own.integrator, own.num_steps, own.runs), *best.values()]
         chosen, *others = median_seconds(*(functools.partial(setting, *each) for each in settings))
         ms = {ladder: 1e3 * seconds for ladder, seconds in zip(best, others)}
-        work = sum(n for n, _ in own.tried) / (own.num_steps * (1.5 if own.extrapolated else 1.0))
+        work = sum(n for n, _ in own.tried) / work_of(own.num_steps, own.runs)
         row |= {"reached": error(reached, true), "estimated": own.error, "steps": own.num_steps}
-        row |= {"aligned": own.integrator == lg.AlignedSteps(), "extrapolated": own.extrapolated, "work": work}
+        row |= {"aligned": own.integrator == lg.AlignedSteps(), "runs": own.runs, "work": work}
         row |= {"ms": 1e3 * chosen, "best": {ladder: at[1:] for ladder, at in best.items()}, "best_ms": ms}
         found.append(row)
         print(
             f"{name[:34]:34} {asked:7.0e} {row['reached']:9.1e} {own.error:9.1e} {own.num_steps:7d} "
-            f"{'two' if own.extrapolated else 'one'}  {row['ms']:8.2f} {work:5.1f}  "
-            + ", ".join(
-                f"{ladder} {ms[ladder]:.2f} ({at[1]}{', two' if at[2] else ''})" for ladder, at in best.items()
-            ),
+            f"{own.runs:4d}  {row['ms']:8.2f} {work:5.1f}  "
+            + ", ".join(f"{ladder} {ms[ladder]:.2f} ({at[1]}, {at[2]})" for ladder, at in best.items()),
             flush=True,
         )
     jax.clear_caches()  # programs hold memory maps, of which a process has only so many

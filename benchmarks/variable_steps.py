@@ -35,6 +35,9 @@ CASES = [
     *((f"tolerance {tolerance:g}", lg.AdaptiveSteps(ALPHA, tolerance=tolerance), n) for tolerance, n in (
         (1e-4, 200), (1e-5, 320), (1e-6, 600),
     )),
+    ("aligned", lg.AlignedSteps(ALPHA), 500),
+    ("given, equal", lg.GivenSteps(np.ones(500), ALPHA), 500),
+    ("given, equal, fixed", lg.GivenSteps(np.ones(500), ALPHA, fixed=True), 500),
 ]  # fmt: skip
 COMFORT = lg.Criterion(integrand=lambda s, p: s.body("chassis").acceleration[2] ** 2)
 RATES = ("stiffness", "damping", "bump")

@@ -114,6 +114,26 @@ def test_derivatives_on_a_given_grid():
         np.testing.assert_allclose(jnp.sum(forward[i] * direction), central(shifted, 1e-3), rtol=1e-7)
 
 
+def test_fixed_fractions_are_constants():
+    """Nothing but the derivative by them is left out: an uneven grid, whose ratios are not 1 in two steps of twelve."""
+    sizes = jnp.array([1.0] * 5 + [2.0] * 4 + [0.5] * 3)
+
+    def psi(p, t1, fractions, fixed, sensitivity):
+        integrator = lg.GivenSteps(fractions, SCHEME, fixed=fixed)
+        run = lg.simulate(make(p), t1=t1, num_steps=12, integrator=integrator, sensitivity=sensitivity)
+        return observed(run)
+
+    point = jnp.array(P), jnp.asarray(0.7), sizes
+    forward, reverse = lg.DirectDifferentiation(), lg.AdjointVariable()
+    every = jax.jit(jax.grad(partial(psi, fixed=False, sensitivity=reverse), argnums=(0, 1, 2)))(*point)
+    for derivative, method in ((jax.grad, reverse), (jax.jacfwd, forward)):
+        of = partial(psi, fixed=True, sensitivity=method)
+        found = jax.jit(derivative(of, argnums=(0, 1, 2)))(*point)
+        for one, other in zip(found[:2], every[:2], strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-10)  # other order of round-off
+        assert not found[2].any() and every[2].any()
+
+
 @pytest.mark.slow
 def test_derivatives_of_a_top_on_a_given_grid():
     """Rotations: by the initial angle and by the sizes of the steps, reverse mode against differences."""
@@ -274,6 +294,8 @@ def test_bad_input():
     for wrong in ([0.0, 1.0], [1.0, -1.0], [1.0, float("inf")]):
         with pytest.raises(ValueError, match=says("`fractions`", "first one positive")):
             lg.GivenSteps(wrong)
+    with pytest.raises(ValueError, match=says("GivenSteps", "`fixed`", "'yes'")):
+        lg.GivenSteps([1.0], fixed="yes")
     given = lg.GivenSteps([1.0, 2.0])
     with pytest.raises(ValueError, match=says("`num_steps` = 3", "has 2")):
         run(given, num_steps=3)

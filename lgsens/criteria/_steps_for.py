@@ -125,7 +125,7 @@ def steps_for(
         num_steps = _enough(flat, rows.shape[0], float(tolerance), pilot)
     placed = placed_steps(flat, as_count(num_steps, "num_steps"))
     of_values, of_gradients = (structure.unflatten(list(part)) for part in _expected(placed, len(leaves)))
-    return PlacedSteps(GivenSteps(placed.fractions, integrator), of_values, of_gradients)
+    return PlacedSteps(GivenSteps(placed.fractions, integrator, fixed=True), of_values, of_gradients)
 
 
 def _expected(placed: Placed, count: int) -> tuple[Float[Array, " c"], Float[Array, " c"]]:

@@ -10,7 +10,9 @@ from jax.flatten_util import ravel_pytree
 
 from lgsens.dynamics import RESULTS
 from lgsens.integrate import AbstractIntegrator, Steps
-from lgsens.simulation import Reached, richardson, to_accuracy
+from lgsens.simulation import Compared, Reached, richardson, to_accuracy
+
+_THREE = 5  # the order of three runs, where what is left of h³ does not show yet
 
 
 def differentiate_to(
@@ -23,43 +25,48 @@ def differentiate_to(
 ) -> Any:
     """The `Sensitivities` that have it, with `reached`; `run`: number of steps, whether to raise ↦ `Sensitivities`."""
 
-    def extrapolated(coarse, fine):
-        two = iter([coarse[:2], fine[:2]])
-        value, gradient = richardson(lambda _: next(two), 1).value
-        return fine._replace(value=value, gradient=gradient)
+    def extrapolated(runs):
+        each = iter([found[:2] for found in runs])
+        value, gradient = richardson(lambda _: next(each), 1, len(runs)).value
+        return runs[-1]._replace(value=value, gradient=gradient)
 
     run = functools.cache(run)
-    how = extrapolated if extrapolate and integrator.scheme.convergence_order == 2 else None
-    found, reached = to_accuracy(run, _distance, how, accuracy, integrator, fewest)
-    found, reached = _in_less_work(run, how, found, reached)
+    several = extrapolate and integrator.scheme.convergence_order == 2
+    compared = Compared(_distance, extrapolated, 3 if several else 1)
+    found, reached = to_accuracy(run, compared, accuracy, integrator, fewest)
+    found, reached = _in_less_work(run, compared, found, reached)
     return found._replace(reached=reached)
 
 
-def _in_less_work(run, extrapolated, found, reached: Reached) -> tuple[Any, Reached]:
-    """The cheapest of the runs that have the accuracy too, as what was found tells in the end: their error is their
+def _in_less_work(run, compared: Compared, found, reached: Reached) -> tuple[Any, Reached]:
+    """The cheapest of the settings that have the accuracy too, as what was found tells in the end: their error is their
     distance from that, and its own. In loops this setting is taken again and again, so three quarters of its steps are
     tried as well, unless a program were compiled for them."""
 
-    def accurate(n: int, two: bool) -> tuple[Any, Reached] | None:
-        runs = [run(k, False) for k in ((n // 2, n) if two else (n,))]
+    def accurate(setting: Reached) -> tuple[Any, Reached] | None:
+        runs = [run(n, False) for n in setting.numbers]
         if any(int(one.result) != RESULTS.successful for one in runs):
             return None
-        result = extrapolated(*runs) if two else runs[0]
-        error = _distance(result, found) + reached.error
-        now = reached._replace(error=error, num_steps=n, extrapolated=two)
-        return (result, now) if error <= reached.asked else None
+        result = compared.extrapolated(runs) if setting.extrapolated else runs[0]
+        setting = setting._replace(error=_distance(result, found) + reached.error)
+        return (result, setting) if setting.error <= reached.asked else None
 
-    work = lambda n, two: 1.5 * n if two else float(n)
+    work = lambda setting: sum(setting.numbers)
     numbers = [n for n, _ in reached.tried]
-    every = [(n, two) for n in numbers for two in (False, True) if not two or (extrapolated and n // 2 in numbers)]
-    own = work(reached.num_steps, reached.extrapolated)
-    less = sorted((setting for setting in every if work(*setting) < own), key=lambda setting: work(*setting))
-    best = next((one for setting in less if (one := accurate(*setting)) is not None), (found, reached))
-    n, two = best[1].num_steps, best[1].extrapolated
-    compiled = n % 4 == 0 and Steps.of(3 * n // 4, float).room == Steps.of(n, float).room
-    order: Any = 4 if two else reached.integrator.scheme.convergence_order
-    if compiled and (4 / 3) ** order * best[1].error <= reached.asked:
-        return accurate(3 * n // 4, two) or best
+    every = [
+        reached._replace(num_steps=n, runs=k + 1)
+        for i, n in enumerate(numbers)
+        for k in range(min(i + 1, compared.runs))
+    ]
+    less = sorted((setting for setting in every if work(setting) < work(reached)), key=work)
+    best = next((one for setting in less if (one := accurate(setting)) is not None), (found, reached))
+    setting = best[1]
+    room = lambda n: Steps.of(n, float).room
+    divided = all(n % 4 == 0 for n in setting.numbers)
+    compiled = divided and {room(3 * n // 4) for n in setting.numbers} <= set(map(room, numbers))
+    order: Any = (reached.integrator.scheme.convergence_order, 4, _THREE)[setting.runs - 1]
+    if compiled and (4 / 3) ** order * setting.error <= reached.asked:
+        return accurate(setting._replace(num_steps=3 * setting.num_steps // 4)) or best
     return best
 
 

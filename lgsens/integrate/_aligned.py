@@ -66,7 +66,7 @@ class AlignedSteps(AbstractUnevenSteps):
         lengths, steps = jax.lax.stop_gradient((piece_lengths(system, t0, t1), steps))
         fractions = aligned_sizes(lengths / jnp.sum(lengths), steps, room)
         count = steps if counted else None
-        return Laid(UnevenGrid.first(t0, (t1 - t0) * fractions, room=counted, count=count))
+        return Laid(UnevenGrid.first(t0, (t1 - t0) * fractions, room=counted, count=count, fixed=True))
 
     def frozen(self, trajectory):
         return GivenSteps.of(trajectory, self.integrator)

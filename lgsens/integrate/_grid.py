@@ -9,7 +9,9 @@ algorithmic acceleration of generalized-α stands for the acceleration at t_n + 
 
     y_n* = `scheme.resized`(y_n) at r_n = h_n/h_{n−1}
 
-in place of y_n. Sizes that differ by round-off are the same, r = 1. A step of size 0 leaves everything as it is: a grid
+in place of y_n. Sizes that differ by round-off are the same, r = 1. There ∂y_n*/∂r is not zero; but where ratios are
+constants (`fixed`: sizes are parts of the interval that nothing depends on), a step with r = 1 begins with y_n, to all
+derivatives, and nothing is to be done. A step of size 0 leaves everything as it is: a grid
 that needs fewer steps than its arrays have places ends with such. For its equations it has the size before it, which
 can be divided by.
 """
@@ -84,6 +86,10 @@ class AbstractGrid(eqx.Module):
 
     def begun(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State, factors: Any = None) -> State:
         """What the step at a place begins with; `factors`: those below, if they are known."""
+        return state
+
+    def resized(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State, factors: Any = None) -> State:
+        """`begun`, of a step whose size may differ from that of the one before."""
         return state
 
     def begun_in_turn(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State) -> State:
@@ -211,13 +217,13 @@ def without_round_off(ratio):
 
 @jax.custom_jvp
 def _begun_in_turn(scheme: Resizes, system: AbstractSystem, grid: "UnevenGrid", place: Place, state: State) -> State:
-    return grid.where_resized(place, lambda state: grid.begun(scheme, system, place, state), state)
+    return grid.where_resized(place, lambda state: grid.resized(scheme, system, place, state), state)
 
 
 @_begun_in_turn.defjvp
 def _derivative_of_begun(primals, tangents):
     """That by r is not zero where r is 1."""
-    return jax.jvp(lambda scheme, system, grid, *at: grid.begun(scheme, system, *at), primals, tangents)
+    return jax.jvp(lambda scheme, system, grid, *at: grid.resized(scheme, system, *at), primals, tangents)
 
 
 class UnevenGrid(AbstractGrid):
@@ -228,13 +234,14 @@ class UnevenGrid(AbstractGrid):
     before: Float[Array, ""]  # the size of the step that led to t0, to which the state there belongs
     room: bool = eqx.field(static=True, default=False)  # whether there may be many empty places at the end
     count: Float[Array, ""] | None = None  # of the steps that are not empty, where it is known
+    fixed: bool = eqx.field(static=True, default=False)  # whether the ratios of sizes are constants
     resizes: ClassVar[bool] = True
     num_steps: ClassVar[Any] = property(lambda self: self.h.shape[-1])  # no argument, where the base has a field
 
     @classmethod
-    def first(cls, t0, h, *, room: bool = False, count=None) -> "UnevenGrid":
+    def first(cls, t0, h, *, room: bool = False, count=None, fixed: bool = False) -> "UnevenGrid":
         """From a state at t0 that belongs to the first step."""
-        return cls(t0=t0, h=h, before=h[0], room=room, count=count)
+        return cls(t0=t0, h=h, before=h[0], room=room, count=count, fixed=fixed)
 
     @property
     def first_size(self):
@@ -255,16 +262,25 @@ class UnevenGrid(AbstractGrid):
         last = jax.lax.cummax(jnp.where(h != 0.0, jnp.arange(1, h.shape[0] + 1), 0))
         size = jnp.concatenate([self.before[None], h])[last]
         ratio = without_round_off(size / jnp.concatenate([self.before[None], size[:-1]]))
+        ratio = jax.lax.stop_gradient(ratio) if self.fixed else ratio
         return Place(self.t0 + jnp.cumsum(h) - h, h, size, ratio)
 
     def node(self, place):
         return Node(place.begin, place.begin + place.size, place.h)
 
-    def begun(self, scheme, system, place, state, factors=None):
+    def resized(self, scheme, system, place, state, factors=None):
         return scheme.resized(system, state, place.begin, factors).at(system, place.ratio)
 
+    def begun(self, scheme, system, place, state, factors=None):
+        change = lambda state: self.resized(scheme, system, place, state, factors)
+        return self.where_resized(place, change, state) if self.fixed else change(state)
+
     def begun_in_turn(self, scheme, system, place, state):
-        return _begun_in_turn(scheme, system, self, place, state)
+        return (
+            self.begun(scheme, system, place, state)
+            if self.fixed
+            else _begun_in_turn(scheme, system, self, place, state)
+        )
 
     def where_resized(self, place, change, same):
         shapes = jax.eval_shape(change, same)
@@ -272,7 +288,11 @@ class UnevenGrid(AbstractGrid):
         return jax.lax.cond(resized, lambda same: alike(change(same), shapes), lambda same: alike(same, shapes), same)
 
     def factors(self, scheme, system, place, state):
-        return scheme.resizing_factors(system, state, place.begin)
+        found = lambda _: scheme.resizing_factors(system, state, place.begin)
+        if not self.fixed:
+            return found(None)
+        none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(found, None))
+        return self.where_resized(place, found, none)
 
     def ratio(self, place):
         return place.ratio
@@ -283,13 +303,13 @@ class UnevenGrid(AbstractGrid):
     def halved(self):
         count = None if self.count is None else 2.0 * self.count
         h = jnp.repeat(self.h / 2.0, 2)
-        return UnevenGrid(t0=self.t0, h=h, before=self.before / 2.0, room=self.room, count=count)
+        return dataclasses.replace(self, h=h, before=self.before / 2.0, count=count)
 
     def segments(self, count, length):
         h = jnp.concatenate([self.h, jnp.zeros(count * length - self.num_steps, self.h.dtype)]).reshape(count, length)
         sizes = jnp.concatenate([self.before[None], self.places().h])
         begins = length * np.arange(count)
-        return UnevenGrid(t0=self.times()[begins], h=h, before=sizes[begins])
+        return UnevenGrid(t0=self.times()[begins], h=h, before=sizes[begins], fixed=self.fixed)
 
 
 def later(states: Tree) -> Tree:

@@ -81,10 +81,14 @@ class GivenSteps(AbstractUnevenSteps):
         fractions: the sizes of the steps, relative to each other, shape (num_steps,), not negative, the first positive.
             A step of size 0 repeats the state.
         integrator: the scheme, `GeneralizedAlpha` or another one.
+        fixed: whether `fractions` are constants, of zero derivative. Gradients are then cheaper, next to those in equal
+            steps where most sizes stay (`benchmarks/variable_steps.py`); else the derivative by the ratio of sizes is
+            formed in every step.
 
-    `GivenSteps.of(trajectory)` has those of a trajectory: the grid that error control found for one design serves
-    those nearby, and what is computed on it is as smooth in the parameters as on equal steps. The trajectory is of
-    second order, multipliers too, where sizes jump as well. Derivatives are exact, those by `fractions`, t0 and t1 too.
+    `GivenSteps.of(trajectory)` has those of a trajectory, fixed: the grid that error control found for one design
+    serves those nearby, and what is computed on it is as smooth in the parameters as on equal steps. The trajectory is
+    of second order, multipliers too, where sizes jump as well. Derivatives are exact, those by `fractions` (unless
+    fixed), t0 and t1 too.
 
     Raises `ValueError` for fractions of another shape or sign.
     """
@@ -92,10 +96,13 @@ class GivenSteps(AbstractUnevenSteps):
     any_number: ClassVar[bool] = False
     fractions: Float[Array, " n"]
     integrator: AbstractScheme = eqx.field(static=True, default=GeneralizedAlpha())
+    fixed: bool = eqx.field(static=True, default=False)
 
-    def __init__(self, fractions, integrator: AbstractScheme = GeneralizedAlpha()):
+    def __init__(self, fractions, integrator: AbstractScheme = GeneralizedAlpha(), *, fixed: bool = False):
         self.fractions = as_float(fractions, None, "GivenSteps: `fractions`")
         self.integrator = scheme_of("GivenSteps", integrator)
+        self.fixed = fixed
+        require_setting(self, "fixed", isinstance(fixed, bool), "True or False")
         if self.fractions.ndim != 1 or not self.fractions.size:
             raise ValueError(f"GivenSteps: `fractions` must have shape (num_steps,), got {self.fractions.shape}.")
         require(
@@ -125,7 +132,7 @@ class GivenSteps(AbstractUnevenSteps):
         sizes = lax.stop_gradient(jnp.diff(trajectory.t))
         if is_concrete(sizes):
             sizes = np.asarray(sizes)[np.asarray(sizes) > 0.0]
-        return cls(sizes, integrator)
+        return cls(sizes, integrator, fixed=True)
 
     @property
     def num_steps(self) -> int:
@@ -138,7 +145,8 @@ class GivenSteps(AbstractUnevenSteps):
             )
 
     def lay(self, system, start, t0, t1, num_steps):
-        return Laid(UnevenGrid.first(t0, (t1 - t0) * (self.fractions / jnp.sum(self.fractions))))
+        fractions = lax.stop_gradient(self.fractions) if self.fixed else self.fractions
+        return Laid(UnevenGrid.first(t0, (t1 - t0) * (fractions / jnp.sum(fractions)), fixed=self.fixed))
 
 
 class AdaptiveSteps(AbstractUnevenSteps):
@@ -195,7 +203,7 @@ class AdaptiveSteps(AbstractUnevenSteps):
         frozen = lax.stop_gradient((system, start, t0, mean))
         found = lax.stop_gradient(_controlled_steps(self, num_steps, *frozen))
         sizes, states, stats, reached = found
-        grid = UnevenGrid.first(t0, sizes / frozen[-1] * mean, room=True)
+        grid = UnevenGrid.first(t0, sizes / frozen[-1] * mean, room=True, fixed=True)
         return Laid(grid, (states, Stats(*stats[: len(Stats._fields)])), stats, reached)
 
     def frozen(self, trajectory):

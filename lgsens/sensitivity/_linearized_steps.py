@@ -82,7 +82,7 @@ class LinearizedSteps(NamedTuple):
     def _begun(self, linear: LinearStep, previous: Variation) -> Variation:
         """δ_n* at given parameters, of a step of another size than the one before."""
         (system, grid), step = self.parameters, linear.step
-        at = lambda state: grid.begun(self.scheme, system, step.place, state, linear.factors)
+        at = lambda state: grid.resized(self.scheme, system, step.place, state, linear.factors)
         d_begun = jax.jvp(at, (step.before,), (to_ambient(system.group, step.before, previous),))[1]
         return to_algebra(system.group, linear.begun, d_begun)
 

@@ -7,13 +7,10 @@ from lgsens.simulation._errors import (
     raise_if_failed as raise_if_failed,
     throw_if_failed as throw_if_failed,
 )
+from lgsens.simulation._extrapolation import Extrapolated as Extrapolated, richardson as richardson
 from lgsens.simulation._joint_motion import JointMotion as JointMotion
 from lgsens.simulation._reached import Reached as Reached
-from lgsens.simulation._richardson import (
-    Extrapolated as Extrapolated,
-    Richardson as Richardson,
-    richardson as richardson,
-)
+from lgsens.simulation._richardson import Richardson as Richardson
 from lgsens.simulation._settings import (
     check_accuracy as check_accuracy,
     check_integrator as check_integrator,
@@ -34,7 +31,7 @@ from lgsens.simulation._start import (
     equilibrium as equilibrium,
     initial_state as initial_state,
 )
-from lgsens.simulation._to_accuracy import aligned as aligned, to_accuracy as to_accuracy
+from lgsens.simulation._to_accuracy import Compared as Compared, aligned as aligned, to_accuracy as to_accuracy
 from lgsens.simulation._trajectory import (
     AbstractMotion as AbstractMotion,
     AbstractRun as AbstractRun,

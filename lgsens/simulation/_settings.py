@@ -56,7 +56,7 @@ def check_accuracy(accuracy: Any, num_steps: int | None, integrator: Any, arrays
         )
     if not is_concrete(jax.tree.map(primal_value, arrays)):
         raise ValueError(
-            "`accuracy` needs numbers, and chooses steps outside of `jit` and `vmap`. Call it once before, and give "
-            "`found.reached.num_steps` and `found.reached.integrator`, that with half as many steps in `Richardson` "
-            "where `found.reached.extrapolated`."
+            "`accuracy` needs numbers, and chooses steps outside of `jit` and `vmap`. Call it once before, and take "
+            "its setting: `found.reached.again(lambda n: differentiate(…, num_steps=n, "
+            "integrator=found.reached.integrator)[:2])`."
         )

@@ -14,8 +14,9 @@ Where runs are clearly of second order, three of them also give two that are ext
 (ψ_n − ψ_{n/2})/3. The error of the finer one is taken to be their distance e_n = |χ_n − χ_{n/2}|, which smooth motions
 have 15 times better: at an edge between two times what extrapolation leaves changes its size from run to run. Where a
 fourth run shows that it does not, r = e_{n/2}/e_n is clearly 2⁴ and the order of the runs was clear before too, the
-error is taken to be 2 e_n/(r − 1), twice what the order says. What no run sees, an event shorter than all steps, is in
-no estimate.
+error is taken to be 2 e_n/(r − 1), twice what the order says. Then h⁴ may be removed as well, ω_n = χ_n + (χ_n −
+χ_{n/2})/15, whose error is taken to be |ω_n − ω_{n/2}|: as large as r is off 2⁴. What no run sees, an event shorter
+than all steps, is in no estimate.
 
 Sources: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I (2008), §II.4 and §II.9; Roache,
 Verification and validation in computational science and engineering (1998), §5 (observed order of convergence).
@@ -23,8 +24,8 @@ Verification and validation in computational science and engineering (1998), §5
 
 import dataclasses
 import itertools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -50,10 +51,23 @@ _ON_TIME = 1e-6  # of a step
 _COARSE = (RESULTS.newton_failed, RESULTS.turn_not_resolved, RESULTS.singular_configuration)  # more steps may help
 
 
+class Compared(NamedTuple):
+    """How results of runs in more and more steps are compared.
+
+    Attributes:
+        distance: of a result from a finer one, relative as the accuracy is.
+        extrapolated: of two or three results, each in twice as many steps as the one before.
+        runs: the most that are extrapolated, 3 at most; 1: none are.
+    """
+
+    distance: Callable[[Any, Any], float]
+    extrapolated: Callable[[Sequence[Any]], Any]
+    runs: int = 3
+
+
 def to_accuracy(
     run: Callable[[int, bool], Any],
-    distance: Callable[[Any, Any], float],
-    extrapolated: Callable[[Any, Any], Any] | None,
+    compared: Compared,
     accuracy: float,
     integrator: AbstractIntegrator,
     fewest: int | None = None,
@@ -62,8 +76,7 @@ def to_accuracy(
 
     Arguments:
         run: number of steps, whether to raise if it fails ↦ a result with `result`, a value of `RESULTS`.
-        distance: of a result from a finer one, relative as `accuracy` is.
-        extrapolated: of two results, the second in twice as many steps; None: not possible.
+        compared: its results, with each other.
         accuracy: the largest error.
         integrator: the scheme in its steps, of order p.
         fewest: the first number of steps.
@@ -77,8 +90,8 @@ def to_accuracy(
         found = run(n, n > most // 8 and not tried)  # a scene that fails in any number of steps says why
         if int(found.result) == RESULTS.successful:
             results = [*results[-3:], found]
-            tried.append((n, distance(*results[-2:]) if len(results) > 1 else np.inf))
-            reached = _reached(results, tried, distance, extrapolated, accuracy, integrator)
+            tried.append((n, compared.distance(*results[-2:]) if len(results) > 1 else np.inf))
+            reached = _reached(results, tried, compared, accuracy, integrator)
             if reached is not None:
                 return reached
         elif int(found.result) in _COARSE:
@@ -95,34 +108,44 @@ def to_accuracy(
     )
 
 
-def _reached(results, tried, distance, extrapolated, accuracy: float, integrator) -> tuple[Any, Reached] | None:
+def _reached(results, tried, compared: Compared, accuracy: float, integrator) -> tuple[Any, Reached] | None:
     """The result that is accurate enough, if there is one."""
-    order = integrator.scheme.convergence_order
     distances = [d for _, d in tried if np.isfinite(d)]
     if len(results) < 3 or len(distances) < 2:
         return None
+    levels = _levels(results, distances, compared, integrator.scheme.convergence_order)
+    for runs, (result, error) in enumerate(levels, 1):
+        if error <= accuracy:
+            return result, Reached(accuracy, float(error), tried[-1][0], runs, integrator, tuple(tried))
+    return None
+
+
+def _levels(results, distances, compared: Compared, order: int) -> Iterator[tuple[Any, float]]:
+    """The results of one run, of two and of three, as far as they can be trusted, and their errors."""
     *_, before, last = distances
-    (n, _), history = tried[-1], tuple(tried)
     ratio = before / last if last > 0.0 else np.inf
     if not ratio > _LEAST:
-        return None
+        return
     clear = _clear(ratio, order)
     if ratio < _CLEAR[0] * 2.0**order:
         earlier = distances[-3] / before if len(distances) > 2 else 0.0
         if earlier < _LEAST:
-            return None
+            return
         ratio = min(ratio, earlier)
-    error = last / (min(ratio, 2.0**order) - 1.0) if ratio <= _CLEAR[1] * 2.0**order else last
-    if error <= accuracy:
-        return results[-1], Reached(accuracy, float(error), n, False, integrator, history)
-    if extrapolated is None or not clear:
-        return None
-    coarse, fine = (extrapolated(*pair) for pair in itertools.pairwise(results[-3:]))
-    error = distance(coarse, fine)
+    yield results[-1], last / (min(ratio, 2.0**order) - 1.0) if ratio <= _CLEAR[1] * 2.0**order else last
+    if compared.runs < 2 or not clear:
+        return
+    coarse, fine = map(compared.extrapolated, itertools.pairwise(results[-3:]))
+    error, clear = compared.distance(coarse, fine), False
     if len(results) > 3 and _clear(distances[-3] / before, order) and error > 0.0:
-        ratio = distance(extrapolated(*results[:2]), coarse) / error
-        error = _SAFETY * error / (min(ratio, 2.0**4) - 1.0) if _clear(ratio, 4) else error
-    return (fine, Reached(accuracy, float(error), n, True, integrator, history)) if error <= accuracy else None
+        ratio = compared.distance(compared.extrapolated(results[:2]), coarse) / error
+        clear = _clear(ratio, 4)
+        error = _SAFETY * error / (min(ratio, 2.0**4) - 1.0) if clear else error
+    yield fine, error
+    if compared.runs < 3 or not clear:
+        return
+    coarse, fine = compared.extrapolated(results[:3]), compared.extrapolated(results[1:])
+    yield fine, compared.distance(coarse, fine)
 
 
 def _clear(ratio: float, order: int) -> bool:
@@ -143,9 +166,9 @@ def simulate_to(simulate: Callable[..., Any], accuracy, model, num_steps: int | 
         return float(_distance(system, coarse.states, jax.tree.map(lambda leaf: leaf[::stride], fine.states)))
 
     run = lambda n, throw: simulate(fixed, num_steps=n, throw=throw, **at)
-    extrapolated = lambda coarse, fine: extrapolate_runs(coarse.system, coarse, fine)
-    extrapolated = extrapolated if integrator.scheme.convergence_order == 2 else None
-    found, reached = to_accuracy(run, distance, extrapolated, float(accuracy), integrator, fewest)
+    extrapolated = lambda two: extrapolate_runs(two[0].system, *two)
+    compared = Compared(distance, extrapolated, 2 if integrator.scheme.convergence_order == 2 else 1)
+    found, reached = to_accuracy(run, compared, float(accuracy), integrator, fewest)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((model, settings))):
         two = {"integrator": Richardson(integrator), "num_steps": reached.num_steps // 2}
         one = {"num_steps": reached.num_steps}
