@@ -7,6 +7,7 @@ mode. Other runs are estimated by `_refined_run.py`.
 """
 
 import dataclasses
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -21,7 +22,9 @@ from lgsens.integrate import (
     AbstractScheme,
     EqualGrid,
     GeneralizedAlpha,
+    Node,
     Variation,
+    renewed,
 )
 from lgsens.sensitivity import LinearStep, Parameters, linearized_trajectory
 from lgsens.simulation import StateError, Trajectory
@@ -80,8 +83,8 @@ def error_estimate(trajectory: Trajectory, integrator: AbstractIntegrator = Gene
 def _is_by(integrator: AbstractIntegrator, trajectory: Trajectory):
     """Whether steps are equal if they should be, and a belongs to v̇, up to round-off and what is NaN."""
     t, a, vdot = jax.lax.stop_gradient((trajectory.t, trajectory.states.a, trajectory.states.vdot))
-    xp = jnp
-    if is_concrete(t, a, vdot):  # inside `jit` operations of JAX are traced even so
+    xp, restarts = jnp, integrator.scheme.restarts(trajectory.system)
+    if is_concrete(t, a, vdot, restarts):  # inside `jit` operations of JAX are traced even so
         xp, (t, a, vdot) = np, map(np.asarray, (t, a, vdot))
     scheme, eps, h = integrator.scheme, float(jnp.finfo(vdot.dtype).eps), xp.diff(t)
     before = xp.concatenate([h[:1], h[:-1]])
@@ -89,7 +92,8 @@ def _is_by(integrator: AbstractIntegrator, trajectory: Trajectory):
     ratio = xp.where(taken, h / xp.where(taken, before, 1.0), 1.0)
     left = scheme.mismatch((vdot[:-1], a[:-1]), (vdot[1:], a[1:]), ratio[:, None])
     differ = xp.abs(0.0 * a[1:] if left is None else left) > 1e3 * eps * xp.nanmax(xp.abs(a), initial=0.0)
-    same = ~xp.any(taken[:, None] & differ)
+    anew = jax.vmap(partial(renewed, restarts))(Node(*map(jnp.asarray, (t[:-1], t[1:], h))), ratio)
+    same = ~xp.any((taken & ~xp.asarray(anew))[:, None] & differ)
     equal = xp.ptp(h) <= 1e-6 * h.mean() + 16 * eps * xp.abs(t).max()
     return xp.asarray(same & (equal | (not integrator.equal_steps)))
 
@@ -99,7 +103,7 @@ def _estimated(integrator: AbstractIntegrator, trajectory: Trajectory) -> StateE
     scheme, t = integrator.scheme, trajectory.t
     if not integrator.equal_steps:
         return refined_error(scheme, trajectory)
-    grid = EqualGrid(t[0], (t[-1] - t[0]) / (t.shape[0] - 1), t.shape[0] - 1)
+    grid = EqualGrid.between(t[0], t[-1], t.shape[0] - 1, scheme.restarts(trajectory.system))
     defects = scheme.defects(trajectory.system, grid, trajectory.states)
     if defects is None:
         return refined_error(scheme, trajectory)

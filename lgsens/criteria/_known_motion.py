@@ -1,5 +1,6 @@
 """A motion in equal steps that is gone over several times: simulated once, and its steps linearized once."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -63,15 +64,16 @@ def known_motion(
 ) -> tuple[Packed, KnownMotion]:
     """A `KnownMotion` for programs to come, its numbers packed: a program of its own, which all criteria share."""
     flat, unravel = ravel_pytree(p)
-    grid = EqualGrid(t0, (t1 - t0) / num_steps, num_steps)
+    equal = EqualGrid.between(t0, t1, num_steps)
 
     def scene(flat):
         p = unravel(flat)
         system = as_system(build(p))
         begun = begin(scheme, system, t0, None if start is None else start(p))
-        return (system, begun.start.at(system, grid.first_size)), begun
+        return (system, begun.start.at(system, equal.first_size)), begun
 
     (system, state0), of_scene, begun = jax.linearize(scene, flat, has_aux=True)
+    grid = dataclasses.replace(equal, restarts=scheme.restarts(system))
     known = KnownRun.of(scheme, state0, Parameters(system, grid))
     motion = KnownMotion(known, begun, eqx.filter_closure_convert(of_scene, flat), t1)
     numbers, functions = eqx.partition(motion, eqx.is_array)

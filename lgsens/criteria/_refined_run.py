@@ -40,7 +40,7 @@ def refined_run(scheme: AbstractScheme, trajectory: Trajectory) -> Trajectory:
     states, system, t = trajectory.states, trajectory.system, trajectory.t
     first = jax.tree.map(lambda leaf: leaf[0], states)
     start = scheme.resized(system, scheme.resumed(system, first, t[0]), t[0]).at(system, 0.5)
-    grid = UnevenGrid.first(t[0], jnp.repeat(0.5 * jnp.diff(t), 2))
+    grid = UnevenGrid.first(t[0], jnp.repeat(0.5 * jnp.diff(t), 2), restarts=scheme.restarts(system))
     finer, stats = DirectDifferentiation().trajectory(scheme, start, Parameters(system, grid))
     stages, finer = scheme.stages(system, grid, finer), scheme.physical(system, finer)
     stats = scheme.statistics(stats)

@@ -24,6 +24,7 @@ from lgsens.dynamics._initial import (
     acceleration_and_jerk as acceleration_and_jerk,
     accelerations as accelerations,
     assemble as assemble,
+    consistent_acceleration as consistent_acceleration,
     consistent_velocity as consistent_velocity,
     given_way as given_way,
     initial_state as initial_state,

@@ -88,6 +88,11 @@ class AbstractSystem(eqx.Module):
     def coordinate_scale(self) -> Float[Array, " k"]:
         """The size of a large change of each coordinate: 1 rad, or the length of the scene [m]."""
 
+    @property
+    def constraint_breaks(self) -> Float[Array, " k"]:
+        """The times at which what constraints follow breaks, as far as it says so (`AbstractTimeFunction.breaks`)."""
+        return jnp.zeros(0)
+
     def constraint_round_off(self) -> Float[Array, ""]:
         """What round-off may leave of Φ: a thousand of those of the largest number in q, or of a large change of it;
         far from the origin those are of the distance."""

@@ -5,24 +5,28 @@ from lgsens.integrate._alpha import AbstractAlpha as AbstractAlpha
 from lgsens.integrate._explicit import IndexReducedODE as IndexReducedODE
 from lgsens.integrate._explicit_step import ended as ended
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha as GeneralizedAlpha
+from lgsens.integrate._given import GivenSteps as GivenSteps
 from lgsens.integrate._grid import (
     AbstractGrid as AbstractGrid,
     EqualGrid as EqualGrid,
     Start as Start,
     Steps as Steps,
-    UnevenGrid as UnevenGrid,
-    earlier as earlier,
-    later as later,
-    with_first as with_first,
-    with_last as with_last,
+    renewed as renewed,
 )
 from lgsens.integrate._index3 import factorize_iteration_matrix as factorize_iteration_matrix
+from lgsens.integrate._integrator import AbstractIntegrator as AbstractIntegrator, Laid as Laid
 from lgsens.integrate._linearized import (
     AbstractLinearizedStep as AbstractLinearizedStep,
     Node as Node,
     Variation as Variation,
 )
-from lgsens.integrate._loops import over_steps as over_steps
+from lgsens.integrate._loops import (
+    earlier as earlier,
+    later as later,
+    over_steps as over_steps,
+    with_first as with_first,
+    with_last as with_last,
+)
 from lgsens.integrate._march import (
     Mark as Mark,
     Walk as Walk,
@@ -34,17 +38,12 @@ from lgsens.integrate._march import (
 from lgsens.integrate._pieces import MANY as MANY, PieceEnds as PieceEnds, piece_lengths as piece_lengths
 from lgsens.integrate._radau import RadauIIA as RadauIIA
 from lgsens.integrate._scheme import (
-    AbstractIntegrator as AbstractIntegrator,
     AbstractScheme as AbstractScheme,
-    Laid as Laid,
     Stages as Stages,
     Stats as Stats,
     rows as rows,
     scheme_of as scheme_of,
 )
 from lgsens.integrate._singular import singular_steps as singular_steps
-from lgsens.integrate._uneven import (
-    AdaptiveSteps as AdaptiveSteps,
-    ControlledStats as ControlledStats,
-    GivenSteps as GivenSteps,
-)
+from lgsens.integrate._uneven import AdaptiveSteps as AdaptiveSteps, ControlledStats as ControlledStats
+from lgsens.integrate._uneven_grid import UnevenGrid as UnevenGrid

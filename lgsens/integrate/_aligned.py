@@ -22,10 +22,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
-from lgsens.integrate._grid import Steps, UnevenGrid
+from lgsens.integrate._given import AbstractUnevenSteps, GivenSteps
+from lgsens.integrate._grid import Steps
+from lgsens.integrate._integrator import Laid
 from lgsens.integrate._pieces import piece_lengths, pieces_within
-from lgsens.integrate._scheme import AbstractScheme, Laid, scheme_of
-from lgsens.integrate._uneven import AbstractUnevenSteps, GivenSteps
+from lgsens.integrate._scheme import AbstractScheme, scheme_of
+from lgsens.integrate._uneven_grid import UnevenGrid
 
 _FEWEST = 48  # so that pieces are in proportion to within a few per cent
 _LEAST = 2  # steps in each piece
@@ -66,7 +68,10 @@ class AlignedSteps(AbstractUnevenSteps):
         lengths, steps = jax.lax.stop_gradient((piece_lengths(system, t0, t1), steps))
         fractions = aligned_sizes(lengths / jnp.sum(lengths), steps, room)
         count = steps if counted else None
-        return Laid(UnevenGrid.first(t0, (t1 - t0) * fractions, room=counted, count=count, fixed=True))
+        restarts = self.integrator.restarts(system)
+        return Laid(
+            UnevenGrid.first(t0, (t1 - t0) * fractions, room=counted, count=count, fixed=True, restarts=restarts)
+        )
 
     def frozen(self, trajectory):
         return GivenSteps.of(trajectory, self.integrator)

@@ -56,7 +56,7 @@ from lgsens.dynamics import (
     factorized_accelerations,
 )
 from lgsens.integrate._explicit_step import ExplicitLinearizedStep, Inner, corrections, ended
-from lgsens.integrate._grid import earlier, later, with_first, with_last
+from lgsens.integrate._loops import earlier, later, with_first, with_last
 from lgsens.integrate._scheme import AbstractScheme, Stages, Stats
 
 _MODES = ("reverse", "forward")

@@ -14,6 +14,13 @@ constants (`fixed`: sizes are parts of the interval that nothing depends on), a 
 derivatives, and nothing is to be done. A step of size 0 leaves everything as it is: a grid
 that needs fewer steps than its arrays have places ends with such. For its equations it has the size before it, which
 can be divided by.
+
+Steps that begin anew. Where a constraint breaks (a driver whose second or third derivative jumps), what the state
+carries of the motion before does not belong to that behind, and the first step that begins there or later begins with
+
+    y_n* = `scheme.renewed`(y_n).
+
+With r = 1 and no break a step begins with y_n, to all derivatives where ratios are constants.
 """
 
 import abc
@@ -25,15 +32,14 @@ from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from lgsens._xla import alike, in_any_lane, most_of_lanes
+from lgsens._xla import alike, in_any_lane
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate._linearized import Node
 
 Tree = TypeVar("Tree")
-_SAME = 1e4  # round-offs: what sums of sizes leave of them
+LATE = 1e-6  # of a step: a break that is no later is at its begin
 
 
 class Start(NamedTuple):
@@ -61,6 +67,16 @@ class Resizes(Protocol):
 
     def resizing_factors(self, system: AbstractSystem, state: State, t) -> Any: ...
 
+    def renewed(self, system: AbstractSystem, state: State, node: Node, ratio, factors: Any = None) -> State: ...
+
+
+def renewed(restarts: Float[Array, " k"] | None, node: Node, ratio) -> Bool[Array, ""]:
+    """Whether a break lies at the begin of a step, or in the one before, r times shorter."""
+    if restarts is None:
+        return jnp.zeros((), bool)
+    late = node.begin + LATE * node.h
+    return jnp.any((restarts <= late) & (restarts > late - node.h / ratio))
+
 
 class AbstractGrid(eqx.Module):
     """Where each of the steps begins and ends."""
@@ -69,6 +85,8 @@ class AbstractGrid(eqx.Module):
     h: eqx.AbstractVar[Float[Array, "*n"]]
     num_steps: eqx.AbstractVar[int]
     count: eqx.AbstractVar[Float[Array, ""] | None]  # how many of the steps are taken; None: all
+    restarts: eqx.AbstractVar[Float[Array, " k"] | None]  # the times after which steps begin anew; None: there are none
+    with_empty: ClassVar[bool] = False  # whether some steps may be none
 
     @abc.abstractmethod
     def times(self) -> Float[Array, " n+1"]:
@@ -82,27 +100,62 @@ class AbstractGrid(eqx.Module):
     def node(self, place: Any) -> Node:
         """The step at a place."""
 
-    resizes: ClassVar[bool] = False  # whether a step may begin with another state than the last one ended with
+    @property
+    def resizes(self) -> bool:
+        """Whether a step may begin with another state than the last one ended with."""
+        return self.restarts is not None
+
+    @property
+    def fixed(self) -> bool:
+        """Whether that is so for constants: only the steps of `changes` begin with another state then."""
+        return True
+
+    def resized(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State, factors: Any = None) -> State:
+        """`begun`, of a step that begins with another state than the last one ended with."""
+        node, ratio = self.node(place), self.ratio(place)
+        found = scheme.resized(system, state, node.begin, factors).at(system, ratio)
+        if self.restarts is None:
+            return found
+        anew = scheme.renewed(system, state, node, ratio, factors)
+        return jax.tree.map(lambda one, other: jnp.where(self.renews(place), one, other), anew, found)
 
     def begun(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State, factors: Any = None) -> State:
         """What the step at a place begins with; `factors`: those below, if they are known."""
-        return state
-
-    def resized(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State, factors: Any = None) -> State:
-        """`begun`, of a step whose size may differ from that of the one before."""
-        return state
+        if not self.resizes:
+            return state
+        change = lambda state: self.resized(scheme, system, place, state, factors)
+        return self.where_resized(place, change, state) if self.fixed else change(state)
 
     def begun_in_turn(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State) -> State:
         """`begun`, by `where_resized`."""
-        return state
-
-    def where_resized(self, place: Any, change: Callable[[Tree], Tree], same: Tree) -> Tree:
-        """`change(same)` where the step has another size than the one before; elsewhere it takes no time."""
-        return same
+        return self.begun(scheme, system, place, state)
 
     def factors(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State) -> Any:
         """What `begun` is found with; they have no derivative of their own."""
-        return None
+        if not self.resizes:
+            return None
+        found = lambda _: scheme.resizing_factors(system, state, self.node(place).begin)
+        if not self.fixed:
+            return found(None)
+        none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(found, None))
+        return self.where_resized(place, found, none)
+
+    def where_resized(self, place: Any, change: Callable[[Tree], Tree], same: Tree) -> Tree:
+        """`change(same)` where the step begins with another state; elsewhere it takes no time."""
+        if not self.resizes:
+            return same
+        shapes = jax.eval_shape(change, same)
+        resized = in_any_lane(self.changes(place))
+        return jax.lax.cond(resized, lambda same: alike(change(same), shapes), lambda same: alike(same, shapes), same)
+
+    def changes(self, place: Any) -> Bool[Array, ""]:
+        """Whether the step begins with another state than the last one ended with."""
+        return self.renews(place)
+
+    def renews(self, place: Any) -> Bool[Array, ""]:
+        """Whether the step begins anew."""
+        node, ratio = jax.lax.stop_gradient((self.node(place), self.ratio(place)))
+        return renewed(self.restarts, node, ratio)
 
     def ratio(self, place: Any) -> Any:
         """The size of the step at a place, over that of the one before."""
@@ -166,13 +219,14 @@ class EqualGrid(AbstractGrid):
     h: Float[Array, ""]
     num_steps: int = eqx.field(static=True)
     count: Float[Array, ""] | None = None  # of the steps taken; a float, like all leaves. None: all
+    restarts: Float[Array, " k"] | None = None
 
     @classmethod
-    def between(cls, t0, t1, num_steps: int | Steps) -> "EqualGrid":
+    def between(cls, t0, t1, num_steps: int | Steps, restarts=None) -> "EqualGrid":
         """So many steps from t0 to t1."""
         if isinstance(num_steps, int):
-            return cls(t0, (t1 - t0) / num_steps, num_steps)
-        return cls(t0, (t1 - t0) / num_steps.count, num_steps.room, num_steps.count)
+            return cls(t0, (t1 - t0) / num_steps, num_steps, restarts=restarts)
+        return cls(t0, (t1 - t0) / num_steps.count, num_steps.room, num_steps.count, restarts)
 
     def times(self):
         return self.t0 + self._counted(self.num_steps + 1, 0) * self.h
@@ -193,140 +247,14 @@ class EqualGrid(AbstractGrid):
 
     def halved(self):
         count = None if self.count is None else 2.0 * self.count
-        return EqualGrid(self.t0, self.h / 2.0, 2 * self.num_steps, count)
+        return EqualGrid(self.t0, self.h / 2.0, 2 * self.num_steps, count, self.restarts)
 
     def segments(self, count, length):
         n = length * jnp.arange(count, dtype=self.h.dtype)
-        return EqualGrid(self.t0 + n * self.h, jnp.broadcast_to(self.h, (count,)), length)
+        h, restarts = for_each(count, (self.h, self.restarts))
+        return EqualGrid(self.t0 + n * self.h, h, length, restarts=restarts)
 
 
-class Place(NamedTuple):
-    """One step of different ones."""
-
-    begin: Float[Array, ""]
-    size: Float[Array, ""]  # as given
-    h: Float[Array, ""]  # that before, where it is 0
-    ratio: Float[Array, ""]
-
-
-def without_round_off(ratio):
-    """Of two sizes: 1 where round-off of sums of them is all that they differ by, of which it is made free."""
-    same = jnp.abs(ratio - 1.0) < _SAME * jnp.finfo(ratio.dtype).eps
-    return ratio + jax.lax.stop_gradient(jnp.where(same, 1.0 - ratio, 0.0))
-
-
-@jax.custom_jvp
-def _begun_in_turn(scheme: Resizes, system: AbstractSystem, grid: "UnevenGrid", place: Place, state: State) -> State:
-    return grid.where_resized(place, lambda state: grid.resized(scheme, system, place, state), state)
-
-
-@_begun_in_turn.defjvp
-def _derivative_of_begun(primals, tangents):
-    """That by r is not zero where r is 1."""
-    return jax.jvp(lambda scheme, system, grid, *at: grid.resized(scheme, system, *at), primals, tangents)
-
-
-class UnevenGrid(AbstractGrid):
-    """Steps of sizes h from t0 on."""
-
-    t0: Float[Array, ""]
-    h: Float[Array, " n"]
-    before: Float[Array, ""]  # the size of the step that led to t0, to which the state there belongs
-    room: bool = eqx.field(static=True, default=False)  # whether there may be many empty places at the end
-    count: Float[Array, ""] | None = None  # of the steps that are not empty, where it is known
-    fixed: bool = eqx.field(static=True, default=False)  # whether the ratios of sizes are constants
-    resizes: ClassVar[bool] = True
-    num_steps: ClassVar[Any] = property(lambda self: self.h.shape[-1])  # no argument, where the base has a field
-
-    @classmethod
-    def first(cls, t0, h, *, room: bool = False, count=None, fixed: bool = False) -> "UnevenGrid":
-        """From a state at t0 that belongs to the first step."""
-        return cls(t0=t0, h=h, before=h[0], room=room, count=count, fixed=fixed)
-
-    @property
-    def first_size(self):
-        return self.before
-
-    @property
-    def taken(self):
-        if self.count is not None or not self.room:
-            return self.count
-        last = jnp.max(jnp.where(self.h != 0.0, jnp.arange(1, self.num_steps + 1, dtype=self.h.dtype), 0.0))
-        return most_of_lanes(jax.lax.stop_gradient(last))
-
-    def times(self):
-        return self.t0 + jnp.concatenate([jnp.zeros_like(self.h[:1]), jnp.cumsum(self.h)])
-
-    def places(self):
-        h = self.h
-        last = jax.lax.cummax(jnp.where(h != 0.0, jnp.arange(1, h.shape[0] + 1), 0))
-        size = jnp.concatenate([self.before[None], h])[last]
-        ratio = without_round_off(size / jnp.concatenate([self.before[None], size[:-1]]))
-        ratio = jax.lax.stop_gradient(ratio) if self.fixed else ratio
-        return Place(self.t0 + jnp.cumsum(h) - h, h, size, ratio)
-
-    def node(self, place):
-        return Node(place.begin, place.begin + place.size, place.h)
-
-    def resized(self, scheme, system, place, state, factors=None):
-        return scheme.resized(system, state, place.begin, factors).at(system, place.ratio)
-
-    def begun(self, scheme, system, place, state, factors=None):
-        change = lambda state: self.resized(scheme, system, place, state, factors)
-        return self.where_resized(place, change, state) if self.fixed else change(state)
-
-    def begun_in_turn(self, scheme, system, place, state):
-        return (
-            self.begun(scheme, system, place, state)
-            if self.fixed
-            else _begun_in_turn(scheme, system, self, place, state)
-        )
-
-    def where_resized(self, place, change, same):
-        shapes = jax.eval_shape(change, same)
-        resized = in_any_lane(jax.lax.stop_gradient(place.ratio) != 1.0)
-        return jax.lax.cond(resized, lambda same: alike(change(same), shapes), lambda same: alike(same, shapes), same)
-
-    def factors(self, scheme, system, place, state):
-        found = lambda _: scheme.resizing_factors(system, state, place.begin)
-        if not self.fixed:
-            return found(None)
-        none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(found, None))
-        return self.where_resized(place, found, none)
-
-    def ratio(self, place):
-        return place.ratio
-
-    def empty(self, place):
-        return place.size == 0.0
-
-    def halved(self):
-        count = None if self.count is None else 2.0 * self.count
-        h = jnp.repeat(self.h / 2.0, 2)
-        return dataclasses.replace(self, h=h, before=self.before / 2.0, count=count)
-
-    def segments(self, count, length):
-        h = jnp.concatenate([self.h, jnp.zeros(count * length - self.num_steps, self.h.dtype)]).reshape(count, length)
-        sizes = jnp.concatenate([self.before[None], self.places().h])
-        begins = length * np.arange(count)
-        return UnevenGrid(t0=self.times()[begins], h=h, before=sizes[begins], fixed=self.fixed)
-
-
-def later(states: Tree) -> Tree:
-    """All states but the first."""
-    return jax.tree.map(lambda leaf: leaf[1:], states)
-
-
-def earlier(states: Tree) -> Tree:
-    """All states but the last."""
-    return jax.tree.map(lambda leaf: leaf[:-1], states)
-
-
-def with_first(first: Tree, rest: Tree) -> Tree:
-    """One instant before a stack of others."""
-    return jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), first, rest)
-
-
-def with_last(rest: Tree, last: Tree) -> Tree:
-    """One instant after a stack of others."""
-    return jax.tree.map(lambda others, one: jnp.concatenate([others, one[None]]), rest, last)
+def for_each(count: int, tree: Tree) -> Tree:
+    """The same of all segments."""
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), tree)

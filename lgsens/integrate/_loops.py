@@ -1,17 +1,19 @@
-"""A loop over steps: all of those that arrays have room for, or only as many as there are.
+"""A loop over steps: all of those that arrays have room for, or only as many as there are; and stacks of instants.
 
 `lax.scan` is compiled for one number of steps. A loop that writes into arrays with room for more serves all numbers up
 to that with one program, ends after the last step, and takes as long.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from lgsens._xla import fori_loop, scan
+
+Tree = TypeVar("Tree")
 
 
 def over_steps(step: Callable, carry: Any, inputs: Any, count: Any = None, blank: Any = None, *, reverse: bool = False):
@@ -37,3 +39,23 @@ def over_steps(step: Callable, carry: Any, inputs: Any, count: Any = None, blank
         return carry, jax.tree.map(written, found[1], new)
 
     return fori_loop(0, count, turn, (carry, outputs))
+
+
+def later(states: Tree) -> Tree:
+    """All states but the first."""
+    return jax.tree.map(lambda leaf: leaf[1:], states)
+
+
+def earlier(states: Tree) -> Tree:
+    """All states but the last."""
+    return jax.tree.map(lambda leaf: leaf[:-1], states)
+
+
+def with_first(first: Tree, rest: Tree) -> Tree:
+    """One instant before a stack of others."""
+    return jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), first, rest)
+
+
+def with_last(rest: Tree, last: Tree) -> Tree:
+    """One instant after a stack of others."""
+    return jax.tree.map(lambda others, one: jnp.concatenate([others, one[None]]), rest, last)

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from lgsens.dynamics import AbstractSystem, State
-from lgsens.integrate._grid import AbstractGrid, with_first
+from lgsens.integrate._grid import AbstractGrid
 from lgsens.integrate._linearized import Node
-from lgsens.integrate._loops import over_steps
+from lgsens.integrate._loops import over_steps, with_first
 from lgsens.integrate._scheme import AbstractScheme, Memory, Stats
 
 Output = Callable[[State, Any], Any]  # (state, t) ↦ pytree

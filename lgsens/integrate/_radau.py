@@ -66,9 +66,9 @@ from lgsens.dynamics import (
     require_independent,
     require_linear,
 )
-from lgsens.integrate._grid import earlier, later
 from lgsens.integrate._level_step import by_configuration
 from lgsens.integrate._linearized import AbstractLinearizedStep, Node, Variation
+from lgsens.integrate._loops import earlier, later
 from lgsens.integrate._radau_newton import no_memory, solved
 from lgsens.integrate._radau_stages import A, C, RadauStages, StageFactors, advanced, left
 from lgsens.integrate._scheme import AbstractScheme, Stages

@@ -20,7 +20,8 @@ from jaxtyping import Array, Bool, Float, Int
 from lgsens._brief import brief
 from lgsens._xla import while_loop
 from lgsens.dynamics import RESULTS, AbstractSystem, Initial, State, finite
-from lgsens.integrate._grid import AbstractGrid, EqualGrid, Start
+from lgsens.integrate._grid import AbstractGrid, Start
+from lgsens.integrate._integrator import AbstractIntegrator
 from lgsens.integrate._linearized import AbstractLinearizedStep, DenseLinearizedStep, Node, Variation
 
 
@@ -77,57 +78,6 @@ class Stages(NamedTuple):
     t: Float[Array, " s"]
     weights: Float[Array, " s"]
     states: State
-
-
-class Laid(NamedTuple):
-    """Where steps begin and end, and what is known of them already."""
-
-    grid: AbstractGrid
-    found: tuple[State, Any] | None = None  # the states and statistics of the run, where they had to be found
-    stats: Any = None  # what the trajectory shows instead of these
-    reached: Bool[Array, ""] | None = None  # whether the end was reached; None: it is
-
-
-class AbstractIntegrator(eqx.Module):
-    """A scheme, and how its steps are laid.
-
-    Attributes:
-        any_number: whether there may be any number of steps, as data too (`Steps`), twice as many being their halves.
-        by_motion: whether the motion decides where steps end.
-    """
-
-    any_number: ClassVar[bool] = True
-    by_motion: ClassVar[bool] = False
-
-    @property
-    @abc.abstractmethod
-    def scheme(self) -> "AbstractScheme":
-        """The scheme."""
-
-    @property
-    def extrapolated(self) -> bool:
-        """Whether two runs, the second in twice as many steps, are extrapolated."""
-        return False
-
-    @property
-    def equal_steps(self) -> bool:
-        """Whether all steps of a run are equal."""
-        return True
-
-    def check(self, num_steps: int) -> None:
-        """Raise `ValueError` for a number of steps that these are not."""
-
-    def lay(self, system: AbstractSystem, start: Start, t0, t1, num_steps) -> Laid:
-        """The grid of a run from t0 to t1: here equal steps. `num_steps`: an int, or `Steps`."""
-        return Laid(EqualGrid.between(t0, t1, num_steps))
-
-    def as_data(self, dtype) -> "AbstractIntegrator":
-        """With its numbers as arrays, so that one program serves all of them; here as it is."""
-        return self
-
-    def frozen(self, trajectory: Any) -> "AbstractIntegrator":
-        """The steps of a trajectory, where they were chosen for it."""
-        return self
 
 
 def scheme_of(owner: str, integrator: Any) -> "AbstractScheme":
@@ -220,6 +170,14 @@ class AbstractScheme(AbstractIntegrator):
     def resizing_factors(self, system: AbstractSystem, state: State, t) -> Any:
         """What `resized` factorizes, if anything, without derivative."""
         return None
+
+    def restarts(self, system: AbstractSystem) -> Float[Array, " k"] | None:
+        """The times of breaks of the system after which a step begins anew; None: it has nothing to renew."""
+        return None
+
+    def renewed(self, system: AbstractSystem, state: State, node: Node, ratio, factors: Any = None) -> State:
+        """A state as the first step after a break begins with it, r times as long as the one that led there."""
+        return state
 
     def step_error(self, system: AbstractSystem, begun: State, state: State, memory: Memory, node: Node) -> Array:
         """c, shape (k,), of a step from `begun` to `state` that left that memory: the error of its configuration is

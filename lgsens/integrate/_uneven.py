@@ -1,6 +1,6 @@
-"""Steps of different sizes: given ones, and those that error control finds.
+"""Steps whose sizes error control finds.
 
-Error control. A scheme says what a step adds to the error of a configuration, e = h^p c (`step_error`, `error_power`).
+A scheme says what a step adds to the error of a configuration, e = h^p c (`step_error`, `error_power`).
 Generalized-α, p = 3: what the increment of eq. (27) misses of the true one, at no cost (`missed_increment`), with
 v̈ ≈ (a_{n+1} − a_n)/h, a_n that of this step. Radau IIA, p = 4: the error of its polynomial within the step (`_radau`).
 It is measured by the largest
@@ -30,25 +30,28 @@ Mathematics 185 (2006), doi:10.1016/j.cam.2005.03.008 (limiter).
 """
 
 import math
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._brief import brief
-from lgsens._validate import as_float, is_concrete, require, require_setting
+from lgsens._validate import require_setting
 from lgsens._xla import alike, in_any_lane, scan, while_loop
-from lgsens.dynamics import RESULTS, AbstractSystem, State, acceleration_and_jerk, unsteady_rate
+from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk, unsteady_rate
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
-from lgsens.integrate._grid import UnevenGrid, with_first, without_round_off
+from lgsens.integrate._given import AbstractUnevenSteps, GivenSteps
+from lgsens.integrate._grid import Start, renewed
+from lgsens.integrate._integrator import Laid
 from lgsens.integrate._linearized import Node
+from lgsens.integrate._loops import with_first
 from lgsens.integrate._march import Progress, Walk, selected
 from lgsens.integrate._pieces import PieceEnds
-from lgsens.integrate._scheme import AbstractIntegrator, AbstractScheme, Laid, Start, Stats, scheme_of
+from lgsens.integrate._scheme import AbstractScheme, Stats, scheme_of
+from lgsens.integrate._uneven_grid import UnevenGrid, without_round_off
 
 _AIM = 0.5  # θ: few steps are rejected
 _LIMIT = 1.0  # κ: no step is more than 2.6 times as long as the one before
@@ -56,97 +59,6 @@ _ATTEMPTS = 20  # at one step
 _TURN = math.pi / 2  # rad, what an unsteady body may turn by in a step
 _KEPT = (0.93, 1.2)  # what is asked for, relative to a size that stays
 _LEAST = 1e-6  # errors below this fraction of the tolerance count as so large
-
-
-class AbstractUnevenSteps(AbstractIntegrator):
-    """A scheme in steps that are not all equal."""
-
-    integrator: eqx.AbstractVar[AbstractScheme]
-
-    @property
-    def scheme(self):
-        return self.integrator
-
-    @property
-    def equal_steps(self):
-        return False
-
-
-class GivenSteps(AbstractUnevenSteps):
-    """Steps of given sizes: an integrator of `simulate`.
-
-        t_{n+1} = t_n + (t1 − t0) f_n,   f = fractions/Σ fractions
-
-    Arguments:
-        fractions: the sizes of the steps, relative to each other, shape (num_steps,), not negative, the first positive.
-            A step of size 0 repeats the state.
-        integrator: the scheme, `GeneralizedAlpha` or another one.
-        fixed: whether `fractions` are constants, of zero derivative. Gradients are then cheaper, next to those in equal
-            steps where most sizes stay (`benchmarks/variable_steps.py`); else the derivative by the ratio of sizes is
-            formed in every step.
-
-    `GivenSteps.of(trajectory)` has those of a trajectory, fixed: the grid that error control found for one design
-    serves those nearby, and what is computed on it is as smooth in the parameters as on equal steps. The trajectory is
-    of second order, multipliers too, where sizes jump as well. Derivatives are exact, those by `fractions` (unless
-    fixed), t0 and t1 too.
-
-    Raises `ValueError` for fractions of another shape or sign.
-    """
-
-    any_number: ClassVar[bool] = False
-    fractions: Float[Array, " n"]
-    integrator: AbstractScheme = eqx.field(static=True, default=GeneralizedAlpha())
-    fixed: bool = eqx.field(static=True, default=False)
-
-    def __init__(self, fractions, integrator: AbstractScheme = GeneralizedAlpha(), *, fixed: bool = False):
-        self.fractions = as_float(fractions, None, "GivenSteps: `fractions`")
-        self.integrator = scheme_of("GivenSteps", integrator)
-        self.fixed = fixed
-        require_setting(self, "fixed", isinstance(fixed, bool), "True or False")
-        if self.fractions.ndim != 1 or not self.fractions.size:
-            raise ValueError(f"GivenSteps: `fractions` must have shape (num_steps,), got {self.fractions.shape}.")
-        require(
-            lambda sizes: np.all(np.isfinite(sizes)) and np.all(sizes >= 0.0) and sizes[0] > 0.0,
-            "GivenSteps: `fractions` must be finite, not negative, and the first one positive.",
-            self.fractions,
-        )
-
-    @classmethod
-    def of(cls, trajectory: Any, integrator: AbstractScheme = GeneralizedAlpha()) -> "GivenSteps":
-        """The steps of a trajectory; those of size 0 are left out, unless it is traced.
-
-        Raises `ValueError` for a trajectory that has failed, and for a batch, each of which has its own: `jax.vmap`
-        this.
-        """
-        if jnp.ndim(trajectory.t) != 1:
-            raise ValueError(
-                f"GivenSteps.of: this is a batch of trajectories, of shape {jnp.shape(trajectory.t)[:-1]}; each has "
-                "steps of its own: jax.vmap(GivenSteps.of)(trajectories), for simulations under `vmap`."
-            )
-        result = getattr(trajectory, "result", None)
-        if result is not None and is_concrete(result) and int(result) != RESULTS.successful:
-            raise ValueError(
-                "GivenSteps.of: the trajectory has failed, and its steps are not those of the whole interval. "
-                f"{RESULTS(int(result)).message}"
-            )
-        sizes = lax.stop_gradient(jnp.diff(trajectory.t))
-        if is_concrete(sizes):
-            sizes = np.asarray(sizes)[np.asarray(sizes) > 0.0]
-        return cls(sizes, integrator, fixed=True)
-
-    @property
-    def num_steps(self) -> int:
-        return self.fractions.shape[0]
-
-    def check(self, num_steps):
-        if self.num_steps != num_steps:
-            raise ValueError(
-                f"`num_steps` = {num_steps}, but GivenSteps has {self.num_steps}; give `integrator.num_steps`."
-            )
-
-    def lay(self, system, start, t0, t1, num_steps):
-        fractions = lax.stop_gradient(self.fractions) if self.fixed else self.fractions
-        return Laid(UnevenGrid.first(t0, (t1 - t0) * (fractions / jnp.sum(fractions)), fixed=self.fixed))
 
 
 class AdaptiveSteps(AbstractUnevenSteps):
@@ -203,7 +115,9 @@ class AdaptiveSteps(AbstractUnevenSteps):
         frozen = lax.stop_gradient((system, start, t0, mean))
         found = lax.stop_gradient(_controlled_steps(self, num_steps, *frozen))
         sizes, states, stats, reached = found
-        grid = UnevenGrid.first(t0, sizes / frozen[-1] * mean, room=True, fixed=True)
+        grid = UnevenGrid.first(
+            t0, sizes / frozen[-1] * mean, room=True, fixed=True, restarts=self.integrator.restarts(system)
+        )
         return Laid(grid, (states, Stats(*stats[: len(Stats._fields)])), stats, reached)
 
     def frozen(self, trajectory):
@@ -256,7 +170,7 @@ def _controlled_steps(
     scheme, total = settings.integrator, num_steps * h
     walk, scale, power = Walk.of(scheme, system), system.coordinate_scale(), scheme.error_power
     tolerance = max(settings.tolerance, 16 * float(jnp.finfo(h.dtype).eps))
-    pieces = PieceEnds.of(system, t0, total)
+    pieces, restarts = PieceEnds.of(system, t0, total), scheme.restarts(system)
 
     def relative(c, h):
         return h**power * jnp.max(jnp.abs(c) / scale) / tolerance
@@ -290,8 +204,14 @@ def _controlled_steps(
             changes = trial.trying & (ratio != 1.0)
             due = in_any_lane(changes & ~trial.known)
             resized = lax.cond(due, lambda: alike(resize(), shapes), lambda: trial.resized)
-            begun = selected(changes, resized.at(system, ratio), state)
             node = Node(t0 + elapsed, t0 + (elapsed + h), h)
+            begun = selected(changes, resized.at(system, ratio), state)
+            if restarts is not None:
+                anew = in_any_lane(trial.trying & renewed(restarts, node, ratio))
+                renew = lambda begun: selected(
+                    renewed(restarts, node, ratio), scheme.renewed(system, state, node, ratio), begun
+                )
+                begun = lax.cond(anew, lambda begun: alike(renew(begun), begun), lambda begun: begun, begun)
             done, stats = walk.take(start, begun, node, trial.trying)
             error = relative(scheme.step_error(system, begun, done.state, done.memory, node), h)
             turn = h * unsteady_rate(system, done.state.v, done.state.vdot)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import suggestion
-from lgsens.dynamics import AbstractRedundantSystem, AbstractSparseSystem, Tangents, finite, least_norm
+from lgsens.dynamics import AbstractRedundantSystem, AbstractSparseSystem, Tangents, breaks_of, finite, least_norm
 from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew, turn
 from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, chosen
 from lgsens.model._checks import are_bodies, far_from_rotation
@@ -134,13 +134,15 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
 
     def multiplier_rows(self, joint: str) -> np.ndarray:
         """Where the multipliers of a joint are in λ, in the order of its basic constraints."""
-        own = [
-            (place, rows[rows >= 0])
-            for stack, of_stack in zip(self.constraints, self.topology.rows)
-            for owner, place, rows in zip(stack.owners, stack.places, of_stack)
-            if owner == joint
-        ]
-        return np.concatenate([np.zeros(0, int), *(rows for _, rows in sorted(own, key=lambda each: each[0]))])
+        every = zip(self.constraints, self.topology.rows)
+        own = {
+            at: of for stack, rows in every for name, at, of in zip(stack.owners, stack.places, rows) if name == joint
+        }
+        return np.concatenate([np.zeros(0, int), *(own[place][own[place] >= 0] for place in sorted(own))])
+
+    @property
+    def constraint_breaks(self):
+        return breaks_of(self.constraints)
 
     def of_parts(self, q, v, vdot):
         """The system of the bodies as they are named, and their q, v, v̇: those of this one unless some are merged."""

@@ -90,7 +90,7 @@ def direct_sweep(
     first = jax.tree.map(lambda leaf: leaf[0], b)
     d_places = None if d is None else place_tangents(grid, d.grid)
     end, rest = blocks.scan(block, first, (every, *blocks.padded((later(b), d_places), repeat=True)))
-    if grid.resizes and blocks.count is not None:  # empty steps, which hand on what they get
+    if grid.with_empty and blocks.count is not None:  # empty steps, which hand on what they get
         handed_on = lambda end, b: end[None] + jnp.cumsum(b, axis=0)
         rest = blocks.beyond(jax.tree.map(handed_on, end, blocks.beyond(later(b))), rest)
     return with_first(first, rest), d
@@ -127,7 +127,7 @@ def adjoint_sweep(
         of_parameters, of_places = pull_back(found)
         return (c, jax.tree.map(jnp.add, bar, of_parameters)), (found.mu, of_places)
 
-    with_empty = grid.resizes and blocks.count is not None
+    with_empty = grid.with_empty and blocks.count is not None
     if with_empty:
         handed_on = lambda c: jnp.cumsum(c[::-1], axis=0)[::-1]
         c = blocks.beyond(jax.tree.map(handed_on, blocks.beyond(c)), c)
