@@ -1,6 +1,8 @@
 """A motion as tables: `to_csv` read back by Python's csv, `to_xarray` and `to_pandas` by their own packages."""
 
+import copy
 import csv
+import pickle
 import sys
 
 import jax
@@ -60,6 +62,12 @@ def test_csv_has_everything_in_full_precision(trajectory, tmp_path):
     assert len(heads) == len(set(heads)) == 1 + bodies + joints + 1
     for name, values in expected(trajectory).items():
         np.testing.assert_array_equal(table[name], values, err_msg=name)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda run: pickle.loads(pickle.dumps(run))], ids=["copy", "pickle"])
+def test_copies_know_what_the_run_knows(trajectory, copied):
+    for (name, column), other in zip(expected(trajectory).items(), expected(copied(trajectory)).values(), strict=True):
+        np.testing.assert_array_equal(other, column, err_msg=name)
 
 
 def test_xarray(trajectory):

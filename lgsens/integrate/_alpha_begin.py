@@ -14,7 +14,7 @@ from lgsens.dynamics import (
     normal_jerk,
 )
 from lgsens.integrate._alpha import AbstractAlpha
-from lgsens.integrate._grid import LATE, Start
+from lgsens.integrate._grid import Start
 
 
 class AbstractAlphaBegin(AbstractAlpha):
@@ -108,7 +108,7 @@ class AbstractAlphaBegin(AbstractAlpha):
         and a keep h² N Δc and Δ h N Δv̈ too much, Δv̈ by which v̈ jumps; they fade like n (−ρ∞)ⁿ, and until then forces
         of drivers are off by O(h).
         """
-        q, h, t = state.q, node.h, node.begin + LATE * lax.stop_gradient(node.h)
+        q, h, t = state.q, node.h, node.behind
         factors = self.resizing_factors(system, state, node.begin) if factors is None else factors
         v = consistent_velocity(system, q, state.v, node.begin, factors)
         vdot = consistent_acceleration(system, q, v, state.vdot, t, factors)

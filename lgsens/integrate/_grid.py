@@ -39,7 +39,6 @@ from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate._linearized import Node
 
 Tree = TypeVar("Tree")
-LATE = 1e-6  # of a step: a break that is no later is at its begin
 
 
 class Start(NamedTuple):
@@ -74,8 +73,7 @@ def renewed(restarts: Float[Array, " k"] | None, node: Node, ratio) -> Bool[Arra
     """Whether a break lies at the begin of a step, or in the one before, r times shorter."""
     if restarts is None:
         return jnp.zeros((), bool)
-    late = node.begin + LATE * node.h
-    return jnp.any((restarts <= late) & (restarts > late - node.h / ratio))
+    return jnp.any((restarts <= node.behind) & (restarts > node.behind - node.h / ratio))
 
 
 class AbstractGrid(eqx.Module):

@@ -1,16 +1,13 @@
 """An integrator of `simulate`: a scheme, and how its steps are laid."""
 
 import abc
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 from jaxtyping import Array, Bool
 
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate._grid import AbstractGrid, EqualGrid, Start
-
-if TYPE_CHECKING:
-    from lgsens.integrate._scheme import AbstractScheme
 
 
 class Laid(NamedTuple):
@@ -35,8 +32,8 @@ class AbstractIntegrator(eqx.Module):
 
     @property
     @abc.abstractmethod
-    def scheme(self) -> "AbstractScheme":
-        """The scheme."""
+    def scheme(self) -> Any:
+        """The scheme, an `AbstractScheme`."""
 
     @property
     def extrapolated(self) -> bool:

@@ -22,6 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
+from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
@@ -55,6 +56,11 @@ class Node(NamedTuple):
     begin: Float[Array, ""]
     t: Float[Array, ""]  # its end
     h: Float[Array, ""]
+
+    @property
+    def behind(self) -> Float[Array, ""]:
+        """Just behind the begin: a break that is no later is at it, but for round-off of times."""
+        return self.begin + float(jnp.finfo(self.h.dtype).eps) ** 0.5 * lax.stop_gradient(self.h)
 
 
 class AbstractLinearizedStep(eqx.Module):

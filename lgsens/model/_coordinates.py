@@ -141,7 +141,8 @@ class CoordinateForce(AbstractForce):
         coordinate: the name of the coordinate, static; None: the only one.
         stiffness: k [N/m or N m/rad], shape ().
         damping: c [N s/m or N m s/rad], shape ().
-        free: s₀ [m or rad], at which the spring is free, shape (); of an angle within half a turn unless counted.
+        free: s₀ [m or rad], at which the spring is free, shape (); of an angle within half a turn unless counted. The
+            coordinate of a rod is its length, not what it has changed by.
         motor: M(t) [N or N m], a number, shape (), or a signal; None: no motor.
         turns: whether an angle is counted over whole turns, by a state "angle" (`Trajectory.states_of`), static. Else
             it is within half a turn of s₀, where the force of a spring jumps; a motion that comes there has failed.
@@ -180,8 +181,15 @@ class CoordinateForce(AbstractForce):
         return (Attached(CountedTurns(load) if self.turns else load, *self.bodies),)
 
 
+def _values(coordinates: Sequence[Coordinate], ends: Sequence[Frame], attached) -> list[Float[Array, ""]]:
+    """Two coordinates, of joints whose frames are attached to these four ends."""
+    pairs = zip(coordinates, (ends[:2], ends[2:]), attached)
+    return [coordinate.of(_seen(*pair, *own)) for coordinate, pair, own in pairs]
+
+
 class Coupled(AbstractClosedFormConstraint):
-    """Φ = s₁ − Σ c_i s₂ⁱ of two coordinates; `roles`: which of the frames (a, b, *others) their four ends are.
+    """Φ = s₁ − Σ c_i s₂ⁱ of two coordinates, less what they are in the reference configuration, `origins`; `roles`:
+    which of the frames (a, b, *others) their four ends are.
 
     Where s₁ is an angle Φ is that but for turns divided by `teeth`.
     """
@@ -189,6 +197,7 @@ class Coupled(AbstractClosedFormConstraint):
     first: tuple[Frame, Frame]
     second: tuple[Frame, Frame]
     coefficients: Float[Array, " n"]
+    origins: tuple[Any, ...]
     coordinates: tuple[Coordinate, ...] = eqx.field(static=True)  # two
     roles: tuple[int, ...] = eqx.field(static=True)  # four
     teeth: int = eqx.field(static=True)
@@ -201,9 +210,8 @@ class Coupled(AbstractClosedFormConstraint):
 
     def _coordinates(self, frames):
         """s₁ and s₂, angles but for whole turns."""
-        ends = [frames[role] for role in self.roles]
-        first, second = (of.of for of in self.coordinates)
-        return first(_seen(ends[0], ends[1], *self.first)), second(_seen(ends[2], ends[3], *self.second))
+        found = _values(self.coordinates, [frames[role] for role in self.roles], (self.first, self.second))
+        return tuple(s if origin is None else s - origin for s, origin in zip(found, self.origins))
 
     def branch(self, a, b, *others):
         first, second = self.coordinates
@@ -251,7 +259,8 @@ class CoordinateCoupling(AbstractJoint):
     Arguments:
         first, second: the joints, with bodies and geometry; they need not be joints of the model, where others hold
             the bodies.
-        coefficients: c₁, c₂, …, shape (n,), n ≥ 1. Both coordinates vanish together: in the reference configuration.
+        coefficients: c₁, c₂, …, shape (n,), n ≥ 1. Both coordinates vanish together: in the reference configuration,
+            from which lengths of rods are counted, so that two with c₁ = −1 are a rope over a pulley.
         names: the names of the coordinates of both, static; None: the only one.
         teeth: a count for which c₁ · teeth is an integer: those of the first of two gears, as in `GearJoint`. Where c₁
             is the only coefficient angles then turn any number of times; else `second`, if it is an angle, stays within
@@ -324,4 +333,5 @@ class CoordinateCoupling(AbstractJoint):
             _coordinate("CoordinateCoupling", joint, name) for joint, name in zip((self.first, self.second), self.names)
         )
         both = _attached(self.first, *ends[:2]), _attached(self.second, *ends[2:])
-        return (Coupled(*both, self.coefficients, coordinates, roles, self.teeth),)
+        origins = tuple(s if of.absolute else None for s, of in zip(_values(coordinates, ends, both), coordinates))
+        return (Coupled(*both, self.coefficients, origins, coordinates, roles, self.teeth),)

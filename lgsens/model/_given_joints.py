@@ -6,7 +6,7 @@ these, joints of one kind in one array: a motion, an instant of one and whatever
 their joints, and derivatives by hardpoints and axes come the same way as those by masses.
 """
 
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -25,16 +25,38 @@ def numbers_of(joint: AbstractJoint, dtype: Any) -> list[Array]:
     return [jnp.asarray(leaf, jnp.promote_types(dtype, jnp.result_type(leaf))) for leaf in jax.tree.leaves(joint)]
 
 
+class Structure:
+    """What numbers of a joint are numbers of, and static: a `PyTreeDef` that can be copied and pickled.
+
+    One by itself cannot: equinox marks fields that are missing by an object of which a copy is another one. So a copy
+    is made of a joint with no numbers.
+    """
+
+    __slots__ = ("of",)
+
+    def __init__(self, joint: AbstractJoint):
+        self.of = jax.tree.structure(joint)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Structure) and self.of == other.of
+
+    def __hash__(self) -> int:
+        return hash(self.of)
+
+    def __reduce__(self):
+        return Structure, (jax.tree.unflatten(self.of, range(self.of.num_leaves)),)
+
+
 class GivenJoints(eqx.Module):
     """Joints of one kind: their numbers with a leading axis, and by each name what they are numbers of."""
 
     numbers: list[Array]
-    structures: tuple[tuple[str, Hashable], ...] = eqx.field(static=True)
+    structures: tuple[tuple[str, Structure], ...] = eqx.field(static=True)
 
     def __getitem__(self, name: str) -> AbstractJoint:
         place = [own for own, _ in self.structures].index(name)
         row = lambda leaf: jnp.asarray(np.asarray(leaf)[place]) if is_concrete(leaf) else leaf[place]
-        return jax.tree.unflatten(self.structures[place][1], map(row, self.numbers))
+        return jax.tree.unflatten(self.structures[place][1].of, map(row, self.numbers))
 
 
 def given_joints(joints: Sequence[tuple[str, AbstractJoint]], rows: Sequence[StackRow]) -> tuple[GivenJoints, ...]:
@@ -42,7 +64,7 @@ def given_joints(joints: Sequence[tuple[str, AbstractJoint]], rows: Sequence[Sta
     kinds: dict[int, list[int]] = {}
     for i, row in enumerate(rows):
         kinds.setdefault(id(row.of), []).append(i)
-    structure = lambda i: (joints[i][0], jax.tree.structure(joints[i][1]))
+    structure = lambda i: (joints[i][0], Structure(joints[i][1]))
     return tuple(GivenJoints(rows[own[0]].of, tuple(map(structure, own))) for own in kinds.values())
 
 

@@ -30,12 +30,14 @@ class Coordinate(NamedTuple):
         name, unit: what it is called, and "rad" or "m".
         of: its value, given the pose of the joint's frame on b in that on a; a function of module level.
         periodic: whether it is an angle that comes back after 2π, which a trajectory continues over many turns.
+        absolute: whether it is not 0 in the reference configuration.
     """
 
     name: str
     unit: str
     of: Callable[[Frame], Float[Array, ""]]
     periodic: bool = False
+    absolute: bool = False
 
 
 def _about_x(seen: Frame) -> Float[Array, ""]:
@@ -48,7 +50,7 @@ def _rotation(axis: int) -> Callable[[Frame], Float[Array, ""]]:
 
 ANGLE = Coordinate("angle", "rad", _about_x, True)
 DISPLACEMENT = Coordinate("displacement", "m", lambda seen: seen.position[0])
-LENGTH = Coordinate("length", "m", lambda seen: jnp.sqrt(jnp.sum(seen.position**2)))
+LENGTH = Coordinate("length", "m", lambda seen: jnp.sqrt(jnp.sum(seen.position**2)), absolute=True)
 # of a cross from a, about its arm there, and of b from the cross, about the other arm: D = R_x(α) R_y(β)
 ARM_ANGLES = (
     ANGLE._replace(name="angle_a"),
@@ -106,7 +108,7 @@ def relative_motion(coordinates: tuple[Coordinate, ...], frames, references, mot
     def at_time(motions):
         poses, twists, changes = ([motion[i : i + 2] for motion in motions] for i in (0, 2, 4))
         none = [jnp.zeros((), motions[0][0].dtype)] * (not coordinates)
-        values = lambda poses: jnp.stack([of(seen(poses)) for _, _, of, _ in coordinates] or none)
+        values = lambda poses: jnp.stack([coordinate.of(seen(poses)) for coordinate in coordinates] or none)
 
         def moved(poses, twists):
             return [(velocity, R @ skew(spin)) for (_, R), (velocity, spin) in zip(poses, twists)]

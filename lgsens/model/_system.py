@@ -135,10 +135,8 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     def multiplier_rows(self, joint: str) -> np.ndarray:
         """Where the multipliers of a joint are in λ, in the order of its basic constraints."""
         every = zip(self.constraints, self.topology.rows)
-        own = {
-            at: of for stack, rows in every for name, at, of in zip(stack.owners, stack.places, rows) if name == joint
-        }
-        return np.concatenate([np.zeros(0, int), *(own[place][own[place] >= 0] for place in sorted(own))])
+        own = {i: of for stack, rows in every for name, i, of in zip(stack.owners, stack.places, rows) if name == joint}
+        return np.concatenate([np.zeros(0, int), *(own[i][own[i] >= 0] for i in sorted(own))])
 
     @property
     def constraint_breaks(self):

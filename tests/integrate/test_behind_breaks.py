@@ -1,0 +1,169 @@
+"""Behind a break of a driver steps begin anew: forces there, their order, and derivatives through it."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from differences import central
+from jaxtyping import Array, Float
+
+import lgsens as lg
+from lgsens.dynamics import autodiff_tangents
+from lgsens.liegroups import Rn
+
+MASS, T1 = 5.0, 2.0
+SAMPLES = np.linspace(0.0, T1, 21)
+SIGNALS = {
+    "ramp": lg.Ramp(end=1.0, t_start=0.2137, duration=1.1),
+    "ramp from t0": lg.Ramp(end=1.0, duration=1.1),
+    "cubic": lg.Sampled(SAMPLES, 0.3 * np.sin(3.0 * SAMPLES) ** 2, kind="cubic"),
+    "monotone": lg.Sampled(SAMPLES, 0.3 * np.sin(3.0 * SAMPLES) ** 2, kind="monotone"),
+}
+SCHEMES = {
+    "equal": lg.GeneralizedAlpha(),
+    "aligned": lg.AlignedSteps(),
+    "stabilized": lg.AlignedSteps(lg.GeneralizedAlpha(stabilized=True)),
+    "adaptive": lg.AdaptiveSteps(tolerance=1e-6),
+}
+
+
+def driven(signal):
+    """A body on a rail, moved by a driver; it may move across, too."""
+    driver = lg.TranslationDriver(None, "body", at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0), value=signal)
+    return lg.Model({"body": lg.RigidBody(MASS, None, free="x y")}, {"driver": driver})
+
+
+@functools.cache
+def errors(signal, integrator, num_steps):
+    """Of the driver's force against m s̈, relative to the largest, and which steps end behind a break in them."""
+    signal = SIGNALS[signal]
+    run = lg.simulate(driven(signal), t1=T1, num_steps=num_steps, integrator=SCHEMES[integrator])
+    t, force = np.asarray(run.t), np.asarray(run.joint("driver").axial_force)
+    exact = MASS * np.asarray(jax.vmap(jax.grad(jax.grad(signal)))(run.t))
+    within = np.zeros(t.size, bool)
+    for at in np.asarray(signal.breaks):
+        within[1:] |= (t[:-1] < at + 1e-9) & (at - 1e-9 < t[1:])
+    taken = np.append(True, np.diff(t) > 0.0)
+    off = np.minimum(np.abs(force - exact), np.abs(force + exact)) / np.abs(exact).max()
+    return off[taken], within[taken]
+
+
+@pytest.mark.parametrize("integrator", ["equal", "aligned", "stabilized"])
+def test_forces_on_a_ramp_are_of_second_order(integrator):
+    (coarse, within), (fine, also_within) = errors("ramp", integrator, 75), errors("ramp", integrator, 150)
+    assert coarse[~within].max() < 1.5e-2  # (h/T)² of a polynomial whose fourth derivative is 60 times the second
+    np.testing.assert_allclose(coarse[~within].max() / fine[~also_within].max(), 4.0, rtol=0.2)  # the order, and h³
+    if integrator != "equal":  # no step has a break in it
+        assert coarse.max() < 1.5e-2
+
+
+def test_a_ramp_may_begin_at_t0():
+    off, within = errors("ramp from t0", "equal", 75)
+    assert off[~within].max() < 1.5e-2  # first order: 0.2
+
+
+def test_error_control_sees_it():
+    off, _ = errors("ramp", "adaptive", 400)
+    assert off.max() < 3e-3  # tolerance^(2/3) = 1e-4, times what s⁗ T² is of s̈, 30; first order: 0.1
+
+
+def test_behind_samples_forces_are_exact():
+    """Between samples of a cubic the third derivative is constant, and the scheme has no error of v̇."""
+    for signal in ("cubic", "monotone"):
+        off, within = errors(signal, "equal", 130)
+        assert off[~within].max() < 1e-8  # what behind is behind a break, 1.5e-8 h, times v̈/v̇ = 1/h at most
+    assert errors("cubic", "aligned", 130)[0].max() < 1e-8
+
+
+class Towed(lg.AbstractSystem):
+    """A mass on a rail that follows a ramp, and another one on a spring behind it: programs that compile fast."""
+
+    ramp: lg.Ramp
+    load: Float[Array, ""]
+    assembled: bool = eqx.field(static=True, default=True)
+
+    @property
+    def group(self):
+        return Rn(2)
+
+    @property
+    def constraint_names(self):
+        return ("ramp",)
+
+    @property
+    def constraint_breaks(self):
+        return self.ramp.breaks
+
+    def reference(self):
+        return jnp.zeros(2), jnp.zeros(2)
+
+    def coordinate_scale(self):
+        return jnp.ones(2)
+
+    def mass_matrix(self):
+        return jnp.diag(jnp.stack([jnp.full_like(self.load, MASS), self.load]))
+
+    def residual(self, q, v, vdot, lam, t):
+        pull = 200.0 * (q[1] - q[0]) + 300.0 * (q[1] - q[0]) ** 3
+        return self.mass_matrix() @ vdot + jnp.stack([lam[0] - pull, pull])
+
+    def constraint(self, q, t):
+        return (q[0] - self.ramp(t))[None]
+
+    def constraint_jacobian(self, q, t):
+        return jnp.array([[1.0, 0.0]])
+
+    def tangents(self, q, v, vdot, lam, t):
+        return autodiff_tangents(self, q, v, vdot, lam, t)
+
+
+def towed(p):
+    return Towed(lg.Ramp(end=p[0], t_start=p[1], duration=p[2]), p[3])
+
+
+def psi(p, integrator, sensitivity, num_steps=24):
+    settings = {"t1": 0.9, "num_steps": num_steps, "integrator": integrator, "sensitivity": sensitivity}
+    run = lg.simulate(towed(p), save=lambda instant: instant.state.lam[0], **settings)
+    return lg.time_integral(run.t, run.values**2)
+
+
+P = jnp.array([1.0, 0.2137, 0.51, 2.0])  # steps of 37.5 ms: breaks at 5.70 and 19.30 of them
+EXTRAPOLATED = lg.Richardson(SCHEMES["aligned"])
+GIVEN = lg.GivenSteps(1.0 + 0.3 * np.sin(np.arange(24.0)))
+GRIDS = SCHEMES | {"given": GIVEN, "extrapolated": EXTRAPOLATED}
+
+
+@pytest.mark.parametrize(
+    "name", ["equal", *(pytest.param(name, marks=pytest.mark.slow) for name in GRIDS if name != "equal")]
+)
+def test_derivatives_through_it_are_exact(name):
+    """Where breaks lie inside of steps by the times of the ramp, too; where steps end at them, by what moves none."""
+    integrator, n = GRIDS[name], 400 if name == "adaptive" else 24
+    reverse = jax.jit(jax.value_and_grad(lambda p: psi(p, integrator, lg.AdjointVariable(), n)))
+    gradient = reverse(P)[1]
+    forward = jax.jit(jax.jacfwd(lambda p: psi(p, integrator, lg.DirectDifferentiation(), n)))(P)
+    np.testing.assert_allclose(gradient, forward, rtol=1e-9)  # other order of round-off
+    grid = integrator.frozen(lg.simulate(towed(P), t1=0.9, num_steps=n, integrator=integrator))
+    if grid is not integrator:
+        n = grid.num_steps
+        reverse = jax.jit(jax.value_and_grad(lambda p: psi(p, grid, lg.AdjointVariable(), n)))
+    moved = range(4) if name in ("equal", "given") else (0, 3)
+    slopes = [central(lambda s, e=e: reverse(P + s * e)[0], 1e-3) for e in np.eye(4)[list(moved)]]
+    # differences: δ⁶ = 1e-18 × seventh derivative, round-off of forces of 1e-12 over 1e-3
+    np.testing.assert_allclose(gradient[jnp.array(moved)], slopes, rtol=1e-7)
+
+
+@pytest.mark.slow  # the step of parts is that of the whole, by one grid
+def test_parts_of_a_run_begin_anew_as_the_whole_does():
+    of = lambda sensitivity: jax.jit(jax.grad(lambda p: psi(p, SCHEMES["equal"], sensitivity)))(P)
+    whole, parts = of(lg.AdjointVariable()), of(lg.AdjointVariable(checkpoints=5))
+    np.testing.assert_allclose(parts, whole, rtol=1e-10)  # other order of round-off
+
+
+def test_the_error_of_such_a_run_can_be_estimated():
+    """Its a and v̇ do not belong together where a step begins anew, and it is a run of the scheme even so."""
+    run = lg.simulate(towed(P), t1=0.9, num_steps=24)
+    assert np.isfinite(lg.accuracy.error_estimate(run).w).all()
