@@ -51,7 +51,8 @@ class AlignedSteps(AbstractUnevenSteps):
     at least. Where there are not so many, all steps are equal, and so they are where nothing breaks. Twice as many
     steps are the halves of these, from 48 steps on. Under `vmap` each design has its own. The derivative is that on the
     grid of these numbers, exactly. The times of breaks move the grid, and by whole steps from piece to piece, so a
-    search over them goes better on a grid that stays, `GivenSteps.of(trajectory)`; on that finite differences agree.
+    search over them goes better on a grid that stays, `GivenSteps.of(trajectory)`; on that finite differences agree,
+    but for those by the times of breaks themselves: a step that ends at one sees one side of it.
 
     Raises `ValueError` for what is no scheme in steps. Source: Hairer, Nørsett & Wanner, Solving Ordinary Differential
     Equations I (2008), §II.6 (discontinuities).

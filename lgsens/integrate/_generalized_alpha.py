@@ -153,7 +153,8 @@ class GeneralizedAlpha(AbstractGeneralizedAlpha):
         second_order_start: start with what the constraints ask of v̈ in a₀, because a_n stands for the acceleration at
             t_n + (α_m − α_f) h, and with v₀ moved by O(h²) along the constraint directions, where the scheme keeps
             it anyway: positions, velocities and multipliers are then second order from the first step.
-            Where steps change their size the velocity is moved likewise, which takes a factorization per step.
+            Where steps change their size the velocity is moved likewise, which takes a factorization per step, and so
+            are both behind the breaks of drivers (`renewed`).
             False: a₀ = v̇₀ and v₀ as it is; multipliers are first order in the first steps (Arnold,
             Brüls & Cardona, Numerische Mathematik 129, 2015, doi:10.1007/s00211-014-0633-1), and after each change of
             the size.

@@ -140,7 +140,7 @@ class Ramp(AbstractSignal):
         t_start: when it begins [s], shape ().
         duration: how long it takes [s], shape (), positive.
 
-    The largest rate is 1.875 (end − start)/duration. Raises `ValueError` for a duration ≤ 0.
+    The largest rate is 1.875 (end − start)/duration; both ends are `breaks`. Raises `ValueError` for a duration ≤ 0.
     """
 
     start: Float[Array, ""] = number_field("start", default=0.0)
