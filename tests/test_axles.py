@@ -325,6 +325,7 @@ def test_stiff_bushings_become_joints(name):
     assert left[2] / left[1] == pytest.approx(1 / 3, rel=0.02 / 3)
 
 
+@pytest.mark.slow
 def test_one_number_is_of_both_sides():
     """The derivative by the left corner's spring seat: that of both seats of two-sided axles, and differences."""
     axle = Axle.load("semi_trailing_arm")

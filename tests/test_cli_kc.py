@@ -82,6 +82,7 @@ def test_bad_input(tmp_path, capsys, arguments, message):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_what_asks_for_too_much_is_named(tmp_path, capsys):
     asked = ["--rigid", "--sweeps", "opposite,parallel", "--points", "3", "--travel", "0.9", "--quiet"]
     status = main(["kc", FILE, *asked, "--out", str(tmp_path / "out")])

@@ -67,6 +67,7 @@ def test_eager_gradients_share_their_programs(compiled):
     np.testing.assert_allclose(run.t, np.linspace(0.0, 0.1, 31), rtol=0, atol=1e-16)
 
 
+@pytest.mark.slow
 def test_a_gradient_by_the_whole_model_compiles_once(compiled):
     """As in README, outside of `jit`: the projection of orientations on rotations is no loop to be transposed anew."""
     gradient = eqx.filter_grad(psi_of_model)

@@ -49,6 +49,7 @@ def test_a_hardpoint_that_moves_leaves_the_band(car, bounds):
     assert found[2:].max() > 0.1  # a centimetre is too much
 
 
+@pytest.mark.slow
 def test_the_design_has_them_and_their_gradient(car, bounds):
     """In a row after those of the path; their gradient by the hardpoints against differences."""
     with_curves = SuspensionDesign.load(parameters="hardpoints", keep=bounds, t1=0.02, num_steps=4)

@@ -282,6 +282,7 @@ def test_newton_failure_under_differentiation():
         jax.jvp(lambda push: fail(push).body("bob").position, (30.0,), (1.0,))
 
 
+@pytest.mark.slow
 def test_mechanism_that_cannot_be_assembled_inside_jit():
 
     def build(length):

@@ -226,6 +226,7 @@ def about(unit, angle):
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
+@pytest.mark.slow
 def test_a_driver_with_a_value_is_assembled_there():
     """In dynamics a driver holds its coordinate: with a value, where it says, and the moment is that at rest."""
     model = driven_four_bar()

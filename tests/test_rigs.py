@@ -67,6 +67,7 @@ def test_rates_and_levers_in_closed_form():
         np.testing.assert_allclose(found[name], value, rtol=1e-8, atol=1e-12, err_msg=name)
 
 
+@pytest.mark.slow
 def test_compliances_in_closed_form():
     """Bushings in series and parallel: a lateral force turns the arm about z and x on its two bushings."""
     lateral = {"lateral": STANDARD["lateral"], "aligning": STANDARD["aligning"]}

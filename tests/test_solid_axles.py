@@ -295,6 +295,7 @@ def test_half_of_it_has_no_roll_centre(load):
     assert np.isnan(curves.roll_centre_height).all() and not np.isnan(curves.spring_motion_ratio).any()
 
 
+@pytest.mark.slow
 def test_its_numbers_have_their_keys(load):
     axle = Axle.load("solid_axle")
     patterns = ("solid_axle.links.panhard_rod.chassis.z", "bushings.panhard_rod_chassis.stiffness.2", "links")
@@ -315,6 +316,7 @@ def test_its_numbers_have_their_keys(load):
     )
 
 
+@pytest.mark.slow
 def test_bad_files_say_what_is_wrong(load):
     own = FILE["solid_axle"]["links"]
     lower = FILE["links"]["lower_link"]

@@ -73,6 +73,7 @@ def test_curves_agree_with_the_closure(car):
         np.testing.assert_allclose(found.roll_centre_height[i], expected, rtol=0, atol=1e-9)  # as without camber
 
 
+@pytest.mark.slow
 def test_derivatives_by_camber_and_toe(car):
     def curves(angles):
         found = leaning(car, *angles).curves(TRAVEL, throw=False)

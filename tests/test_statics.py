@@ -197,6 +197,7 @@ def test_a_fixed_moment_is_a_load():
         np.testing.assert_allclose(along.joint(bar).rate, [0.01 * moment] * 2, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_points_that_start_anew_are_told_from_the_first():
     """Upwards to 3 rad and then downwards to −3 rad, 6 rad apart: the moment is that of the spring all the way."""
     axis = {"axis": (0.0, 0.0, 1.0)}
@@ -330,6 +331,7 @@ def test_a_truss_snaps_through_and_back_where_its_load_has_its_extremes(points):
     assert found.stable.all()
 
 
+@pytest.mark.slow
 def test_a_perfect_column_stays_straight_and_is_said_to_be_unstable():
     """Above its critical load, that of a chain of `elements` with a hinge's stiffness E I/h and rigid in shear."""
     elements, bending = 6, 4.0

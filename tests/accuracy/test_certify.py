@@ -59,6 +59,7 @@ def test_it_says_how_many_digits_and_what_to_do(oscillator):
     assert strict._replace(tolerance=0.5).good
 
 
+@pytest.mark.slow
 def test_certificates_share_the_motion(oscillator, compiled):
     """Another criterion compiles none."""
     names, _ = compiled(lambda: [certify(HEIGHT, build, P, t1=T1, num_steps=100)._asdict()])

@@ -189,6 +189,7 @@ class Push(AbstractForce):
         return (Attached(Ladder(self.rates), None, "mass"),)
 
 
+@pytest.mark.slow
 def test_any_number_of_states_of_ones_own():
     """Four lags of rate 1/τ: z_n = 1 − e^{−x} Σ_{i<n} x^i/i! with x = t/τ; and both modes agree."""
 

@@ -202,6 +202,7 @@ def test_signals_of_ones_own_that_cannot_be_compiled(of, message):
         motor(of)
 
 
+@pytest.mark.slow
 def test_a_signal_without_a_finite_rate_is_no_success():
     """√t at 0, at the second position."""
     crank = lg.RigidBody(mass=1.0, inertia=(0.1, 0.1, 0.1), free="rz")

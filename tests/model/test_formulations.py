@@ -85,6 +85,7 @@ def test_a_screw_is_exact_in_any_step():
     assert np.abs(run(model) - np.asarray(expected)).max() > 1e-3  # (Ω h)²/12 of the angle, on R³ × SO(3)
 
 
+@pytest.mark.slow
 def test_a_top_moves_on_se3_as_about_its_fixed_point():
     """u + Ω × X = 0 is linear there, so that each increment has it, and what is left is the scheme on SO(3) with the
     moment of inertia about the point: `RigidBody(pivot=…)`, step by step, the start's transient included."""

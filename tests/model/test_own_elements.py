@@ -159,6 +159,7 @@ class Half(AbstractConstraint):
         return (b.point(self.there) - a.point(self.here))[2:]
 
 
+@pytest.mark.slow
 def test_what_an_element_says_of_its_numbers_is_checked():
     """On a part of a merged body a declared element is rewritten; others see the frame of the part."""
     check_joint(Level(TIP, -TIP)).raise_if_failed()

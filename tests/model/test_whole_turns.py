@@ -89,6 +89,7 @@ def test_whatever_the_integrator(name):
     )  # step² of the third derivative, 1e3 of the first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moment", [pytest.param(0.2, marks=pytest.mark.slow), 7.5])
 def test_equilibrium_winds_it_up(moment):
     """Within half a turn, and by four: on the way of a damped motion."""

@@ -138,6 +138,7 @@ def test_every_leaf():
     assert abs(forward - float(sum(terms))) <= 1e-11 * float(sum(map(jnp.abs, terms)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", some_quick([jax.grad, jax.jacfwd]))
 def test_times_are_differentiated(mode):
     """t0 and t1 are traced: dΨ/dt1 against differences of the discrete scheme, with time-dependent forces."""

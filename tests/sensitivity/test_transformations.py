@@ -87,6 +87,7 @@ def scene(request):
     return Scene(request.param)
 
 
+@pytest.mark.slow
 def test_reverse_and_forward(scene):
     """jacrev, jacfwd, jvp and vjp under jit, against differences and each other."""
     expected = scene.differences(scene.value, 1e-3)
