@@ -43,7 +43,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lgsens._validate import as_count, as_parameters
 from lgsens.criteria._certificate import Certificate
 from lgsens.criteria._criterion import Criterion
-from lgsens.criteria._error_estimate import corrected, error_by_defects
+from lgsens.criteria._error_estimate import corrected, error_by_defects, smooth_defects
 from lgsens.criteria._kinks import jumps_of, kinks, roughness
 from lgsens.criteria._known_motion import known_motion, unpacked
 from lgsens.criteria._refined_run import extrapolated, refined_run, require_order
@@ -93,8 +93,9 @@ def certify(
         throw: raise if the simulation fails; with False the certificate says so.
 
     The errors are those of the discretization in time, to leading order: from this one run for `GeneralizedAlpha` of
-    index 3, from a second one in half the steps for others, whose criteria are extrapolated. What the model leaves out
-    is no part of them. Kinks are told from second differences of accelerations, in steps that resolve what is around.
+    index 3 where no driver breaks, else from a second one in steps half as long, whose criteria are extrapolated. What
+    the model leaves out is no part of them. Kinks are told from second differences of accelerations, in steps that
+    resolve what is around.
 
     Returns a `Certificate`, or a pytree of them as the criteria. `differentiate(…, certificate=True)` has it beside its
     own result. Raises `ValueError` as `differentiate`, for an integrator with unequal steps or fewer than eight of
@@ -151,7 +152,7 @@ def _certified(criteria, motion, p, integrator: AbstractIntegrator) -> tuple[lis
     def improved(states, system, flat):
         trajectory = motion.trajectory(integrator, states, system)
         parameters = known.parameters._replace(system=system)
-        defects = known.scheme.defects(system, parameters.grid, trajectory.states)
+        defects = smooth_defects(known.scheme, system, parameters.grid, trajectory.states)
         if defects is None:
             finer = refined_run(known.scheme, trajectory)
             return extrapolated(known.scheme, values_of(trajectory, flat), values_of(finer, flat))

@@ -25,7 +25,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from lgsens.criteria._criterion import Criterion
-from lgsens.criteria._error_estimate import corrected, error_by_defects
+from lgsens.criteria._error_estimate import corrected, error_by_defects, smooth_defects
 from lgsens.criteria._known_motion import known_motion, unpacked
 from lgsens.integrate import AbstractScheme
 from lgsens.simulation import Trajectory
@@ -57,11 +57,12 @@ def defect_densities(
         p = unravel(flat)
         trajectory = motion.trajectory(scheme, states, system)
         parameters = known.parameters._replace(system=system)
-        b = scheme.defects(system, parameters.grid, trajectory.states)
+        b = smooth_defects(scheme, system, parameters.grid, trajectory.states)
         if b is None:
             raise ValueError(
                 f"What {scheme!r} misses in its steps is not known: GeneralizedAlpha of index 3 says it, if no force "
-                "depends on the multipliers (friction in joints). AdaptiveSteps has steps for the motion by any scheme."
+                "depends on the multipliers (friction in joints) and no driver breaks (a Ramp, a Sampled). "
+                "AlignedSteps end at breaks, and AdaptiveSteps has steps for the motion by any scheme."
             )
 
         def better(b):

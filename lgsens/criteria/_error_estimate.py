@@ -16,8 +16,9 @@ import numpy as np
 
 from lgsens._validate import is_concrete, require
 from lgsens.criteria._refined_run import refined_error, require_order
-from lgsens.dynamics import State
+from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate import (
+    AbstractGrid,
     AbstractIntegrator,
     AbstractScheme,
     EqualGrid,
@@ -104,10 +105,16 @@ def _estimated(integrator: AbstractIntegrator, trajectory: Trajectory) -> StateE
     if not integrator.equal_steps:
         return refined_error(scheme, trajectory)
     grid = EqualGrid.between(t[0], t[-1], t.shape[0] - 1, scheme.restarts(trajectory.system))
-    defects = scheme.defects(trajectory.system, grid, trajectory.states)
+    defects = smooth_defects(scheme, trajectory.system, grid, trajectory.states)
     if defects is None:
         return refined_error(scheme, trajectory)
     return error_by_defects(scheme, trajectory.states, Parameters(trajectory.system, grid), defects)
+
+
+def smooth_defects(scheme: AbstractScheme, system: AbstractSystem, grid: AbstractGrid, states: State):
+    """The `defects` of a run; None where they are not known, or not all: where steps begin anew behind a break, what
+    they begin with misses something as well."""
+    return None if grid.restarts is not None else scheme.defects(system, grid, states)
 
 
 def error_by_defects(

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from differences import central
+from helpers import says
 from jaxtyping import Array, Float
 
 import lgsens as lg
@@ -167,3 +168,27 @@ def test_the_error_of_such_a_run_can_be_estimated():
     """Its a and v̇ do not belong together where a step begins anew, and it is a run of the scheme even so."""
     run = lg.simulate(towed(P), t1=0.9, num_steps=24)
     assert np.isfinite(lg.accuracy.error_estimate(run).w).all()
+
+
+SQUARE = lg.Criterion(integrand=lambda s, p: s.joint("driver").axial_force ** 2)
+
+
+def on_a_ramp(p):
+    return driven(lg.Ramp(end=p["end"], t_start=0.2, duration=p["duration"]))
+
+
+@pytest.mark.slow
+def test_certificates_tell_the_errors_of_such_a_run():
+    """∫ s̈² dt = 120/7 d²/T³ with both ends of the ramp at those of steps."""
+    found = lg.certify(SQUARE, on_a_ramp, {"end": 1.0, "duration": 1.0}, t1=1.5, num_steps=75)
+    exact = MASS**2 * 120.0 / 7.0
+    np.testing.assert_allclose(found.value_error, exact - found.value, rtol=0.05)  # of errors of order h², h³
+    wrong = {"end": 2.0 * exact - found.gradient["end"], "duration": -3.0 * exact - found.gradient["duration"]}
+    for name, error in wrong.items():
+        # the second end of the ramp moves with its duration, of which the derivative is of first order
+        np.testing.assert_allclose(found.gradient_error[name], error, rtol=0.05 if name == "end" else 1.0, err_msg=name)
+
+
+def test_steps_for_such_a_criterion_are_refused():
+    with pytest.raises(ValueError, match=says("no driver breaks", "AlignedSteps")):
+        lg.steps_for(SQUARE, on_a_ramp, {"end": 1.0, "duration": 1.0}, t1=1.5, pilot=75, num_steps=60)
