@@ -266,7 +266,8 @@ class CoordinateCoupling(AbstractJoint):
             is the only coefficient angles then turn any number of times; else `second`, if it is an angle, stays within
             half a turn, where a run has failed otherwise, and so it does for the derivative by c₁.
 
-    The multiplier is the generalized force that the coupling takes from s₁ [N or N m]. Raises `ValueError` for joints
+    The multiplier is the generalized force that the coupling takes from s₁ [N or N m]: of ropes over pulleys the
+    tension of the first one, −c₁ times which the second one has. Raises `ValueError` for joints
     without the coordinate, coefficients of a wrong shape, a count below 1, or fewer than two bodies. Source: of gears
     on a carrier, Willis's equation: Uicker, Pennock & Shigley, Theory of Machines and Mechanisms (5th ed. 2017), ch. 9.
     """

@@ -28,7 +28,8 @@ class Coordinate(NamedTuple):
 
     Attributes:
         name, unit: what it is called, and "rad" or "m".
-        of: its value, given the pose of the joint's frame on b in that on a; a function of module level.
+        of: its value, given the pose of the joint's frame on b in that on a; a function of module level with a name, by
+            which it is pickled, or a value.
         periodic: whether it is an angle that comes back after 2π, which a trajectory continues over many turns.
         absolute: whether it is not 0 in the reference configuration.
     """
@@ -44,24 +45,39 @@ def _about_x(seen: Frame) -> Float[Array, ""]:
     return jnp.arctan2(seen.orientation[2, 1], seen.orientation[1, 1])
 
 
-def _rotation(axis: int) -> Callable[[Frame], Float[Array, ""]]:
-    return lambda seen: SO3().log(seen.orientation)[axis]
+def _about_second_arm(seen: Frame) -> Float[Array, ""]:
+    return jnp.arctan2(seen.orientation[0, 2], seen.orientation[0, 0])
+
+
+def _distance(seen: Frame) -> Float[Array, ""]:
+    return jnp.sqrt(jnp.sum(seen.position**2))
+
+
+class _Along(NamedTuple):
+    axis: int
+
+    def __call__(self, seen: Frame) -> Float[Array, ""]:
+        return seen.position[self.axis]
+
+
+class _RotationVector(NamedTuple):
+    axis: int
+
+    def __call__(self, seen: Frame) -> Float[Array, ""]:
+        return SO3().log(seen.orientation)[self.axis]
 
 
 ANGLE = Coordinate("angle", "rad", _about_x, True)
-DISPLACEMENT = Coordinate("displacement", "m", lambda seen: seen.position[0])
-LENGTH = Coordinate("length", "m", lambda seen: jnp.sqrt(jnp.sum(seen.position**2)), absolute=True)
+DISPLACEMENT = Coordinate("displacement", "m", _Along(0))
+LENGTH = Coordinate("length", "m", _distance, absolute=True)
 # of a cross from a, about its arm there, and of b from the cross, about the other arm: D = R_x(α) R_y(β)
 ARM_ANGLES = (
     ANGLE._replace(name="angle_a"),
-    Coordinate("angle_b", "rad", lambda seen: jnp.arctan2(seen.orientation[0, 2], seen.orientation[0, 0]), True),
+    Coordinate("angle_b", "rad", _about_second_arm, True),
 )
 # in the plane whose normal is the x of the frame on a
-IN_PLANE = tuple(
-    Coordinate(f"displacement_{name}", "m", of)
-    for name, of in (("y", lambda seen: seen.position[1]), ("z", lambda seen: seen.position[2]))
-)
-ROTATION_VECTOR = tuple(Coordinate(f"rotation_{name}", "rad", _rotation(i)) for i, name in enumerate("xyz"))
+IN_PLANE = tuple(Coordinate(f"displacement_{name}", "m", _Along(i)) for i, name in ((1, "y"), (2, "z")))
+ROTATION_VECTOR = tuple(Coordinate(f"rotation_{name}", "rad", _RotationVector(i)) for i, name in enumerate("xyz"))
 
 
 def frames_along(at_a, at_b, axis) -> tuple[Frame, Frame]:

@@ -104,7 +104,8 @@ def simulate(
             consistent initial state of the model, from which the scheme begins with its own corrections. A given state
             has none: with `initial_state(model)` accelerations and multipliers of the first steps are of first order.
             For second order leave it out and put initial velocities into the model, or continue from
-            `trajectory.state(-1)`.
+            `trajectory.state(-1)` in steps of the same size: in others of index 3, and so on grids that choose theirs,
+            forces of joints ring at first, by the square of the ratio of sizes (`RadauIIA` has no such memory).
         save: what to return of each instant instead of the trajectory, a function s ↦ pytree of an `Instant`; the
             result is a `Saved`. Without derivatives no state is stored, so that a batch of
             designs takes the memory of what it asks for. Define it once: a new lambda in each call compiles anew.
