@@ -8,7 +8,6 @@ from jax import lax
 
 from lgsens.dynamics import (
     ConstrainedMass,
-    accelerations,
     consistent_acceleration,
     consistent_velocity,
     given_way,
@@ -105,18 +104,14 @@ class AbstractAlphaBegin(AbstractAlpha):
 
             v_n* = v + h² N c,   v̇_n* = v̇,   a_n* = v̇ + r (I − N) (a_n − v̇) + Δ h N v̈,
 
-        v and v̇ those next to v_n and v̇_n, in the metric of M, with B v + Φ_t = 0 and its derivative; where forces
-        depend on multipliers, which jump with v̇, v̇ is that of the equations of motion there. Without it v and a keep
-        h² N Δc and Δ h N Δv̈ too much, Δv̈ by which v̈ jumps; they fade like n (−ρ∞)ⁿ, and until then forces of drivers
-        are off by O(h).
+        v and v̇ those next to v_n and v̇_n, in the metric of M, with B v + Φ_t = 0 and its derivative. Without it v
+        and a keep h² N Δc and Δ h N Δv̈ too much, Δv̈ by which v̈ jumps; they fade like n (−ρ∞)ⁿ, and until then forces
+        of drivers are off by O(h).
         """
         q, h, t = state.q, node.h, node.behind
         factors = self.resizing_factors(system, state, node.begin) if factors is None else factors
         v = consistent_velocity(system, q, state.v, node.begin, factors)
-        if system.reads_multipliers:  # which jump with v̇, and forces with them
-            vdot, _ = accelerations(system, q, v, t)
-        else:
-            vdot = consistent_acceleration(system, q, v, state.vdot, t, factors)
+        vdot = consistent_acceleration(system, q, v, state.vdot, t, factors)
         turning = self.missed_increment(system, v, vdot, jnp.zeros_like(v))
         carried = state.a - state.vdot
         jerk, (normal, of_carried) = normal_jerk(system, q, v, vdot, t, (turning, carried), factors)

@@ -10,7 +10,6 @@ import pytest
 from differences import central
 from helpers import says
 from jaxtyping import Array, Float
-from scipy.integrate import solve_ivp
 
 import lgsens as lg
 from lgsens.dynamics import autodiff_tangents
@@ -169,53 +168,6 @@ def test_the_error_of_such_a_run_can_be_estimated():
     """Its a and v̇ do not belong together where a step begins anew, and it is a run of the scheme even so."""
     run = lg.simulate(towed(P), t1=0.9, num_steps=24)
     assert np.isfinite(lg.accuracy.error_estimate(run).w).all()
-
-
-def pressing(amplitude):
-    return lg.Sampled(np.linspace(0.0, 1.0, 6), amplitude * np.sin(np.linspace(0.0, 4.0, 6)) ** 2, kind="monotone")
-
-
-def rubbing(p):
-    """A block that slides across on a driven cart, pressed by its acceleration, which jumps at the samples."""
-    cart, block = (lg.RigidBody(m, (0.1, 0.1, 0.1), velocity=(0.0, v, 0.0)) for m, v in ((3.0, 0.0), (2.0, 2.0)))
-    signal = pressing(p[0])
-    joints = {
-        "rail": lg.PrismaticJoint(None, "cart", at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0)),
-        "slide": lg.PrismaticJoint("cart", "block", at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0)),
-        "driver": lg.TranslationDriver(None, "cart", at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0), value=signal),
-    }
-    friction = lg.JointFriction("slide", coefficient=p[1], slip_speed=0.2, load_rounding=0.5)
-    return lg.Model({"cart": cart, "block": block}, joints, {"friction": friction})
-
-
-@pytest.mark.slow
-def test_friction_that_jumps_with_the_acceleration():
-    """Of second order too, where forces depend on multipliers; derivatives by amplitude and coefficient."""
-
-    def end(p, n, **sensitivity):
-        run = lg.simulate(rubbing(p), t1=1.0, num_steps=n, integrator=SCHEMES["aligned"], **sensitivity)
-        return run.body("block").position[-1, 1]
-
-    p = jnp.array([0.5, 0.4])
-    acceleration = jax.vmap(jax.grad(jax.grad(pressing(p[0]))))
-    state = [0.0, 2.0]
-    for begin in np.linspace(0.0, 0.8, 5):  # between samples the acceleration is linear in time
-        line = np.polynomial.Polynomial.fit(
-            *(begin + np.array([0.05, 0.15]), acceleration(begin + jnp.array([0.05, 0.15]))), 1
-        )
-
-        def slope(t, y, line=line):
-            pressed = (2.0 * line(t)) ** 2
-            return [y[1], -0.4 * pressed / np.sqrt(pressed + 0.25) * y[1] / np.hypot(y[1], 0.2) / 2.0]
-
-        state = solve_ivp(slope, (begin, begin + 0.2), state, rtol=1e-10, atol=1e-12).y[:, -1]
-    coarse, fine = (abs(end(p, n) - state[0]) for n in (50, 200))
-    assert fine < 2.0 * coarse / 16.0  # of order 1: a fourth
-    both = jax.jit(jax.value_and_grad(lambda p: end(p, 20, sensitivity=lg.AdjointVariable())))
-    gradient = both(p)[1]
-    np.testing.assert_allclose(gradient, jax.jit(jax.jacfwd(lambda p: end(p, 20)))(p), rtol=1e-9)
-    slopes = [central(lambda s, e=e: both(p + s * e)[0], 1e-3) for e in np.eye(2)]
-    np.testing.assert_allclose(gradient, slopes, rtol=1e-6)  # δ⁶ × the seventh derivative of rounded friction
 
 
 SQUARE = lg.Criterion(integrand=lambda s, p: s.joint("driver").axial_force ** 2)
