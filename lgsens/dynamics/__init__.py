@@ -8,6 +8,7 @@ from lgsens.dynamics._accelerations import (
 )
 from lgsens.dynamics._breaks import (
     AbstractTimeFunction as AbstractTimeFunction,
+    Breaking as Breaking,
     breaks_of as breaks_of,
     told_breaks as told_breaks,
 )
@@ -24,7 +25,6 @@ from lgsens.dynamics._initial import (
     acceleration_and_jerk as acceleration_and_jerk,
     accelerations as accelerations,
     assemble as assemble,
-    consistent_acceleration as consistent_acceleration,
     consistent_velocity as consistent_velocity,
     given_way as given_way,
     initial_state as initial_state,

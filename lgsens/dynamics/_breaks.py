@@ -1,11 +1,12 @@
 """Times at which the equations of motion are not smooth, as far as what they follow in time knows them."""
 
 import dataclasses
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_float
@@ -20,6 +21,20 @@ class AbstractTimeFunction(eqx.Module):
         time that it holds. `AlignedSteps` and steps under error control end at them, and the forces of a driver that
         follows it ring behind those that it does not tell."""
         return breaks_of([getattr(self, field.name) for field in dataclasses.fields(self)])
+
+
+class Breaking(NamedTuple):
+    """Constraints that follow functions of time which break.
+
+    Attributes:
+        times: when they do [s], shape (k,).
+        rows: which rows of all constraints these are, shape (m,), static.
+        constraint: Φ(q, t) of them, zeros in the other rows of position level.
+    """
+
+    times: Float[Array, " k"]
+    rows: np.ndarray
+    constraint: Callable[[Any, Any], Float[Array, " m_p"]]
 
 
 def told_breaks(function: AbstractTimeFunction) -> Float[Array, " *k"]:

@@ -118,12 +118,6 @@ def normal_jerk(
     return found[0], found[1:]
 
 
-def consistent_acceleration(system: AbstractSystem, q, v, vdot, t, factors: Factors | None = None):
-    """v̇ with the least change that the constraints ask for: J (v̇ + x) + γ = 0."""
-    kkt = ConstrainedMass.of(system, q, t, factors)
-    return vdot - kkt.solve(jnp.zeros_like(v), constraint_acceleration(system, q, v, vdot, t))[0]
-
-
 def acceleration_and_jerk(system: AbstractSystem, q, v, t, factors: Factors | None = None):
     """v̇, λ and v̈ of the motion through (q, v): v̈ is the derivative of `accelerations` along q ṽ, v̇ and 1."""
 

@@ -10,6 +10,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
+from lgsens.dynamics._breaks import Breaking
 from lgsens.liegroups import AbstractLieGroup
 from lgsens.linear import AbstractLinearSolver, Elimination, Matrix, SparseMatrix
 
@@ -89,9 +90,9 @@ class AbstractSystem(eqx.Module):
         """The size of a large change of each coordinate: 1 rad, or the length of the scene [m]."""
 
     @property
-    def constraint_breaks(self) -> Float[Array, " k"]:
-        """The times at which what constraints follow breaks, as far as it says so (`AbstractTimeFunction.breaks`)."""
-        return jnp.zeros(0)
+    def breaking(self) -> Breaking | None:
+        """The constraints of position level that follow what breaks, as far as it says so; None: there are none."""
+        return None
 
     def constraint_round_off(self) -> Float[Array, ""]:
         """What round-off may leave of Φ: a thousand of those of the largest number in q, or of a large change of it;

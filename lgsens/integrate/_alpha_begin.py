@@ -3,12 +3,12 @@
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 
 from lgsens.dynamics import (
     ConstrainedMass,
-    consistent_acceleration,
     consistent_velocity,
     given_way,
     normal_jerk,
@@ -90,35 +90,53 @@ class AbstractAlphaBegin(AbstractAlpha):
 
     def restarts(self, system):
         """Where a constraint of position level breaks: the second or the third derivative of a driver."""
-        breaks = system.constraint_breaks
-        if not (self.second_order_start and breaks.shape[0]):
+        breaking = system.breaking
+        if not self.second_order_start or breaking is None:
             return None
-        return lax.stop_gradient(breaks.astype(system.mass_matrix().dtype))
+        return lax.stop_gradient(breaking.times.astype(system.mass_matrix().dtype))
 
     def renewed(self, system, state, node, ratio, factors=None):
-        """What the constraints ask for behind a break, in place of what they asked for before.
+        """What the constraints that break ask for behind a break, in place of what they asked for before.
 
-        Along the constraint directions everything is known, B v + Φ_t = 0 and its derivatives, and with it what v and a
-        have there in a smooth motion (see `start`, N as there). So the state begins anew in these directions with what
-        belongs to the motion behind, and goes on in all others:
+        Let c(q, v, t) = B v + Φ_t of the constraints that follow what breaks. Along their directions everything is
+        known, c = 0, ċ = 0 and c̈ = 0, and with it what v, v̇ and a have in a smooth motion (see `start`; what is c there
+        is γ here). So the state begins anew in these directions with what belongs to the motion behind, and goes on in
+        all others: it is moved by the least x, y and z, in the metric of M, that leave the other constraints as they
+        are, with
 
-            v_n* = v + h² N c,   v̇_n* = v̇,   a_n* = v̇ + r (I − N) (a_n − v̇) + Δ h N v̈,
+            v_n* = v_n + x,                          B x = −c + h² B γ,
+            v̇_n* = v̇_n + y,                          B y = −ċ,
+            a_n* = v̇_n* + r (a_n − v̇_n) + z,         B z = Δ h B v̈ − r B (a_n − v̇_n),
 
-        v and v̇ those next to v_n and v̇_n, in the metric of M, with B v + Φ_t = 0 and its derivative. Without it v
-        and a keep h² N Δc and Δ h N Δv̈ too much, Δv̈ by which v̈ jumps; they fade like n (−ρ∞)ⁿ, and until then forces
-        of drivers are off by O(h).
+        B v̈ = −c̈ at v̈ = 0. Without it v and a keep h² Δγ and Δ h Δv̈ too much, Δv̈ by which v̈ jumps; they fade like
+        n (−ρ∞)ⁿ, and until then forces of drivers are off by O(h).
         """
-        q, h, t = state.q, node.h, node.behind
-        factors = self.resizing_factors(system, state, node.begin) if factors is None else factors
-        v = consistent_velocity(system, q, state.v, node.begin, factors)
-        vdot = consistent_acceleration(system, q, v, state.vdot, t, factors)
+        q, v, vdot, h, t = state.q, state.v, state.vdot, node.h, node.behind
+        breaking, carried = system.breaking, state.a - vdot
+        assert breaking is not None  # or there are no `restarts`
         turning = self.missed_increment(system, v, vdot, jnp.zeros_like(v))
-        carried = state.a - state.vdot
-        jerk, (normal, of_carried) = normal_jerk(system, q, v, vdot, t, (turning, carried), factors)
-        a = vdot + ratio * (carried - of_carried) + self.delta * h * jerk
-        if not self.stabilized:
-            v = v + h**2 * (self.missed_increment(system, v, vdot, jerk) - turning + normal)
-        return dataclasses.replace(state, v=v, vdot=vdot, a=a)
+        moving = lambda q, v: system.group.to_ambient(q, v)
+        one = jnp.ones_like(t)
+        rate = lambda q, v, t: jax.jvp(breaking.constraint, (q, t), (moving(q, v), one))[1]
+        second = lambda q, v, t: jax.jvp(rate, (q, v, t), (moving(q, v), vdot, one))[1]
+        c_dot, c_ddot = jax.jvp(second, (q, v, t), (moving(q, v), vdot, one))
+        level = lambda rows: jnp.concatenate([rows, jnp.zeros(system.num_velocity_rows, rows.dtype)])
+        kkt = ConstrainedMass.of(system, q, node.begin, factors)
+        own = lambda rows: jnp.where(breaking.rows, rows, 0.0)
+        along = lambda x: own(kkt.jacobian @ x)
+        jerk = -level(c_ddot)
+        size = self.jerk_share
+        offsets = jnp.stack(
+            [
+                -level(rate(q, v, node.begin)) + h**2 * (size * jerk + along(turning)),
+                -level(c_dot),
+                self.delta * h * jerk - ratio * along(carried),
+            ]
+        )
+        x, y, z = jax.vmap(lambda rows: kkt.solve(jnp.zeros_like(v), rows)[0])(offsets)
+        vdot = vdot + y
+        v = v if self.stabilized else v + x
+        return dataclasses.replace(state, v=v, vdot=vdot, a=vdot + ratio * carried + z)
 
     @staticmethod
     def resized_acceleration(vdot, a, ratio):
@@ -133,10 +151,15 @@ class AbstractAlphaBegin(AbstractAlpha):
         off = not self.stabilized and len(system.constraint_names) > system.num_velocity_rows
         return self.second_order_start and off
 
+    @property
+    def jerk_share(self):
+        """Of v̈ in c of `missed_increment`."""
+        return 1.0 / 6.0 - self.beta - self.delta / 2.0
+
     def missed_increment(self, system, v, vdot, jerk):
         """c: with exact values and a_n = v̇(t_n + Δ h), Δ = α_m − α_f, the increment (27) misses the true one by h³ c.
 
         The true one is h v + h²/2 v̇ + h³ (v̈/6 + ad(v) v̇/12), from ẋ = T⁻¹(x) v and T⁻¹ = I + ½ ad(x) + …; hence
         c = (1/6 − β − Δ/2) v̈ + ad(v) v̇/12.
         """
-        return (1.0 / 6.0 - self.beta - self.delta / 2.0) * jerk + system.group.ad_mv(v, vdot) / 12.0
+        return self.jerk_share * jerk + system.group.ad_mv(v, vdot) / 12.0

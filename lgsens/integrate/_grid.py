@@ -41,6 +41,9 @@ from lgsens.integrate._linearized import Node
 Tree = TypeVar("Tree")
 
 
+EQUAL = 1.0  # the ratio of sizes where all are equal
+
+
 class Start(NamedTuple):
     """A state as a step of any size h begins with it: q exp(h² q̃_2), v + h² v_2, a + h a_1; None: nothing."""
 
@@ -111,7 +114,9 @@ class AbstractGrid(eqx.Module):
     def resized(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State, factors: Any = None) -> State:
         """`begun`, of a step that begins with another state than the last one ended with."""
         node, ratio = self.node(place), self.ratio(place)
-        found = scheme.resized(system, state, node.begin, factors).at(system, ratio)
+        found = state  # of the same size
+        if ratio is not EQUAL:
+            found = scheme.resized(system, state, node.begin, factors).at(system, ratio)
         if self.restarts is None:
             return found
         anew = scheme.renewed(system, state, node, ratio, factors)
@@ -157,7 +162,7 @@ class AbstractGrid(eqx.Module):
 
     def ratio(self, place: Any) -> Any:
         """The size of the step at a place, over that of the one before."""
-        return 1.0
+        return EQUAL
 
     def empty(self, place: Any) -> Bool[Array, ""] | None:
         """Whether the step is none; None: no step of this grid is empty."""

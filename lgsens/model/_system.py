@@ -2,7 +2,7 @@
 
 import dataclasses
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import suggestion
-from lgsens.dynamics import AbstractRedundantSystem, AbstractSparseSystem, Tangents, breaks_of, finite, least_norm
+from lgsens.dynamics import AbstractRedundantSystem, AbstractSparseSystem, Tangents, finite, least_norm
 from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew, turn
 from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, chosen
+from lgsens.model._breaking import breaking_of
 from lgsens.model._checks import are_bodies, far_from_rotation
 from lgsens.model._constraints import AbstractRows
 from lgsens.model._frames import BODY_DIM, ROTATION, Frame, motion_at
@@ -138,9 +139,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         own = {i: of for stack, rows in every for name, i, of in zip(stack.owners, stack.places, rows) if name == joint}
         return np.concatenate([np.zeros(0, int), *(own[i][own[i] >= 0] for i in sorted(own))])
 
-    @property
-    def constraint_breaks(self):
-        return breaks_of(self.constraints)
+    breaking: ClassVar[Any] = property(breaking_of)
 
     def of_parts(self, q, v, vdot):
         """The system of the bodies as they are named, and their q, v, v̇: those of this one unless some are merged."""

@@ -12,7 +12,7 @@ from helpers import says
 from jaxtyping import Array, Float
 
 import lgsens as lg
-from lgsens.dynamics import autodiff_tangents
+from lgsens.dynamics import Breaking, autodiff_tangents
 from lgsens.liegroups import Rn
 
 MASS, T1 = 5.0, 2.0
@@ -95,8 +95,8 @@ class Towed(lg.AbstractSystem):
         return ("ramp",)
 
     @property
-    def constraint_breaks(self):
-        return self.ramp.breaks
+    def breaking(self):
+        return Breaking(self.ramp.breaks, np.ones(1, bool), self.constraint)
 
     def reference(self):
         return jnp.zeros(2), jnp.zeros(2)

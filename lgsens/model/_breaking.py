@@ -1,0 +1,28 @@
+"""The constraints of a scene that follow signals which break."""
+
+from typing import Any
+
+import numpy as np
+
+from lgsens.dynamics import Breaking, breaks_of
+from lgsens.linear import added
+from lgsens.model._stack import at_ends
+
+
+def breaking_of(system: Any) -> Breaking | None:
+    """Those of position level of a `MultibodySystem`; None: there are none."""
+    every = zip(system.constraints[: system.topology.num_positions], system.topology.rows)
+    own = [(stack, rows) for stack, rows in every if breaks_of(stack).shape[0]]
+    if not own:
+        return None
+    stacks, rows = [stack for stack, _ in own], [rows for _, rows in own]
+    broken = np.zeros(system.topology.num_constraints, bool)
+    for each in rows:
+        broken[each[each >= 0]] = True
+
+    def constraint(q, t):
+        placed = zip(stacks, at_ends(stacks, system._placed(q)), rows)
+        values = [(stack.map(lambda e, *args: e.value(*args), ends, (t,)), of) for stack, ends, of in placed]
+        return added(values, system.topology.num_constraints - system.num_velocity_rows, system.mass.dtype)
+
+    return Breaking(breaks_of(stacks), broken, constraint)
