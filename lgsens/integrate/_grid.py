@@ -11,16 +11,12 @@ algorithmic acceleration of generalized-α stands for the acceleration at t_n + 
 
 in place of y_n. Sizes that differ by round-off are the same, r = 1. There ∂y_n*/∂r is not zero; but where ratios are
 constants (`fixed`: sizes are parts of the interval that nothing depends on), a step with r = 1 begins with y_n, to all
-derivatives, and nothing is to be done. A step of size 0 leaves everything as it is: a grid
-that needs fewer steps than its arrays have places ends with such. For its equations it has the size before it, which
-can be divided by.
+derivatives, and nothing is to be done. A step of size 0 leaves everything as it is: a grid that needs fewer steps than
+its arrays have places ends with such. For its equations it has the size before it, which can be divided by.
 
 Steps that begin anew. Where a constraint breaks (a driver whose second or third derivative jumps), what the state
 carries of the motion before does not belong to that behind, and the first step that begins there or later begins with
-
-    y_n* = `scheme.renewed`(y_n).
-
-With r = 1 and no break a step begins with y_n, to all derivatives where ratios are constants.
+`scheme.renewed`(y_n). On equal steps that is all that differs from y_n.
 """
 
 import abc
