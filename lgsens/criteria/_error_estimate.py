@@ -93,8 +93,10 @@ def _is_by(integrator: AbstractIntegrator, trajectory: Trajectory):
     ratio = xp.where(taken, h / xp.where(taken, before, 1.0), 1.0)
     left = scheme.mismatch((vdot[:-1], a[:-1]), (vdot[1:], a[1:]), ratio[:, None])
     differ = xp.abs(0.0 * a[1:] if left is None else left) > 1e3 * eps * xp.nanmax(xp.abs(a), initial=0.0)
-    anew = jax.vmap(partial(renewed, restarts))(Node(*map(jnp.asarray, (t[:-1], t[1:], h))), ratio)
-    same = ~xp.any((taken & ~xp.asarray(anew))[:, None] & differ)
+    if restarts is not None:
+        anew = jax.vmap(partial(renewed, restarts))(Node(*map(jnp.asarray, (t[:-1], t[1:], h))), ratio)
+        taken = taken & ~xp.asarray(anew)
+    same = ~xp.any(taken[:, None] & differ)
     equal = xp.ptp(h) <= 1e-6 * h.mean() + 16 * eps * xp.abs(t).max()
     return xp.asarray(same & (equal | (not integrator.equal_steps)))
 

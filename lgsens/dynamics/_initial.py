@@ -104,18 +104,18 @@ def _implicit_accelerations(system: AbstractSystem, q, v, t):
 
 
 def normal_jerk(
-    system: AbstractSystem, q, v, vdot, t, others, factors: Factors | None = None
-) -> tuple[Float[Array, " k"], Float[Array, "n k"]]:
-    """N v̈, and N x of n velocities x, N the M-orthogonal projection on the constraint directions.
+    system: AbstractSystem, q, v, vdot, t, other, factors: Factors | None = None
+) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+    """N v̈ and N x of a velocity x, N the M-orthogonal projection on the constraint directions.
 
     N v̈ is what the constraints ask for: the least with J v̈ + d(J v̇ + γ)/dt = 0, the latter at fixed v̈ = 0.
     """
     motion = system.group.to_ambient(q, v), vdot, jnp.ones_like(t)
     rate = lambda q, v, t: constraint_acceleration(system, q, v, vdot, t)
     kkt = ConstrainedMass.of(system, q, t, factors)
-    rows = jnp.stack([-jax.jvp(rate, (q, v, t), motion)[1], *(kkt.jacobian @ other for other in others)])
-    found = jax.vmap(lambda row: kkt.solve(jnp.zeros_like(v), row)[0])(rows)
-    return found[0], found[1:]
+    rows = jnp.stack([-jax.jvp(rate, (q, v, t), motion)[1], kkt.jacobian @ other])
+    jerk, normal = jax.vmap(lambda row: kkt.solve(jnp.zeros_like(v), row)[0])(rows)
+    return jerk, normal
 
 
 def acceleration_and_jerk(system: AbstractSystem, q, v, t, factors: Factors | None = None):

@@ -7,12 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from lgsens.dynamics import (
-    ConstrainedMass,
-    consistent_velocity,
-    given_way,
-    normal_jerk,
-)
+from lgsens.dynamics import ConstrainedMass, consistent_velocity, given_way, normal_jerk
 from lgsens.integrate._alpha import AbstractAlpha
 from lgsens.integrate._grid import Start
 
@@ -43,7 +38,7 @@ class AbstractAlphaBegin(AbstractAlpha):
             return Start(state)
         q, v, vdot = state.q, state.v, state.vdot
         turning = self.missed_increment(system, v, vdot, jnp.zeros_like(v))
-        jerk, (normal,) = normal_jerk(system, q, v, vdot, t0, (turning,), initial.factors)
+        jerk, normal = normal_jerk(system, q, v, vdot, t0, turning, initial.factors)
         a_1 = self.delta * jerk
         if self.stabilized:
             return Start(state, a_1=a_1)
@@ -115,25 +110,19 @@ class AbstractAlphaBegin(AbstractAlpha):
         breaking, carried = system.breaking, state.a - vdot
         assert breaking is not None  # or there are no `restarts`
         turning = self.missed_increment(system, v, vdot, jnp.zeros_like(v))
-        moving = lambda q, v: system.group.to_ambient(q, v)
-        one = jnp.ones_like(t)
+        moving, one = system.group.to_ambient, jnp.ones_like(t)
         rate = lambda q, v, t: jax.jvp(breaking.constraint, (q, t), (moving(q, v), one))[1]
         second = lambda q, v, t: jax.jvp(rate, (q, v, t), (moving(q, v), vdot, one))[1]
         c_dot, c_ddot = jax.jvp(second, (q, v, t), (moving(q, v), vdot, one))
         level = lambda rows: jnp.concatenate([rows, jnp.zeros(system.num_velocity_rows, rows.dtype)])
         kkt = ConstrainedMass.of(system, q, node.begin, factors)
-        own = lambda rows: jnp.where(breaking.rows, rows, 0.0)
-        along = lambda x: own(kkt.jacobian @ x)
-        jerk = -level(c_ddot)
-        size = self.jerk_share
-        offsets = jnp.stack(
-            [
-                -level(rate(q, v, node.begin)) + h**2 * (size * jerk + along(turning)),
-                -level(c_dot),
-                self.delta * h * jerk - ratio * along(carried),
-            ]
-        )
-        x, y, z = jax.vmap(lambda rows: kkt.solve(jnp.zeros_like(v), rows)[0])(offsets)
+        along, jerk = lambda x: jnp.where(breaking.rows, kkt.jacobian @ x, 0.0), -level(c_ddot)
+        offsets = [
+            -level(rate(q, v, node.begin)) + h**2 * (self.jerk_share * jerk + along(turning)),
+            -level(c_dot),
+            self.delta * h * jerk - ratio * along(carried),
+        ]
+        x, y, z = jax.vmap(lambda rows: kkt.solve(jnp.zeros_like(v), rows)[0])(jnp.stack(offsets))
         vdot = vdot + y
         v = v if self.stabilized else v + x
         return dataclasses.replace(state, v=v, vdot=vdot, a=vdot + ratio * carried + z)

@@ -25,9 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from lgsens._validate import require_setting
-from lgsens.dynamics import (
-    softness,
-)
+from lgsens.dynamics import softness
 from lgsens.integrate._alpha import AbstractEquations, Matrix, Wear
 from lgsens.integrate._alpha_begin import AbstractAlphaBegin
 from lgsens.integrate._alpha_defects import alpha_defects

@@ -37,9 +37,6 @@ from lgsens.integrate._linearized import Node
 Tree = TypeVar("Tree")
 
 
-EQUAL = 1.0  # the ratio of sizes where all are equal
-
-
 class Start(NamedTuple):
     """A state as a step of any size h begins with it: q exp(h² q̃_2), v + h² v_2, a + h a_1; None: nothing."""
 
@@ -83,6 +80,7 @@ class AbstractGrid(eqx.Module):
     num_steps: eqx.AbstractVar[int]
     count: eqx.AbstractVar[Float[Array, ""] | None]  # how many of the steps are taken; None: all
     restarts: eqx.AbstractVar[Float[Array, " k"] | None]  # the times after which steps begin anew; None: there are none
+    fixed: eqx.AbstractVar[bool]  # whether ratios of sizes are constants: only `changes` begin with another state then
     with_empty: ClassVar[bool] = False  # whether some steps may be none
 
     @abc.abstractmethod
@@ -102,20 +100,16 @@ class AbstractGrid(eqx.Module):
         """Whether a step may begin with another state than the last one ended with."""
         return self.restarts is not None
 
-    @property
-    def fixed(self) -> bool:
-        """Whether that is so for constants: only the steps of `changes` begin with another state then."""
-        return True
+    def sized(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State, factors: Any = None) -> State:
+        """A state as a step of the size at a place begins with it."""
+        return state
 
     def resized(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State, factors: Any = None) -> State:
         """`begun`, of a step that begins with another state than the last one ended with."""
-        node, ratio = self.node(place), self.ratio(place)
-        found = state  # of the same size
-        if ratio is not EQUAL:
-            found = scheme.resized(system, state, node.begin, factors).at(system, ratio)
+        found = self.sized(scheme, system, place, state, factors)
         if self.restarts is None:
             return found
-        anew = scheme.renewed(system, state, node, ratio, factors)
+        anew = scheme.renewed(system, state, self.node(place), self.ratio(place), factors)
         return jax.tree.map(lambda one, other: jnp.where(self.renews(place), one, other), anew, found)
 
     def begun(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State, factors: Any = None) -> State:
@@ -158,7 +152,7 @@ class AbstractGrid(eqx.Module):
 
     def ratio(self, place: Any) -> Any:
         """The size of the step at a place, over that of the one before."""
-        return EQUAL
+        return 1.0
 
     def empty(self, place: Any) -> Bool[Array, ""] | None:
         """Whether the step is none; None: no step of this grid is empty."""
@@ -219,6 +213,7 @@ class EqualGrid(AbstractGrid):
     num_steps: int = eqx.field(static=True)
     count: Float[Array, ""] | None = None  # of the steps taken; a float, like all leaves. None: all
     restarts: Float[Array, " k"] | None = None
+    fixed: ClassVar[bool] = True
 
     @classmethod
     def between(cls, t0, t1, num_steps: int | Steps, restarts=None) -> "EqualGrid":

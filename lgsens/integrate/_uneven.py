@@ -207,11 +207,9 @@ def _controlled_steps(
             node = Node(t0 + elapsed, t0 + (elapsed + h), h)
             begun = selected(changes, resized.at(system, ratio), state)
             if restarts is not None:
-                anew = in_any_lane(trial.trying & renewed(restarts, node, ratio))
-                renew = lambda begun: selected(
-                    renewed(restarts, node, ratio), scheme.renewed(system, state, node, ratio), begun
-                )
-                begun = lax.cond(anew, lambda begun: alike(renew(begun), begun), lambda begun: begun, begun)
+                anew = renewed(restarts, node, ratio)
+                renew = lambda begun: alike(selected(anew, scheme.renewed(system, state, node, ratio), begun), begun)
+                begun = lax.cond(in_any_lane(trial.trying & anew), renew, lambda begun: begun, begun)
             done, stats = walk.take(start, begun, node, trial.trying)
             error = relative(scheme.step_error(system, begun, done.state, done.memory, node), h)
             turn = h * unsteady_rate(system, done.state.v, done.state.vdot)

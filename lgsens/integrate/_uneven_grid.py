@@ -51,7 +51,7 @@ class UnevenGrid(AbstractGrid):
     before: Float[Array, ""]  # the size of the step that led to t0, to which the state there belongs
     room: bool = eqx.field(static=True, default=False)  # whether there may be many empty places at the end
     count: Float[Array, ""] | None = None  # of the steps that are not empty, where it is known
-    constant: bool = eqx.field(static=True, default=False)  # whether the ratios of sizes are
+    fixed: bool = eqx.field(static=True, default=False)
     restarts: Float[Array, " k"] | None = None
     with_empty: ClassVar[bool] = True
     num_steps: ClassVar[Any] = property(lambda self: self.h.shape[-1])  # no argument, where the base has a field
@@ -59,15 +59,14 @@ class UnevenGrid(AbstractGrid):
     @classmethod
     def first(cls, t0, h, *, room: bool = False, count=None, fixed: bool = False, restarts=None) -> "UnevenGrid":
         """From a state at t0 that belongs to the first step."""
-        return cls(t0=t0, h=h, before=h[0], room=room, count=count, constant=fixed, restarts=restarts)
+        return cls(t0=t0, h=h, before=h[0], room=room, count=count, fixed=fixed, restarts=restarts)
 
     @property
     def resizes(self):
         return True
 
-    @property
-    def fixed(self):
-        return self.constant
+    def sized(self, scheme, system, place, state, factors=None):
+        return scheme.resized(system, state, place.begin, factors).at(system, place.ratio)
 
     @property
     def first_size(self):
@@ -88,14 +87,14 @@ class UnevenGrid(AbstractGrid):
         last = jax.lax.cummax(jnp.where(h != 0.0, jnp.arange(1, h.shape[0] + 1), 0))
         size = jnp.concatenate([self.before[None], h])[last]
         ratio = without_round_off(size / jnp.concatenate([self.before[None], size[:-1]]))
-        ratio = jax.lax.stop_gradient(ratio) if self.constant else ratio
+        ratio = jax.lax.stop_gradient(ratio) if self.fixed else ratio
         return Place(self.t0 + jnp.cumsum(h) - h, h, size, ratio)
 
     def node(self, place):
         return Node(place.begin, place.begin + place.size, place.h)
 
     def begun_in_turn(self, scheme, system, place, state):
-        if self.constant:
+        if self.fixed:
             return self.begun(scheme, system, place, state)
         return _begun_in_turn(scheme, system, self, place, state)
 
@@ -118,4 +117,4 @@ class UnevenGrid(AbstractGrid):
         sizes = jnp.concatenate([self.before[None], self.places().h])
         begins = length * np.arange(count)
         restarts = for_each(count, self.restarts)
-        return UnevenGrid(t0=self.times()[begins], h=h, before=sizes[begins], constant=self.constant, restarts=restarts)
+        return UnevenGrid(t0=self.times()[begins], h=h, before=sizes[begins], fixed=self.fixed, restarts=restarts)
