@@ -2,10 +2,11 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens._validate import axis_field, point_field
-from lgsens.model._constraints import AbstractConstraint, ConstraintSum, InPlane
+from lgsens.model._constraints import AbstractClosedFormConstraint, ConstraintSum, InPlane, Orthogonality
 from lgsens.model._elements import body_fixed
 from lgsens.model._frames import TURNING_A, TURNING_B, Frame, normals
 from lgsens.model._joints import AbstractJoint
@@ -14,15 +15,20 @@ from lgsens.model._signal_fields import prescribed_field
 from lgsens.model._signals import Prescribed, at_time, number_of, prepared
 
 
-class Angle(AbstractConstraint):
+class Angle(AbstractClosedFormConstraint):
     """b has turned by a prescribed angle s(t) about an axis of a; λ is a moment [N m].
 
     With x, y fixed in a, normal to the axis, and β in b, which coincided with x before the turn:
 
-        Φ = atan2(β·(−x sin s + y cos s), β·(x cos s + y sin s)),
+        Φ = atan2(β·y, β·x) − s − 2πk,     k the integer with |Φ| ≤ π,
 
-    the angle from the prescribed direction to β. It is smooth but for a misalignment of π, so that s may grow beyond a
-    turn, and ∂Φ/∂s = −1.
+    the angle from the prescribed direction to β. It is smooth but for a misalignment of π: where atan2 jumps, k does.
+    So s may grow beyond a turn. (With sin s and cos s within atan2 it would be one formula, with three times as many
+    operations in the derivatives that a step behind a break asks for.)
+
+    With x = β·x and y = β·y the components, and both vectors in a, δΦ = d·δβ, d = (x y − y x)/r², r² = x² + y²: B is
+    that of `Orthogonality` of β and of d held in a, and as δd = −(d pᵀ + p dᵀ) δβ/r², p = x x + y y, the stiffness is
+    its K less λ (wᵀB + Bᵀw)/r², w that row of p.
     """
 
     first_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
@@ -42,12 +48,41 @@ class Angle(AbstractConstraint):
     def driven(self):
         return number_of(self.prescribed)
 
-    def value(self, a, b, t):
+    @property
+    def coupled(self):
+        return (self.acts_on,)
+
+    drawn = None
+
+    def _components(self, a, b):
+        """Those of β along x and y."""
         beta = a.local_axis(b.axis(self.first_b))
-        x, y = jnp.sum(beta * self.first_a), jnp.sum(beta * self.second_a)
-        angle = at_time(self.prescribed, t)
-        sine, cosine = jnp.sin(angle), jnp.cos(angle)
-        return jnp.arctan2(y * cosine - x * sine, x * cosine + y * sine)[None]
+        return jnp.sum(beta * self.first_a), jnp.sum(beta * self.second_a)
+
+    def _with_axis(self, axis) -> Orthogonality:
+        return Orthogonality(axis, self.first_b)
+
+    def _gradient(self, a, b) -> Orthogonality:
+        x, y = self._components(a, b)
+        return self._with_axis((x * self.second_a - y * self.first_a) / (x**2 + y**2))
+
+    def value(self, a, b, t):
+        x, y = self._components(a, b)
+        off = jnp.arctan2(y, x) - at_time(self.prescribed, t)
+        return (off - 2.0 * jnp.pi * jnp.round(lax.stop_gradient(off) / (2.0 * jnp.pi)))[None]
+
+    def jacobian(self, a, b, t):
+        return self._gradient(a, b).jacobian(a, b, t)
+
+    def force(self, a, b, lam, t):
+        return self._gradient(a, b).force(a, b, lam, t)
+
+    def geometric_stiffness(self, a, b, lam, t):
+        x, y = self._components(a, b)
+        held = self._gradient(a, b)
+        (row,) = held.jacobian(a, b, t)
+        along = self._with_axis(x * self.first_a + y * self.second_a).force(a, b, lam / (x**2 + y**2), t)
+        return held.geometric_stiffness(a, b, lam, t) - jnp.outer(along, row) - jnp.outer(row, along)
 
 
 class TranslationDriver(AbstractJoint):
