@@ -168,6 +168,14 @@ def while_loop(unfinished: Callable[[Carry], Any], body: Callable[[Carry], Carry
     return lax.while_loop(unfinished, body, init)
 
 
+def changed_where(which, change: Callable[[Carry], Carry], same: Carry) -> Carry:
+    """`change(same)` where it is so, by `cond`."""
+    if jax.sharding.get_abstract_mesh().manual_axes:
+        shapes = jax.eval_shape(change, same)
+        return lax.cond(which, lambda same: alike(change(same), shapes), lambda same: alike(same, shapes), same)
+    return lax.cond(which, change, lambda same: same, same)
+
+
 def renewed_where(due, new: Callable[[], Carry], earlier: Carry) -> Carry:
     """`new()` where it is due. A loop of no or one turn, because `cond` would copy what is large."""
     renewed = lambda carry: (jnp.zeros((), bool), new())

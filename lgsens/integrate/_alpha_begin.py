@@ -114,11 +114,12 @@ class AbstractAlphaBegin(AbstractAlpha):
         rate = lambda q, v, t: jax.jvp(breaking.constraint, (q, t), (moving(q, v), one))[1]
         second = lambda q, v, t: jax.jvp(rate, (q, v, t), (moving(q, v), vdot, one))[1]
         c_dot, c_ddot = jax.jvp(second, (q, v, t), (moving(q, v), vdot, one))
+        in_time = jax.jvp(lambda t: breaking.constraint(q, t), (node.begin,), (one,))[1]
         level = lambda rows: jnp.concatenate([rows, jnp.zeros(system.num_velocity_rows, rows.dtype)])
         kkt = ConstrainedMass.of(system, q, node.begin, factors)
         along, jerk = lambda x: jnp.where(breaking.rows, kkt.jacobian @ x, 0.0), -level(c_ddot)
         offsets = [
-            -level(rate(q, v, node.begin)) + h**2 * (self.jerk_share * jerk + along(turning)),
+            -along(v) - level(in_time) + h**2 * (self.jerk_share * jerk + along(turning)),
             -level(c_dot),
             self.delta * h * jerk - ratio * along(carried),
         ]

@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from lgsens._xla import alike, in_any_lane
+from lgsens._xla import changed_where, in_any_lane
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate._linearized import Node
 
@@ -114,10 +114,7 @@ class AbstractGrid(eqx.Module):
 
     def begun(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State, factors: Any = None) -> State:
         """What the step at a place begins with; `factors`: those below, if they are known."""
-        if not self.resizes:
-            return state
-        change = lambda state: self.resized(scheme, system, place, state, factors)
-        return self.where_resized(place, change, state) if self.fixed else change(state)
+        return self.where_varied(place, lambda state: self.resized(scheme, system, place, state, factors), state)
 
     def begun_in_turn(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State) -> State:
         """`begun`, by `where_resized`."""
@@ -128,18 +125,18 @@ class AbstractGrid(eqx.Module):
         if not self.resizes:
             return None
         found = lambda _: scheme.resizing_factors(system, state, self.node(place).begin)
-        if not self.fixed:
-            return found(None)
         none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(found, None))
-        return self.where_resized(place, found, none)
+        return self.where_varied(place, found, none)
+
+    def where_varied(self, place: Any, change: Callable[[Tree], Tree], same: Tree) -> Tree:
+        """`change(same)` where a step begins with something else than the state before, to all derivatives."""
+        return self.where_resized(place, change, same) if self.fixed else change(same)
 
     def where_resized(self, place: Any, change: Callable[[Tree], Tree], same: Tree) -> Tree:
         """`change(same)` where the step begins with another state; elsewhere it takes no time."""
         if not self.resizes:
             return same
-        shapes = jax.eval_shape(change, same)
-        resized = in_any_lane(self.changes(place))
-        return jax.lax.cond(resized, lambda same: alike(change(same), shapes), lambda same: alike(same, shapes), same)
+        return changed_where(in_any_lane(self.changes(place)), change, same)
 
     def changes(self, place: Any) -> Bool[Array, ""]:
         """Whether the step begins with another state than the last one ended with."""

@@ -8,15 +8,23 @@ made once.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
 from lgsens.dynamics import State
 from lgsens.integrate import AbstractLinearizedStep, AbstractScheme, Variation
-from lgsens.sensitivity._linearization import Parameters, Step, node_tangent, to_algebra, to_ambient
+from lgsens.sensitivity._linearization import (
+    Parameters,
+    Step,
+    cotangent_to_algebra,
+    cotangent_to_ambient,
+    node_tangent,
+    to_algebra,
+    to_ambient,
+)
 
 
 class LinearStep(NamedTuple):
@@ -29,18 +37,26 @@ class LinearStep(NamedTuple):
 
 
 class Loads(NamedTuple):
-    """What parameters add: to the equations of a step, and to the variation that it begins with."""
+    """What parameters add to a step, or a cotangent of it: E_p p', and the tangent of its place."""
 
     equations: Any
-    begun: Variation | None  # None: nothing
+    place: Any
 
 
 class Backward(NamedTuple):
     """What a step makes of the cotangent of its end."""
 
-    previous: Variation  # what it adds to the cotangent of δ_n
+    begun: Variation  # the cotangent of δ_n*
     mu: Variation
-    loads: Loads
+    loads: Any  # that of E_p p'
+
+
+class Before(NamedTuple):
+    """What the cotangent of δ_n* adds to those of δ_n, of all parameters as one vector, and of the place."""
+
+    previous: Variation
+    parameters: Any
+    place: Any
 
 
 class LinearizedSteps(NamedTuple):
@@ -64,66 +80,79 @@ class LinearizedSteps(NamedTuple):
         return LinearStep(step, begun, factors, equations)
 
     def loads(self, linear: LinearStep, d: Parameters | None, d_place: Any) -> Loads:
-        """E_p p', and what p' makes of y_n*; d None: nothing."""
+        """E_p p'; d None: nothing."""
         if d is None:
             none = jax.tree.map(jnp.zeros_like, (self.parameters, linear.step.place))
             shapes = jax.eval_shape(self.loads, linear, *none)
             return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         system, grid = self.parameters
-        step, begun = linear.step, None
+        step = linear.step
         node, d_node = grid.node(step.place), node_tangent(grid, d.grid, step.place, d_place)
         loads = self.scheme.loads(self.shared, linear.begun, step.state)
-        if grid.resizes:
-            at = lambda system, place: grid.begun(self.scheme, system, place, step.before, linear.factors)
-            _, d_begun = jax.jvp(at, (system, step.place), (d.system, d_place))
-            begun = to_algebra(system.group, linear.begun, d_begun)
-        return Loads(jax.jvp(loads, (system, node), (d.system, d_node))[1], begun)
+        return Loads(jax.jvp(loads, (system, node), (d.system, d_node))[1], d_place)
 
-    def _begun(self, linear: LinearStep, previous: Variation) -> Variation:
-        """δ_n* at given parameters, of a step of another size than the one before."""
-        (system, grid), step = self.parameters, linear.step
-        at = lambda state: grid.resized(self.scheme, system, step.place, state, linear.factors)
-        d_begun = jax.jvp(at, (step.before,), (to_ambient(system.group, step.before, previous),))[1]
-        return to_algebra(system.group, linear.begun, d_begun)
+    def _begins(self, linear: LinearStep) -> Callable[[State, Parameters, Any], State]:
+        """y_n* of y_n, the parameters and the place, where a step begins with another state than the last one ended
+        with."""
+        return lambda state, parameters, place: parameters.grid.resized(
+            self.scheme, parameters.system, place, state, linear.factors
+        )
 
-    def forward(self, linear: LinearStep, previous: Variation, loads: Loads, row: Variation) -> Variation:
-        """δ_{n+1}."""
+    def _begun(self, linear: LinearStep, previous: Variation, *of: Any) -> Variation:
+        """δ_n* there, from δ_n, and p' and the tangent of the place, if they vary."""
+        group, step = self.parameters.system.group, linear.step
+        constant = (self.parameters, step.place)[len(of) :]
+        at = lambda *varied: self._begins(linear)(*varied, *constant)
+        varied = (step.before, self.parameters, step.place)[: 1 + len(of)]
+        return to_algebra(group, linear.begun, jax.jvp(at, varied, (to_ambient(group, step.before, previous), *of))[1])
+
+    def forward(
+        self, linear: LinearStep, previous: Variation, loads: Loads, row: Variation, d: Parameters | None
+    ) -> Variation:
+        """δ_{n+1}; d None: `previous` is all that moves what the step begins with."""
         grid, place = self.parameters.grid, linear.step.place
-        begun = grid.where_resized(place, partial(self._begun, linear), previous)
-        if loads.begun is not None:
-            begun = jax.tree.map(jnp.add, begun, loads.begun)
+        of = () if d is None else (d, loads.place)
+        begun = grid.where_varied(place, lambda previous: self._begun(linear, previous, *of), previous)
         current = linear.equations.forward(self.shared, grid.node(place), begun, loads.equations, row)
         return grid.unless_empty(place, current, jax.tree.map(jnp.add, previous, row))
 
-    def backward(self, linear: LinearStep, c: Variation, loads: Loads) -> Backward:
-        """The transpose of `forward`; `loads`: in shape."""
+    def backward(self, linear: LinearStep, c: Variation, loads: Any) -> Backward:
+        """The transpose of the equations; `loads`: in shape."""
         grid, place = self.parameters.grid, linear.step.place
-        begun, of_equations, mu = linear.equations.backward(self.shared, grid.node(place), c, loads.equations)
-        pulled = lambda begun: jax.vjp(partial(self._begun, linear), Variation.none(linear.begun))[1](begun)[0]
-        previous = grid.where_resized(place, pulled, begun)
-        found = Loads(of_equations, begun if grid.resizes else None)
-        found = grid.unless_empty(place, found, jax.tree.map(jnp.zeros_like, found))
-        return Backward(grid.unless_empty(place, previous, c), grid.unless_empty(place, mu, c), found)
+        begun, of_equations, mu = linear.equations.backward(self.shared, grid.node(place), c, loads)
+        nothing = jax.tree.map(jnp.zeros_like, (begun, of_equations))
+        begun, of_equations = grid.unless_empty(place, (begun, of_equations), nothing)
+        return Backward(begun, grid.unless_empty(place, mu, c), of_equations)
 
-    def pull_back(self, linear: LinearStep) -> tuple[Loads, Callable[[Backward], tuple[Parameters, Any]]]:
-        """The loads of a step, in shape; and for stacked steps what they add to p̄, and the cotangents of places."""
-        resizes, group = self.parameters.grid.resizes, self.parameters.system.group
+    def before(self, linear: LinearStep, c: Variation, found: Backward, bar: Any) -> Before:
+        """The transpose of what a step begins with, added to the cotangent `bar` of the parameters."""
+        (system, grid), (place, state, _) = self.parameters, linear.step
+
+        def pulled(before: Before) -> Before:
+            _, transposed = jax.vjp(self._begins(linear), state, self.parameters, place)
+            of_state, of_parameters, of_place = transposed(
+                cotangent_to_ambient(system.group, linear.begun, before.previous)
+            )
+            previous = cotangent_to_algebra(system.group, state, of_state)
+            return Before(previous, before.parameters + ravel_pytree(of_parameters)[0], of_place)
+
+        of_place = jax.tree.map(jnp.zeros_like, place)
+        before = grid.where_varied(place, pulled, Before(found.begun, bar, of_place))
+        return before._replace(previous=grid.unless_empty(place, before.previous, c))
+
+    def pull_back(self, linear: LinearStep) -> tuple[Any, Callable[[Any], tuple[Parameters, Any]]]:
+        """E_p p' of a step, in shape; and for stacked steps what they add to p̄, and the cotangents of places."""
 
         def all_loads(system, grid, places):
-            def of_one(linear: LinearStep, place):
-                step = linear.step
-                loads = self.scheme.loads(self.shared, linear.begun, step.state)(system, grid.node(place))
-                if not resizes:
-                    return Loads(loads, None)
-                begun = grid.begun(self.scheme, system, place, step.before, linear.factors)
-                return Loads(loads, Variation.of(group.from_ambient(linear.begun.q, begun.q), begun))
-
+            of_one = lambda linear, place: self.scheme.loads(self.shared, linear.begun, linear.step.state)(
+                system, grid.node(place)
+            )
             return jax.vmap(of_one)(linear, places)
 
         loads, transposed = jax.vjp(all_loads, *self.parameters, linear.step.place)
 
-        def pulled(found: Backward):
-            of_system, of_grid, of_places = transposed(found.loads)
+        def pulled(found):
+            of_system, of_grid, of_places = transposed(found)
             return Parameters(of_system, of_grid), of_places
 
         return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), loads), pulled

@@ -41,13 +41,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import State
 from lgsens.integrate import AbstractScheme, Variation, earlier, later, with_first, with_last
 from lgsens.sensitivity._carried import Carried
 from lgsens.sensitivity._linearization import Parameters, place_tangents, steps, with_places
-from lgsens.sensitivity._linearized_steps import Backward, LinearizedSteps, LinearStep, Loads
+from lgsens.sensitivity._linearized_steps import Backward, Before, LinearizedSteps, LinearStep, Loads
 
 
 class _Composed(NamedTuple):
@@ -74,20 +75,26 @@ class _Composed(NamedTuple):
             loads = jax.tree.map(jnp.zeros_like, jax.eval_shape(equations.loads, linear, d, place))
 
             def column(y):
-                return after.back(equations.forward(linear, before.into(y, none), loads, none))
+                return after.back(equations.forward(linear, before.into(y, none), loads, none, None))
 
             return jax.vmap(column, out_axes=1)(jnp.eye(before.back(none).shape[0], dtype=none.v.dtype))
 
         found = jax.vmap(transition)(linear, d_places, before, after)
         return cls(equations, linear, before, after, found)
 
-    def forward(self, previous: Variation, loads: Loads, rows: Variation) -> Variation:
-        """A_n δ_n + f_n."""
-        return jax.vmap(self.equations.forward)(self.steps, previous, loads, rows)
+    def forward(self, previous: Variation, loads: Loads, rows: Variation, d: Parameters | None = None) -> Variation:
+        """A_n δ_n + f_n; d None: f_n is that of `rows` and `loads` alone."""
+        return jax.vmap(partial(self.equations.forward, d=d))(self.steps, previous, loads, rows)
 
-    def backward(self, c: Variation, loads: Loads) -> Backward:
+    def backward(self, c: Variation, loads: Any) -> tuple[Backward, Before]:
         """Of all c_{n+1}; `loads`: of one, in shape."""
-        return jax.vmap(lambda linear, c: self.equations.backward(linear, c, loads))(self.steps, c)
+        none = jnp.zeros_like(ravel_pytree(self.equations.parameters)[0])
+
+        def of_one(linear, c):
+            found = self.equations.backward(linear, c, loads)
+            return found, self.equations.before(linear, c, found, none)
+
+        return jax.vmap(of_one)(self.steps, c)
 
 
 def _after(first, second):
@@ -112,8 +119,8 @@ def direct_at_once(scheme: AbstractScheme, states: State, parameters: Parameters
         before = _sum(earlier(f), jax.vmap(Carried.into)(every.before, y, earlier(f)))
         return with_first(_row(f, 0), _sum(every.forward(before, *nothing), later(f)))
 
-    delta = solved(with_first(_row(b, 0), every.forward(nothing[1], *given)))
-    left = jax.tree.map(jnp.subtract, every.forward(earlier(delta), *given), later(delta))
+    delta = solved(with_first(_row(b, 0), every.forward(nothing[1], *given, d)))
+    left = jax.tree.map(jnp.subtract, every.forward(earlier(delta), *given, d), later(delta))
     return _sum(delta, solved(with_first(_row(nothing[1], 0), left))), d
 
 
@@ -123,22 +130,26 @@ def adjoint_at_once(scheme: AbstractScheme, states: State, parameters: Parameter
     loads, pull_back = every.equations.pull_back(every.steps)
     transposed, none = jnp.swapaxes(every.transitions, 1, 2), jax.tree.map(jnp.zeros_like, _row(c, 0))
 
+    of_before = lambda c: every.backward(c, loads)[1].previous
+
     def solved(own: Variation) -> Variation:
         """c of c_n = own_n + A_nᵀ c_{n+1}."""
-        handed = jax.vmap(_into_transposed)(every.before, every.backward(later(own), loads).previous)
+        handed = jax.vmap(_into_transposed)(every.before, of_before(later(own)))
         _, z = lax.associative_scan(_after, (transposed, handed), reverse=True)
         z = with_last(later(z), jnp.zeros_like(z[0]))
         after = _sum(later(own), jax.vmap(_back_transposed)(every.after, z, later(own)))
-        return _sum(own, with_last(every.backward(after, loads).previous, none))
+        return _sum(own, with_last(of_before(after), none))
 
     first = solved(c)
     found = every.backward(later(first), loads)
-    left = jax.tree.map(lambda own, more, c: own + more - c, c, with_last(found.previous, none), first)
+    left = jax.tree.map(lambda own, more, c: own + more - c, c, with_last(found[1].previous, none), first)
     second = solved(left)
-    found = _sum(found, every.backward(later(second), loads))
-    of_parameters, of_places = pull_back(found)
-    mu = with_first(_sum(_row(first, 0), _row(second, 0)), found.mu)
-    return mu, with_places(parameters.grid, _sum(c_p, of_parameters), of_places)
+    at_ends, at_begins = _sum(found, every.backward(later(second), loads))
+    of_parameters, of_places = pull_back(at_ends.loads)
+    begun = ravel_pytree(parameters)[1](jnp.sum(at_begins.parameters, axis=0))
+    mu = with_first(_sum(_row(first, 0), _row(second, 0)), at_ends.mu)
+    bar = _sum(_sum(c_p, of_parameters), begun)
+    return mu, with_places(parameters.grid, bar, _sum(of_places, at_begins.place))
 
 
 def _sum(tree: Any, other: Any) -> Any:

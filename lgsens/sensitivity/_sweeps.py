@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
 from lgsens._xla import scan
 from lgsens.dynamics import State
@@ -78,7 +79,7 @@ def direct_sweep(
 
     def one(previous: Variation, inputs):
         (linear, loads), row = inputs
-        current = equations.forward(linear, previous, loads, row)
+        current = equations.forward(linear, previous, loads, row, d)
         return current, current
 
     def block(previous: Variation, inputs):
@@ -111,21 +112,27 @@ def adjoint_sweep(
     grid = parameters.grid
     equations, blocks, every, linearized = _Gone.of(scheme, states, parameters, linear)
 
-    def one(loads, c: Variation, inputs):
-        linear, own = inputs
+    _, unravel = ravel_pytree(parameters)
+
+    def one(loads, carry, inputs):
+        (c, bar), (linear, own) = carry, inputs
         found = equations.backward(linear, c, loads)
-        return jax.tree.map(jnp.add, own, found.previous), found._replace(previous=None)
+        before = equations.before(linear, c, found, bar)
+        c = jax.tree.map(jnp.add, own, before.previous)
+        return (c, before.parameters), (found.mu, found.loads, before.place)
 
     def block(carry, inputs):
         c, bar = carry
         given, own = inputs
         steps = linearized(given)
         loads, pull_back = equations.pull_back(steps)
-        c, found = scan(partial(one, loads), c, (steps, own), reverse=True)
+        none = jnp.zeros_like(ravel_pytree(parameters)[0])
+        (c, begun), (mu, of_loads, of_begun) = scan(partial(one, loads), (c, none), (steps, own), reverse=True)
         if c_p is None:
-            return (c, None), (found.mu, None)
-        of_parameters, of_places = pull_back(found)
-        return (c, jax.tree.map(jnp.add, bar, of_parameters)), (found.mu, of_places)
+            return (c, None), (mu, None)
+        of_parameters, of_places = pull_back(of_loads)
+        bar = jax.tree.map(lambda *parts: sum(parts), bar, of_parameters, unravel(begun))
+        return (c, bar), (mu, jax.tree.map(jnp.add, of_places, of_begun))
 
     with_empty = grid.with_empty and blocks.count is not None
     if with_empty:
