@@ -74,7 +74,7 @@ def direct_on_the_fly(
         progress = progress._replace(memory=memory)
 
         def along(delta, d: Parameters, d_place):
-            return equations.forward(linear, delta, equations.loads(linear, d, d_place), none)
+            return equations.forward(linear, delta, equations.loads(linear, d, d_place), none, d)
 
         delta = jax.vmap(along)(delta, d, d_places)
         rate = with_derivative(functional.rate, progress.state, node.t, delta)

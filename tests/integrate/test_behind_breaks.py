@@ -143,7 +143,7 @@ GRIDS = SCHEMES | {"given": GIVEN, "extrapolated": EXTRAPOLATED}
     "name", ["equal", *(pytest.param(name, marks=pytest.mark.slow) for name in GRIDS if name != "equal")]
 )
 def test_derivatives_through_it_are_exact(name):
-    """Where breaks lie inside of steps by the times of ramp and run, too; where steps end at them, by what moves none."""
+    """Where breaks lie inside of steps by times of ramp and run, too; where steps end at them, by what moves none."""
     integrator, n = GRIDS[name], 400 if name == "adaptive" else 24
     reverse = jax.jit(jax.value_and_grad(lambda p: psi(p, integrator, lg.AdjointVariable(), n)))
     gradient = reverse(P)[1]
