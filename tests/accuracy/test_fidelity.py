@@ -7,7 +7,7 @@ import pytest
 from oscillator import CRITERION, T1, V
 
 import lgsens as lg
-from lgsens.accuracy import fidelity
+from lgsens.accuracy import _fidelity, fidelity
 from lgsens.examples import QuarterCar
 from lgsens.model import Frozen, Joint, Rod, Without
 
@@ -81,6 +81,17 @@ def test_what_does_not_matter_is_told_and_left_out_first(found):
     assert best.reductions == (Frozen("other"),)  # a joint in place of a bushing adds equations, and saves no time
     assert best.unknowns == found.unknowns - 1 and best.time < 1.0
     assert "the rich scene: Ψ" in str(found) and len(str(found).splitlines()) == 6
+
+
+@pytest.mark.parametrize("lean", [0.5, 2.0])
+def test_the_fastest_in_fact_may_be_the_rich_scene(found, monkeypatch, lean):
+    """Both are run; times are given, as a test knows none."""
+    seconds = lambda programs, rounds: {options: (lean if options else 1.0, 0.0) for options in programs}
+    monkeypatch.setattr(_fidelity, "in_turns", seconds)
+    best = found.fastest(1e-4)
+    assert best.reductions == ((Frozen("other"),) if lean < 1.0 else ())
+    assert best.time == min(lean, 1.0) and best.error < 1e-9  # as it is predicted, above
+    assert best.unknowns == found.unknowns - len(best.options)
 
 
 def test_an_option_is_the_sum_of_its_reductions(found):
