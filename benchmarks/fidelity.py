@@ -2,8 +2,8 @@
 
     python benchmarks/fidelity.py [--out benchmarks/results]
 
-Options of the five-link car and of a multi-link one: Ψ₀ and its gradient by k, c and all hardpoints of the chassis. Each
-option is compiled as a lean scene of its own and compared with its prediction; of the five-link car also what is
+Options of the five-link car and of a multi-link one: Ψ₀ and its gradient by k, c and all hardpoints of the chassis.
+Each option is compiled as a lean scene of its own and compared with its prediction; of the five-link car also what is
 recommended for 1e-2 and 1e-3, what `Fidelity.fastest` chooses, and the reductions around it. Value and gradient of all
 are timed in turns, and which is the fastest of those within a tolerance. Writes fidelity.json and prints a table; some
 twenty minutes of compilation.

@@ -125,7 +125,6 @@ from lgsens.model._stack import (
     constraint_jacobian as constraint_jacobian,
     constraint_stiffness as constraint_stiffness,
     load_tangents as load_tangents,
-    moved as moved,
 )
 from lgsens.model._summary import Summary as Summary
 from lgsens.model._surface_joints import (

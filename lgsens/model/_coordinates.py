@@ -13,10 +13,10 @@ from jaxtyping import Array, Float
 
 from lgsens._brief import brief
 from lgsens._validate import as_count, as_float, number_field, require, require_setting, suggestion
-from lgsens.liegroups import skew, turn_back
+from lgsens.liegroups import turn_back
 from lgsens.model._constraints import AbstractClosedFormConstraint
 from lgsens.model._forces import AbstractForce, Attached, _frame
-from lgsens.model._frames import BODY_DIM, Frame
+from lgsens.model._frames import BODY_DIM, Frame, tilted
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._loads import AbstractClosedFormLoad, LoadTangents
 from lgsens.model._relative import Coordinate, but_for_turns
@@ -39,19 +39,12 @@ def _seen(a: Frame, b: Frame, on_a: Frame, on_b: Frame) -> Frame:
     return Frame(turn_back(axes_a, b.point(on_b.position) - a.point(on_a.position)), axes_a.T @ axes_b)
 
 
-def _tilted(frames: Sequence[Frame], x) -> list[Frame]:
-    """Frames after small x = [u, θ] of each, to first order: x + u, R (I + θ̃). Derivatives at x = 0 are those of
-    R exp(θ̃), of which XLA would compile the series."""
-    parts = jnp.split(x, len(frames))
-    return [Frame(f.position + u[:3], f.orientation + f.orientation @ skew(u[3:])) for f, u in zip(frames, parts)]
-
-
 def _row(
     value: Callable[..., Float[Array, ""]], frames: Sequence[Frame]
 ) -> tuple[Float[Array, ""], Float[Array, " n"]]:
     """A function of some frames, and its derivative by their [u, θ]."""
     zero = jnp.zeros(BODY_DIM * len(frames), frames[0].position.dtype)
-    return jax.value_and_grad(lambda x: value(*_tilted(frames, x)))(zero)
+    return jax.value_and_grad(lambda x: value(*tilted(frames, x)))(zero)
 
 
 def _attached(joint: AbstractJoint, a: Frame, b: Frame) -> tuple[Frame, Frame]:
@@ -123,7 +116,7 @@ class CoordinateLoad(AbstractClosedFormLoad):
         zero, (_, row) = jnp.zeros_like(va, shape=2 * BODY_DIM), self.value(a, b)
 
         def force(x):
-            one, other = _tilted((a, b), x)
+            one, other = tilted((a, b), x)
             return self.force(one, other, va, vb, t)
 
         position = jax.jacfwd(force)(zero)
@@ -241,7 +234,7 @@ class Coupled(AbstractClosedFormConstraint):
         frames = (a, b, *others)
 
         def force(x):
-            one, other, *more = _tilted(frames, x)
+            one, other, *more = tilted(frames, x)
             return self.force(one, other, lam, t, *more)
 
         return jax.jacfwd(force)(jnp.zeros_like(lam, shape=BODY_DIM * len(frames)))

@@ -5,6 +5,7 @@ generalized coordinates are ordered [x_a, θ_a, x_b, θ_b]: a translation in the
 rotation in the body frame, δx and δθ = (Rᵀ δR)^∨, for each body.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -54,6 +55,13 @@ class Frame(NamedTuple):
     def local_axis(self, axis: Float[Array, "3"]) -> Float[Array, "3"]:
         """Rᵀ e: an inertial direction in the body frame."""
         return turn_back(self.orientation, axis)
+
+
+def tilted(frames: Sequence[Frame], x) -> list[Frame]:
+    """Frames after small x = [u, θ] of each, to first order: x + u, R (I + θ̃). Derivatives at x = 0 are those of
+    R exp(θ̃), of which XLA would compile the series."""
+    parts = jnp.split(x, len(frames))
+    return [Frame(f.position + u[:3], f.orientation + f.orientation @ skew(u[3:])) for f, u in zip(frames, parts)]
 
 
 def motion_at(arm, position, orientation, twist, rate):

@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens.liegroups import Pose, R3xSO3
+from lgsens.liegroups import Pose
 from lgsens.linear import chosen
 from lgsens.model._constraints import (
     AbstractClosedFormConstraint,
@@ -23,7 +23,18 @@ from lgsens.model._constraints import (
     AbstractVelocityConstraint,
 )
 from lgsens.model._evaluate_by_kind import StackRow, joined
-from lgsens.model._frames import ALL, BODY_A, BODY_B, BODY_DIM, ROTATION, TURNING_A, TURNING_B, Frame, ground_frame
+from lgsens.model._frames import (
+    ALL,
+    BODY_A,
+    BODY_B,
+    BODY_DIM,
+    ROTATION,
+    TURNING_A,
+    TURNING_B,
+    Frame,
+    ground_frame,
+    tilted,
+)
 from lgsens.model._loads import (
     AbstractClosedFormLoad,
     AbstractDynamicLoad,
@@ -217,15 +228,6 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
 # Elements with closed-form tangents use them; for the others autodiff perturbs by retraction, R exp(θ̃).
 
 
-def moved(frame: Frame, x) -> Frame:
-    """The frame after x = [u, θ]: x + u, R exp(θ̃)."""
-    return Frame(*R3xSO3().retract(Pose(*frame), x))
-
-
-def _moved(frames, x) -> tuple[Frame, ...]:
-    return tuple(moved(frame, x[BODY_DIM * i : BODY_DIM * (i + 1)]) for i, frame in enumerate(frames))
-
-
 def constraint_jacobian(element: AbstractRows, a: Frame, b: Frame, t, *others: Frame):
     """B of one element, or A, shape (rows, 12), 6 more for each other body."""
     if isinstance(element, AbstractClosedFormConstraint):
@@ -234,7 +236,7 @@ def constraint_jacobian(element: AbstractRows, a: Frame, b: Frame, t, *others: F
     if isinstance(element, AbstractConstraint):
 
         def value(x):
-            a_, b_, *others_ = _moved((a, b, *others), x)
+            a_, b_, *others_ = tilted((a, b, *others), x)
             return element.value(a_, b_, t, *others_)
 
         return jax.jacfwd(value)(zero)
@@ -256,7 +258,7 @@ def constraint_stiffness(element: AbstractRows, a: Frame, b: Frame, lam, t, *oth
     zero = jnp.zeros(BODY_DIM * (2 + len(others)), a.position.dtype)
 
     def force(x):
-        a_, b_, *others_ = _moved((a, b, *others), x)
+        a_, b_, *others_ = tilted((a, b, *others), x)
         return constraint_force(element, a_, b_, lam, t, *others_)
 
     return jax.jacfwd(force)(zero)
@@ -281,7 +283,7 @@ def load_tangents(element: AbstractLoad | AbstractDynamicLoad, a: Frame, b: Fram
         return element.tangents(a, b, va, vb, t)
     force = lambda a, b, va, vb, *z: generalized_force(element, a, b, va, vb, t, *z)
     zero = jnp.zeros(2 * BODY_DIM, a.position.dtype)
-    position = jax.jacfwd(lambda x: force(moved(a, x[BODY_A]), moved(b, x[BODY_B]), va, vb, *z))(zero)
+    position = jax.jacfwd(lambda x: force(*tilted((a, b), x), va, vb, *z))(zero)
     velocity = jax.jacfwd(lambda x: force(a, b, va + x[BODY_A], vb + x[BODY_B], *z))(zero)
     if z:
         wide = jnp.zeros((len(position), len(position)), zero.dtype)
