@@ -46,7 +46,7 @@ from lgsens.model._forces import (
     SpringDamper as SpringDamper,
     TyreSpring as TyreSpring,
 )
-from lgsens.model._frames import Frame as Frame, motion_at as motion_at
+from lgsens.model._frames import Frame as Frame, motion_at as motion_at, moved as moved
 from lgsens.model._free import ALL_FREE as ALL_FREE
 from lgsens.model._friction import (
     JointFriction as JointFriction,

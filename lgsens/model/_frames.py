@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens.liegroups import cross, skew, turn, turn_back
+from lgsens.liegroups import Pose, R3xSO3, cross, skew, turn, turn_back
 
 BODY_DIM = 6
 BODY_A, BODY_B = slice(0, 6), slice(6, 12)
@@ -57,9 +57,14 @@ class Frame(NamedTuple):
         return turn_back(self.orientation, axis)
 
 
+def moved(frame: Frame, x) -> Frame:
+    """The frame after x = [u, θ]: x + u, R exp(θ̃)."""
+    return Frame(*R3xSO3().retract(Pose(*frame), x))
+
+
 def tilted(frames: Sequence[Frame], x) -> list[Frame]:
     """Frames after small x = [u, θ] of each, to first order: x + u, R (I + θ̃). Derivatives at x = 0 are those of
-    R exp(θ̃), of which XLA would compile the series."""
+    `moved`, of whose exponential XLA would compile the series."""
     parts = jnp.split(x, len(frames))
     return [Frame(f.position + u[:3], f.orientation + f.orientation @ skew(u[3:])) for f, u in zip(frames, parts)]
 

@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from lgsens.liegroups import Pose, R3xSO3
-from lgsens.model import Frame, RigidBody
+from lgsens.model import Frame, RigidBody, moved
 from lgsens.testing._differences import (
     NODES,
     NOISE_POINTS,
@@ -27,8 +26,7 @@ SPREAD = 0.5  # of points, in lengths, and of a displacement, in lengths and rad
 
 def displaced(a: Frame, b: Frame, x) -> tuple[Frame, Frame]:
     """Both frames after the displacement x, shape (12,)."""
-    group = R3xSO3()
-    return Frame(*group.retract(Pose(*a), x[:6])), Frame(*group.retract(Pose(*b), x[6:]))
+    return moved(a, x[:6]), moved(b, x[6:])
 
 
 class ScenePoses:
