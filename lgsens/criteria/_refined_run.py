@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from lgsens.integrate import AbstractScheme, UnevenGrid
+from lgsens.integrate import AbstractScheme, Start, UnevenGrid
 from lgsens.sensitivity import DirectDifferentiation, Parameters
 from lgsens.simulation import StateError, Trajectory
 
@@ -39,7 +39,7 @@ def refined_run(scheme: AbstractScheme, trajectory: Trajectory) -> Trajectory:
     """The run of a trajectory by `scheme` in half its steps; NaN from where it failed."""
     states, system, t = trajectory.states, trajectory.system, trajectory.t
     first = jax.tree.map(lambda leaf: leaf[0], states)
-    start = scheme.resized(system, scheme.resumed(system, first, t[0]), t[0]).at(system, 0.5)
+    start = scheme.resized(system, scheme.resumed(system, Start(first), t[0]).state, t[0]).at(system, 0.5)
     grid = UnevenGrid.first(t[0], jnp.repeat(0.5 * jnp.diff(t), 2), restarts=scheme.restarts(system))
     finer, stats = DirectDifferentiation().trajectory(scheme, start, Parameters(system, grid))
     stages, finer = scheme.stages(system, grid, finer), scheme.physical(system, finer)

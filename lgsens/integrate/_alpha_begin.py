@@ -45,6 +45,10 @@ class AbstractAlphaBegin(AbstractAlpha):
         v_2 = self.missed_increment(system, v, vdot, jerk) - turning + normal  # N c, linear in v̈
         return Start(state, q_2=given_way(system, q, self.beta * state.lam, t0), v_2=v_2, a_1=a_1)
 
+    def resumed(self, system, given, t0):
+        given = super().resumed(system, given, t0)
+        return given._replace(v_2=None) if self.stabilized else given
+
     def complete(self, system, state):
         if not self.stabilized:
             return state

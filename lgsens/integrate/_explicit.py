@@ -56,6 +56,7 @@ from lgsens.dynamics import (
     factorized_accelerations,
 )
 from lgsens.integrate._explicit_step import ExplicitLinearizedStep, Inner, corrections, ended
+from lgsens.integrate._grid import Start
 from lgsens.integrate._loops import earlier, later, with_first, with_last
 from lgsens.integrate._scheme import AbstractScheme, Stages, Stats
 
@@ -181,10 +182,11 @@ class IndexReducedODE(AbstractScheme):
 
     # How a motion begins, and what is seen of it.
 
-    def resumed(self, system, state0, t0):
+    def resumed(self, system, given, t0):
         """Accelerations are those of (q, v): a state of another scheme has them with its own error."""
-        vdot, lam = factorized_accelerations(Inertia.of(system), system, state0.q, state0.v, t0)
-        return self.complete(system, State(state0.q, state0.v, vdot, lam, vdot))
+        q, v = given.state.q, given.state.v
+        vdot, lam = factorized_accelerations(Inertia.of(system), system, q, v, t0)
+        return Start(self.complete(system, State(q, v, vdot, lam, vdot)))
 
     def complete(self, system, state):
         stages = len(self.coefficients.b) - 1

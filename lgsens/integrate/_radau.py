@@ -66,6 +66,7 @@ from lgsens.dynamics import (
     require_independent,
     require_linear,
 )
+from lgsens.integrate._grid import Start
 from lgsens.integrate._level_step import by_configuration
 from lgsens.integrate._linearized import AbstractLinearizedStep, Node, Variation
 from lgsens.integrate._loops import earlier, later
@@ -128,10 +129,11 @@ class RadauIIA(AbstractScheme):
 
     # How a motion begins, and what is seen of it.
 
-    def resumed(self, system, state0, t0):
+    def resumed(self, system, given, t0):
         """Accelerations are those of (q, v): a state of another scheme has them with its own error."""
-        vdot, lam = factorized_accelerations(Inertia.of(system), system, state0.q, state0.v, t0)
-        return self.complete(system, State(state0.q, state0.v, vdot, lam, vdot))
+        q, v = given.state.q, given.state.v
+        vdot, lam = factorized_accelerations(Inertia.of(system), system, q, v, t0)
+        return Start(self.complete(system, State(q, v, vdot, lam, vdot)))
 
     def complete(self, system, state):
         require_independent(system, "RadauIIA")

@@ -141,9 +141,9 @@ class AbstractScheme(AbstractIntegrator):
         """What the scheme starts from, given consistent values."""
         return Start(self.complete(system, initial.state))
 
-    def resumed(self, system: AbstractSystem, state0: State, t0) -> State:
+    def resumed(self, system: AbstractSystem, given: Start, t0) -> Start:
         """What the scheme starts from, given the state of another run."""
-        return self.complete(system, state0)
+        return given._replace(state=self.complete(system, given.state))
 
     def complete(self, system: AbstractSystem, state: State) -> State:
         """A state with what else the scheme carries."""

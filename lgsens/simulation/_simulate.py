@@ -18,6 +18,7 @@ from lgsens.integrate import (
     AbstractScheme,
     GeneralizedAlpha,
     Laid,
+    Start,
     Stats,
     Steps,
     singular_steps,
@@ -49,7 +50,7 @@ def simulate(
     num_steps: int | None = ...,
     integrator: AbstractIntegrator = ...,
     sensitivity: AbstractSensitivity = ...,
-    state0: State | None = ...,
+    state0: State | Start | None = ...,
     save: None = ...,
     accuracy: float | None = ...,
     throw: bool = ...,
@@ -65,7 +66,7 @@ def simulate(
     num_steps: int,
     integrator: AbstractIntegrator = ...,
     sensitivity: AbstractSensitivity = ...,
-    state0: State | None = ...,
+    state0: State | Start | None = ...,
     save: Save,
     throw: bool = ...,
 ) -> Saved: ...
@@ -79,7 +80,7 @@ def simulate(
     num_steps: int | None = None,
     integrator: AbstractIntegrator = GeneralizedAlpha(),
     sensitivity: AbstractSensitivity = DirectDifferentiation(),
-    state0: State | None = None,
+    state0: State | Start | None = None,
     save: Save | None = None,
     accuracy: float | None = None,
     throw: bool = True,
@@ -98,14 +99,14 @@ def simulate(
         sensitivity: how the trajectory is differentiated. `DirectDifferentiation` supports every JAX
             transformation; `AdjointVariable` is reverse mode, and forward over it (`jax.hessian`); `AssociativeScan`
             takes all steps at once, for accelerators.
-        state0: the state at t0, used as it is: one of `equilibrium`, or `Trajectory.state` to continue. Off its joints
+        state0: the state at t0, used as it is: one of `equilibrium`, or what a run continues from. Off its joints
             by more than a thousandth of the scene, or with velocities that these forbid, it is refused, inside `jit` by
             the result `off_joints`; with orientations that are no rotations, too (`invalid_numbers`). None: the
             consistent initial state of the model, from which the scheme begins with its own corrections. A given state
             has none: with `initial_state(model)` accelerations and multipliers of the first steps are of first order.
-            For second order leave it out and put initial velocities into the model, or continue from
-            `trajectory.state(-1)` in steps of the same size: in others of index 3, and so on grids that choose theirs,
-            forces of joints ring at first, by the square of the ratio of sizes (`RadauIIA` has no such memory).
+            For second order leave it out and put initial velocities into the model. `Trajectory.state` continues a run
+            in steps of the same size: in others of index 3, and so on grids that choose theirs, forces of joints ring
+            at first, by the square of the ratio of sizes. `Trajectory.continued` is for steps of any size.
         save: what to return of each instant instead of the trajectory, a function s ↦ pytree of an `Instant`; the
             result is a `Saved`. Without derivatives no state is stored, so that a batch of
             designs takes the memory of what it asks for. Define it once: a new lambda in each call compiles anew.

@@ -98,10 +98,11 @@ def _found_state(find: Callable[..., Initial], model: Model | AbstractSystem, t0
     return throw_if_failed(initial.state, initial.result, details, system.constraint_names)
 
 
-def check_state0(system: AbstractSystem, state0: State | None, t0) -> None:
+def check_state0(system: AbstractSystem, state0: State | Start | None, t0) -> None:
     """Raise `ValueError` for what is no state of the system, and for one that is known to be off its joints at t0."""
     if state0 is None:
         return
+    state0 = state0.state if isinstance(state0, Start) else state0
     known = jax.tree.map(primal_value, (system, state0, t0))
     if not is_concrete(known):
         _as_state(system, state0)
@@ -175,7 +176,7 @@ def _as_state(system: AbstractSystem, state0: Any) -> State:
     """A state in the precision of the system; `ValueError` for what is none, or has other shapes than the system's."""
     if not isinstance(state0, State):
         raise ValueError(
-            "`state0` must be a State: one of `equilibrium` or `initial_state`, or `trajectory.state(-1)` to continue, "
+            "`state0` must be a State: one of `equilibrium` or `initial_state`, or `trajectory.continued()` to go on, "
             f"got {type(state0).__name__}."
         )
     q, v = system.reference()
@@ -209,18 +210,20 @@ class Begin(NamedTuple):
 
 
 def begin(
-    scheme: AbstractScheme, system: AbstractSystem, t0, state0: State | None, initial: Initial | None = None
+    scheme: AbstractScheme, system: AbstractSystem, t0, state0: State | Start | None, initial: Initial | None = None
 ) -> Begin:
     """The state at t0: `state0` as it is, or the consistent one of the reference configuration, `initial` if known."""
     if state0 is not None:
-        state0 = _as_state(system, state0)
-        jacobian, start = constraint_jacobian(system, state0.q, t0), scheme.resumed(system, state0, t0)
+        given = state0 if isinstance(state0, Start) else Start(state0)
+        given = given._replace(state=_as_state(system, given.state))
+        state0, start = given.state, scheme.resumed(system, given, t0)
+        jacobian = constraint_jacobian(system, state0.q, t0)
         off = jax.lax.stop_gradient(_Off.of(system, state0, t0, jacobian))
         valid = system.is_valid() & finite(state0) & off.known
         result = jnp.where(off.on_joints, RESULTS.successful, RESULTS.off_joints)
         result = jnp.where(valid, result, RESULTS.invalid_numbers).astype(jnp.int32)
         usable = result == RESULTS.successful
-        start = Start(jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), start))
+        start = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), start)
         return Begin(start, state0.v, result, off.positions, jacobian)
     initial = _initial(system, t0) if initial is None else initial
     usable = initial.result == RESULTS.successful

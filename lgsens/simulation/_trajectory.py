@@ -15,10 +15,11 @@ from jaxtyping import Array, Float, Int
 from lgsens._brief import brief, listed, roster, shown
 from lgsens._validate import as_float, is_concrete, suggestion
 from lgsens.dynamics import RESULTS, AbstractSystem, State
-from lgsens.integrate import Stages
+from lgsens.integrate import Stages, Start
 from lgsens.model import MultibodySystem, SE3System, measured, motion_at, scene_of
 from lgsens.sensitivity import Sound
 from lgsens.simulation._body_motion import BodyMotion, PointMotion
+from lgsens.simulation._continued import continued
 from lgsens.simulation._joint_motion import JointMotion, joint_motions
 from lgsens.simulation._reached import Reached
 from lgsens.simulation._tables import to_csv, to_pandas, to_xarray
@@ -280,7 +281,7 @@ class Trajectory(AbstractRun):
 
     @_of_each
     def state(self, index: int) -> State:
-        """The state at step `index` (negative: from the end), from which a simulation can be continued.
+        """The state at step `index` (negative: from the end); a run in steps of the same size continues from it.
 
         Raises `IndexError` for an int that is out of range; a traced one is taken to the nearest state.
         """
@@ -290,6 +291,12 @@ class Trajectory(AbstractRun):
         if isinstance(index, int | np.integer) and not -count <= index < count:
             raise IndexError(f"`index` must be from {-count} to {count - 1}, as there are {count} states; got {index}.")
         return jax.tree.map(lambda leaf: leaf[index], self.states)
+
+    @_of_each
+    def continued(self, index: int = -1) -> Start:
+        """What a run in steps of any size, and on grids that choose theirs, continues from: a `state0` of `simulate`,
+        `differentiate` and others, in which what belongs to a size is by itself. Raises as `state`."""
+        return continued(self.system, self.t, self.state(index), self.t[index])
 
     def instant(self, index: int) -> "Instant":
         """Step `index` (negative: from the end) as the integrand of a `Criterion` sees it. Raises as `state`."""
