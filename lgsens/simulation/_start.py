@@ -176,9 +176,8 @@ def _as_state(system: AbstractSystem, state0: Any) -> State:
     """A state in the precision of the system; `ValueError` for what is none, or has other shapes than the system's."""
     if not isinstance(state0, State):
         raise ValueError(
-            "`state0` must be a State: one of `equilibrium` or `initial_state`, or `trajectory.state(-1)` to continue in "
-            "steps of the same size, `trajectory.continued()` in others; "
-            f"got {type(state0).__name__}."
+            "`state0` must be a State: one of `equilibrium` or `initial_state`, or `trajectory.state(-1)` to continue "
+            f"in steps of the same size, `trajectory.continued()` in others; got {type(state0).__name__}."
         )
     q, v = system.reference()
     lam = jax.ShapeDtypeStruct((len(system.constraint_names),), v.dtype)
