@@ -402,3 +402,13 @@ def test_double_precision_does_not_warn():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         fail(0.0)
+
+
+def test_times_far_from_zero_are_warned_of():
+    """Seconds since 1970 are known to 2e-7 s, and a driver's acceleration at steps of 10 ms to nothing."""
+    driver = lg.TranslationDriver(
+        None, "body", at=(0, 0, 0), axis=(1, 0, 0), value=lg.Harmonic(amplitude=1.0, frequency=1.0)
+    )
+    model = lg.Model({"body": lg.RigidBody(1.0, None, free="x")}, {"driver": driver})
+    with pytest.warns(UserWarning, match=says("`t0` = 1.7e+09 s", "beginning of the run")):
+        lg.simulate(model, t0=1.7e9, t1=1.7e9 + 0.2, num_steps=20)

@@ -129,7 +129,8 @@ class RotationDriver(AbstractJoint):
         axis: direction of the axis, fixed in `a`, inertial frame, shape (3,), any length > 0.
         value: the angle from the reference configuration [rad], right-handed, any number of turns, shape (), or a
             signal of it; None: 0. With a value the mechanism is assembled before it moves, with a signal it starts
-            with its rate. `lgsens.kinematics` prescribes many.
+            with its rate. Poses tell no turns: what counts them (racks, screws, gears, couplings, springs about the
+            axis) takes the angle at t0 between −π and π. `lgsens.kinematics` prescribes many.
 
     The multiplier is the moment of `b` on `a` about the axis [N m]: its negative drives `b`. Raises `ValueError` for a
     wrong shape, a zero axis, or samples joined by straight lines, at which velocities would jump. Source: Haug (1989),

@@ -1,5 +1,6 @@
 """The arguments of `simulate`, checked."""
 
+import warnings
 from typing import Any
 
 import jax
@@ -39,6 +40,22 @@ def interval(t0, t1):
     require(lambda t0, t1: t1 > t0, lambda: f"`t1` must be later than `t0`, {given()}", t0, t1)
     require(lambda *t: np.isfinite(t).all(), lambda: f"`t0` and `t1` must be finite, {given()}", t0, t1)
     return t0, t1
+
+
+def warn_of_far_times(t0, t1, num_steps: int) -> None:
+    """Where round-off of times, ε t, is more than 1e-6 of a step: signals then change by as much from step to step, and
+    accelerations come from the change of that, which is smaller by as many steps as the signal takes."""
+    known = primal_value(t0), primal_value(t1)
+    if not is_concrete(known) or known[0].dtype != np.float64:
+        return
+    start, end = map(float, known)
+    left = abs(start) * float(np.finfo(float).eps) * num_steps / (end - start)
+    if left > 1e-6:
+        warnings.warn(
+            f"`t0` = {start:g} s is so far from 0 that times are known to {left:.0e} of a step, and forces of what "
+            "follows them to less. Count time from the beginning of the run, in signals and roads, too.",
+            stacklevel=3,
+        )
 
 
 def check_accuracy(accuracy: Any, num_steps: int | None, integrator: Any, arrays: Any) -> None:

@@ -35,7 +35,7 @@ from lgsens.simulation._errors import primal_value, throw_if_failed
 from lgsens.simulation._index_reduced_ode import integrate_ode
 from lgsens.simulation._richardson import extrapolate_runs
 from lgsens.simulation._save import Output, Save
-from lgsens.simulation._settings import by_diffrax, check_integrator, check_sensitivity, interval
+from lgsens.simulation._settings import by_diffrax, check_integrator, check_sensitivity, interval, warn_of_far_times
 from lgsens.simulation._start import Begin, as_system, begin, check_state0
 from lgsens.simulation._to_accuracy import simulate_to
 from lgsens.simulation._trajectory import Saved, Trajectory
@@ -159,6 +159,7 @@ def simulate(
     if caution := integrator.scheme.caution(system):
         warnings.warn(caution, stacklevel=2)
     t0, t1 = interval(t0, t1)
+    warn_of_far_times(t0, t1, num_steps)
     check_state0(system, state0, t0)
     with tracing():
         system, t0, t1, state0 = alike((system, t0, t1, state0))
