@@ -225,7 +225,7 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
     return tuple(sorted(stacks, key=lambda stack: stack.ends.velocity))
 
 
-# Elements with closed-form tangents use them; for the others autodiff perturbs by retraction, R exp(θ̃).
+# Elements with closed-form tangents use them; for the others autodiff perturbs by R (I + θ̃).
 
 
 def constraint_jacobian(element: AbstractRows, a: Frame, b: Frame, t, *others: Frame):

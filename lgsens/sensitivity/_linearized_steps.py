@@ -3,8 +3,8 @@
 A step begins with what its grid makes of the state before (δ_n* from δ_n and p') and solves its linearized equations
 (`AbstractLinearizedStep`) for δ_{n+1}, with the loads E_p p' of the parameters; an empty one is δ_{n+1} = δ_n + b.
 Backwards it takes the cotangent c of δ_{n+1} to the multipliers μ of its rows, and to what it adds to the cotangents of
-δ_n and of p. Between equal steps δ_n* = δ_n; else y_n* is a function that JAX differentiates, with factors that are
-made once.
+δ_n and of p. Between equal steps δ_n* = δ_n; else y_n* is a function of y_n, p and the place that JAX differentiates by
+all of them at once, with factors that are made once.
 """
 
 from collections.abc import Callable

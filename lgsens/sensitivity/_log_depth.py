@@ -129,7 +129,6 @@ def adjoint_at_once(scheme: AbstractScheme, states: State, parameters: Parameter
     every = _Composed.of(scheme, states, parameters)
     loads, pull_back = every.equations.pull_back(every.steps)
     transposed, none = jnp.swapaxes(every.transitions, 1, 2), jax.tree.map(jnp.zeros_like, _row(c, 0))
-
     of_before = lambda c: every.backward(c, loads)[1].previous
 
     def solved(own: Variation) -> Variation:

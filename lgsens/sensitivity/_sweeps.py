@@ -16,8 +16,9 @@ c_n += c_{n+1}, are sums.
 
 Blocks. The states are known before the sensitivities are, so what a step needs of them (tangents, factors, pseudo-loads
 and their pull-back) does not wait for the step before it. It is evaluated for a block of steps at once, in the few
-large operations that one step would cost; what remains in the sweep is one solve and a few products. Where several
-sweeps are gone through at the same states, the steps may be linearized once for all of them (`linearized_steps`).
+large operations that one step would cost; what remains in the sweep is one solve and a few products, and the derivative
+of y_n* at the few steps that begin with another state than the last one ended with. Where several sweeps are gone
+through at the same states, the steps may be linearized once for all of them (`linearized_steps`).
 """
 
 from collections.abc import Callable
@@ -112,7 +113,7 @@ def adjoint_sweep(
     grid = parameters.grid
     equations, blocks, every, linearized = _Gone.of(scheme, states, parameters, linear)
 
-    _, unravel = ravel_pytree(parameters)
+    flat, unravel = ravel_pytree(parameters)
 
     def one(loads, carry, inputs):
         (c, bar), (linear, own) = carry, inputs
@@ -126,8 +127,9 @@ def adjoint_sweep(
         given, own = inputs
         steps = linearized(given)
         loads, pull_back = equations.pull_back(steps)
-        none = jnp.zeros_like(ravel_pytree(parameters)[0])
-        (c, begun), (mu, of_loads, of_begun) = scan(partial(one, loads), (c, none), (steps, own), reverse=True)
+        (c, begun), (mu, of_loads, of_begun) = scan(
+            partial(one, loads), (c, jnp.zeros_like(flat)), (steps, own), reverse=True
+        )
         if c_p is None:
             return (c, None), (mu, None)
         of_parameters, of_places = pull_back(of_loads)
