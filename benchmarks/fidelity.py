@@ -60,7 +60,8 @@ def study(name, car, options, repeats: int):
         rows = sorted((row for row in found.rows if row.unknowns < found.unknowns), key=lambda row: row.error)
         sets += [found.combined(rows[:n]).options for n in range(2, len(rows) + 1)]
         for row in [*best.values(), *chosen.values()]:
-            sets += [row.options] if set(row.options) not in map(set, sets) else []
+            if set(row.options) not in map(set, sets):
+                sets.append(row.options)
     programs = [found.runs.program(options) for options in sets]
     evaluated = [program.evaluate()[0] for program in programs]
     calls = {place: lambda program=program: program() for place, program in enumerate(programs)}  # which block

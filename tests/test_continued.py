@@ -90,6 +90,11 @@ def test_from_any_step_and_of_a_batch():
         several.continued(11)
 
 
+def test_a_step_that_is_not_there():
+    with pytest.raises(IndexError, match="from -41 to 40"):
+        half().continued(41)
+
+
 def test_derivatives_through_it_are_exact():
     """By a length, and by the time at which the size of the steps changes."""
 

@@ -178,7 +178,7 @@ class Fidelity:
             tolerance: as in `recommended`.
 
         All of them are compiled and run in turns: a scene of fewer unknowns may take longer, as a first rod brings a
-        kind of joint of its own. Raises `ValueError` as `verified`.
+        kind of joint of its own. Raises `ValueError` as `recommended` and `verified`.
         """
         rows = {row.options: row for row in self.rows}
         best = sorted(self.recommended(tolerance).options, key=lambda option: rows[(option,)].error)

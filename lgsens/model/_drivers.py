@@ -2,7 +2,6 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens._validate import axis_field, point_field
@@ -10,7 +9,7 @@ from lgsens.model._constraints import AbstractClosedFormConstraint, ConstraintSu
 from lgsens.model._elements import body_fixed
 from lgsens.model._frames import TURNING_A, TURNING_B, Frame, normals
 from lgsens.model._joints import AbstractJoint
-from lgsens.model._relative import ANGLE, DISPLACEMENT, frames_along, frames_at
+from lgsens.model._relative import ANGLE, DISPLACEMENT, but_for_turns, frames_along, frames_at
 from lgsens.model._signal_fields import prescribed_field
 from lgsens.model._signals import Prescribed, at_time, number_of, prepared
 
@@ -68,8 +67,7 @@ class Angle(AbstractClosedFormConstraint):
 
     def value(self, a, b, t):
         x, y = self._components(a, b)
-        off = jnp.arctan2(y, x) - at_time(self.prescribed, t)
-        return (off - 2.0 * jnp.pi * jnp.round(lax.stop_gradient(off) / (2.0 * jnp.pi)))[None]
+        return but_for_turns(jnp.arctan2(y, x) - at_time(self.prescribed, t))[None]
 
     def jacobian(self, a, b, t):
         return self._gradient(a, b).jacobian(a, b, t)

@@ -112,7 +112,6 @@ def adjoint_sweep(
     """
     grid = parameters.grid
     equations, blocks, every, linearized = _Gone.of(scheme, states, parameters, linear)
-
     flat, unravel = ravel_pytree(parameters)
 
     def one(loads, carry, inputs):

@@ -192,9 +192,8 @@ def _as_state(system: AbstractSystem, state0: Any) -> State:
     if wrong:
         raise ValueError(
             f"`state0` must be one state of this model; its shapes are others: {'; '.join(wrong)} (bodies, then states "
-            "of force elements). Take it from "
-            "`initial_state(model)` or `trajectory.state(i)` of the same model; for a batch of states jax.vmap(lambda "
-            "state0: simulate(model, state0=state0, …))(states)."
+            "of force elements). Take it from `initial_state(model)` or `trajectory.state(i)` of the same model; for a "
+            "batch of states jax.vmap(lambda state0: simulate(model, state0=state0, …))(states)."
         )
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, v.dtype), state0)
 

@@ -19,7 +19,7 @@ from lgsens.integrate import Stages, Start
 from lgsens.model import MultibodySystem, SE3System, measured, motion_at, scene_of
 from lgsens.sensitivity import Sound
 from lgsens.simulation._body_motion import BodyMotion, PointMotion
-from lgsens.simulation._continued import continued
+from lgsens.simulation._continued import start_in_any_steps
 from lgsens.simulation._joint_motion import JointMotion, joint_motions
 from lgsens.simulation._reached import Reached
 from lgsens.simulation._tables import to_csv, to_pandas, to_xarray
@@ -294,9 +294,11 @@ class Trajectory(AbstractRun):
 
     @_of_each
     def continued(self, index: int = -1) -> Start:
-        """What a run in steps of any size, and on grids that choose theirs, continues from: a `state0` of `simulate`,
-        `differentiate` and others, in which what belongs to a size is by itself. Raises as `state`."""
-        return continued(self.system, self.t, self.state(index), self.t[index])
+        """What a run in steps of any size continues from at step `index` (negative: from the end), by any integrator:
+        a `state0` of `simulate` with this time as t0, or of `differentiate`. What of v and a belongs to the size of a
+        step is by itself there (Brüls & Arnold 2008, doi:10.1115/1.2960475). Raises as `state`.
+        """
+        return start_in_any_steps(self.system, self.t, self.state(index), self.t[index])
 
     def instant(self, index: int) -> "Instant":
         """Step `index` (negative: from the end) as the integrand of a `Criterion` sees it. Raises as `state`."""

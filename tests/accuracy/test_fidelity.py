@@ -126,6 +126,12 @@ def test_rods_of_the_quarter_car_are_predicted():
     np.testing.assert_allclose(best.gradient, verified.gradient, rtol=0.1)
 
 
+def test_bad_tolerance(found):
+    for of in (found.recommended, found.fastest):
+        with pytest.raises(ValueError, match="`tolerance` must be positive"):
+            of(0.0)
+
+
 def test_bad_arguments():
     with pytest.raises(ValueError, match="`options` must be reductions"):
         fidelity(CRITERION, build, P, ["damper"], t1=T1, num_steps=10)
