@@ -90,16 +90,6 @@ def _called(function: Callable, *arguments):
     return function(*arguments)
 
 
-class _Given(NamedTuple):
-    """A builder with some of its arguments; equal, for one compilation, where all of these are."""
-
-    build: Build
-    options: tuple[tuple[str, Any], ...]
-
-    def __call__(self, p):
-        return self.build(p, **dict(self.options))
-
-
 class _OfTrajectory(NamedTuple):
     """A function of a trajectory as one of parameters, too."""
 
@@ -114,13 +104,14 @@ class Program:
 
     def __init__(self, study: Study, setting: Setting):
         self.study, self.setting = study, setting
+        self._integrator = setting.placed(study.fn, study.build, study.p, t0=study.t0, t1=study.t1)
         options = {"sensitivity": DirectDifferentiation(), "state0": None} | dict(setting.options)
         self._method, state0 = options.pop("sensitivity"), options.pop("state0")
         if options.keys() - {"throw"}:
             raise ValueError(f"Setting: `options` may be `sensitivity` and `state0`, got {sorted(options)}.")
         check_sensitivity(self._method)
         self._start = None if state0 is None else lambda p: state0
-        self._build = _Given(study.build, setting.model)
+        self._build = setting.version(study.build)
         self._fn = study.fn if isinstance(study.fn, Criterion) else _OfTrajectory(study.fn)
         self.temporary_bytes = None
         seconds = []
@@ -141,7 +132,7 @@ class Program:
 
     def __call__(self, call: Callable = _called) -> tuple[Any, Any, list[Trajectory]]:
         """Ψ, dΨ/dp, and the motions behind them."""
-        study, integrator, motions = self.study, self.setting.integrator, []
+        study, integrator, motions = self.study, self._integrator, []
 
         def run(num_steps: int):
             check_integrator(integrator, num_steps)

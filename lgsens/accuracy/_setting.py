@@ -3,13 +3,13 @@
 import dataclasses
 from collections.abc import Callable, Mapping
 from functools import reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from lgsens._validate import as_count
-from lgsens.criteria import Criterion
+from lgsens.criteria import Criterion, steps_for
 from lgsens.dynamics import RESULTS
 from lgsens.integrate import GeneralizedAlpha, IndexReducedODE
 from lgsens.simulation import Trajectory, richardson, simulate
@@ -28,6 +28,16 @@ def _items(options: Any) -> tuple[tuple[str, Any], ...]:
     return tuple(sorted(options.items()))
 
 
+class _Given(NamedTuple):
+    """A builder with some of its arguments; equal, for one compilation, where all of these are."""
+
+    build: Build
+    options: tuple[tuple[str, Any], ...]
+
+    def __call__(self, p):
+        return self.build(p, **dict(self.options))
+
+
 class Setting(eqx.Module):
     """How a simulation is done: steps, integrator, and the version of the model.
 
@@ -38,17 +48,21 @@ class Setting(eqx.Module):
             `richardson`; a number: with so many runs, of 1, 2, 4, … times as many steps. For schemes of second order; a
             criterion with a kink between two steps loses less than by `integrator=Richardson(…)`, which extrapolates
             the states.
+        pilot: place the steps where they serve the criterion and its gradient, by `steps_for` with a pilot run of so
+            many equal steps at the parameters; None: as `integrator` has them. Of a `Criterion`, not extrapolated.
         model: keyword arguments for the builder of the model, `{"links": "rods"}`: its fidelity, a linear solver.
         options: further keyword arguments for `simulate`.
         name: how tables call it; else what differs from the defaults.
         family: settings of one family are one curve in the plot; else the integrator and the version of the model.
 
-    All static and hashable. Raises `ValueError` for a number of steps that is none, and for one run to extrapolate.
+    All static and hashable. Raises `ValueError` for a number of steps that is none, for one run to extrapolate, and for
+    both of `pilot` and `extrapolate`.
     """
 
     num_steps: int = eqx.field(static=True)
     integrator: Any = eqx.field(static=True, default=GeneralizedAlpha())
     extrapolate: bool | int = eqx.field(static=True, default=False, kw_only=True)
+    pilot: int | None = eqx.field(static=True, default=None, kw_only=True)
     model: Any = eqx.field(static=True, default=(), kw_only=True, converter=_items)
     options: Any = eqx.field(static=True, default=(), kw_only=True, converter=_items)
     name: str = eqx.field(static=True, default="", kw_only=True)
@@ -61,6 +75,13 @@ class Setting(eqx.Module):
                 "Setting: `extrapolate` must be True, False, or a number of runs of at least 2, "
                 f"got {self.extrapolate!r}."
             )
+        if self.pilot is not None:
+            as_count(self.pilot, "pilot", " (it is static)")
+            if self.runs > 1:
+                raise ValueError(
+                    "Setting: `pilot` places so many steps as there are, whose errors do not cancel in those of twice "
+                    "as many; give `extrapolate` or `pilot`."
+                )
 
     @property
     def runs(self) -> int:
@@ -79,13 +100,40 @@ class Setting(eqx.Module):
 
     def _described(self, integrator: str) -> str:
         options = [f"{name}={value!r}" for name, value in (*self.model, *self.options)]
-        extrapolated = {1: "", 2: "extrapolated "}.get(self.runs, f"extrapolated ({self.runs} runs) ")
-        return ", ".join([extrapolated + integrator, *options])
+        how = {1: "", 2: "extrapolated "}.get(self.runs, f"extrapolated ({self.runs} runs) ")
+        return ", ".join([("placed " if self.pilot else how) + integrator, *options])
+
+    def version(self, build: Build) -> Callable[[Any], Any]:
+        """p ↦ model, with the options `model`."""
+        return _Given(build, self.model)
+
+    def placed(self, fn: Function, build: Build, p: Any, *, t0=0.0, t1) -> Any:
+        """The integrator, with the steps that `pilot` asks for, placed at the parameters p; arguments as `evaluate`."""
+        if self.pilot is None:
+            return self.integrator
+        state0 = dict(self.options).get("state0")
+        steps = steps_for(
+            fn,
+            self.version(build),
+            p,
+            t0=t0,
+            t1=t1,
+            pilot=self.pilot,
+            num_steps=self.num_steps,
+            integrator=self.integrator,
+            state0=None if state0 is None else lambda _: state0,
+        )
+        return steps.integrator
 
     def trajectory(self, build: Build, p: Any, *, t0=0.0, t1, throw: bool = True) -> Trajectory:
-        """The motion of build(p), with `num_steps` steps; arguments as in `evaluate`."""
-        options = dict(self.options) | {"integrator": self.integrator, "throw": throw}
-        return simulate(build(p, **dict(self.model)), t0=t0, t1=t1, num_steps=self.num_steps, **options)
+        """The motion of build(p), with `num_steps` steps that no criterion places; arguments as in `evaluate`."""
+        if self.pilot is not None:
+            raise ValueError("Setting: steps of a `pilot` are placed for a criterion; `value_and_trajectory` has one.")
+        return self._motion(self.integrator, self.num_steps, build, p, t0, t1, throw)
+
+    def _motion(self, integrator: Any, num_steps: int, build: Build, p: Any, t0, t1, throw: bool) -> Trajectory:
+        options = dict(self.options) | {"integrator": integrator, "throw": throw}
+        return simulate(self.version(build)(p), t0=t0, t1=t1, num_steps=num_steps, **options)
 
     def evaluate(self, fn: Function, build: Build, p: Any, *, t0=0.0, t1, throw: bool = True) -> Any:
         """Ψ of the parameters p with this setting, to be differentiated as usual.
@@ -101,11 +149,10 @@ class Setting(eqx.Module):
 
     def value_and_trajectory(self, fn: Function, build: Build, p, *, t0=0.0, t1, throw: bool = True):
         """`evaluate`, and the motion behind it: of several runs the finest one, with the result of all."""
-        found = []
+        found, integrator = [], self.placed(fn, build, p, t0=t0, t1=t1)
 
         def value(num_steps: int):
-            setting = dataclasses.replace(self, num_steps=num_steps)
-            found.append(setting.trajectory(build, p, t0=t0, t1=t1, throw=throw))
+            found.append(self._motion(integrator, num_steps, build, p, t0, t1, throw))
             return fn(found[-1], p) if isinstance(fn, Criterion) else fn(found[-1])
 
         if self.runs == 1:
@@ -134,7 +181,7 @@ def grid(num_steps: Any, *integrators: Any, **options: Any) -> tuple[Setting, ..
     Arguments:
         num_steps: numbers of steps, a sequence of ints.
         integrators: values of `integrator=` of `simulate`; none: `GeneralizedAlpha()`.
-        options: `extrapolate`, `model`, `options`, `family` of all of them, as in `Setting`.
+        options: `extrapolate`, `pilot`, `model`, `options`, `family` of all of them, as in `Setting`.
     """
     integrators = integrators or (GeneralizedAlpha(),)
     return tuple(Setting(n, integrator, **options) for integrator in integrators for n in num_steps)

@@ -82,6 +82,7 @@ def quarter_car(bushings: Sequence[str] = ()) -> Scene:
     if bushings:
         settings = (
             *grid((28, 76, 200), loose),
+            *grid((52, 76), loose, pilot=80),
             *grid((400, 1600, 6400), alpha),
             *extrapolated,
             *grid((200, 800), alpha, extrapolate=True),
@@ -91,6 +92,7 @@ def quarter_car(bushings: Sequence[str] = ()) -> Scene:
     else:  # three pairs of scene and scheme, in at most 256 steps: three programs forward and three backward
         settings = (
             *grid((28, 52, 76), loose),
+            *grid((52, 76), loose, pilot=80),
             *grid((200,), alpha),
             *grid((28, 52, 76), loose, model={"links": "rods"}),
             *extrapolated,

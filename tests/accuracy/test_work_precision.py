@@ -4,6 +4,8 @@ import dataclasses
 import json
 
 import diffrax
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from oscillator import CRITERION, T1, P, build, exact_with_gradient
@@ -113,6 +115,27 @@ def test_the_recommended_setting_is_used_as_it_is(table):
     assert setting.trajectory(build, P, t1=T1).t.shape == (setting.num_steps + 1,)
 
 
+def test_steps_placed_for_a_criterion():
+    """Of one that looks at the begin only: as many steps, those of `steps_for`, leave less than half of the errors."""
+    early = lg.Criterion(integrand=lambda s, p: jnp.exp(-((s.t / 0.15) ** 2)) * (s.body("mass").position[2] - 1.0) ** 2)
+    settings = (Setting(40), Setting(40, pilot=40))
+    fine = accuracy.grid((2000,))[0]
+    value, gradient = jax.value_and_grad(lambda p: fine.evaluate(early, build, p, t1=T1))(jax.tree.map(jnp.asarray, P))
+    # 40 steps have 1e-2; the errors of 2000 are 2500 times smaller
+    exact = accuracy.Reference(float(value), np.array([gradient["k"] * P["k"], gradient["m"] * P["m"]]), 1e-5, 1e-5)
+    equal, placed = work_precision(early, build, P, settings, t1=T1, reference=exact, progress=False)
+    assert equal.error > 1e-3 and placed.value_error < 0.5 * equal.value_error
+    assert placed.gradient_error < 0.5 * equal.gradient_error
+    assert (placed.setting.label, placed.setting.curve) == ("placed GeneralizedAlpha()", "placed GeneralizedAlpha")
+    steps = lg.steps_for(early, build, P, t1=T1, pilot=40, num_steps=40)
+    own = lg.differentiate(early, build, P, t1=T1, num_steps=40, integrator=steps.integrator)
+    assert placed.value == pytest.approx(float(own.value), rel=1e-12)  # the same program but for round-off
+    used = jax.jit(lambda p: settings[1].evaluate(early, build, p, t1=T1))(jax.tree.map(jnp.asarray, P))
+    assert float(used) == pytest.approx(placed.value, rel=1e-12)
+    with pytest.raises(ValueError, match="placed for a criterion"):
+        settings[1].trajectory(build, P, t1=T1)
+
+
 def test_text_and_json(table, tmp_path):
     text = str(table)
     assert "impatient" in text and "failed: Newton" in text and "reference: Ψ" in text
@@ -196,5 +219,9 @@ def test_settings():
         Setting(0)
     with pytest.raises(ValueError, match="`extrapolate` must be True, False, or a number of runs of at least 2, got 1"):
         Setting(5, extrapolate=1)
+    with pytest.raises(ValueError, match="give `extrapolate` or `pilot`"):
+        Setting(5, extrapolate=True, pilot=20)
+    with pytest.raises(ValueError, match="`pilot` must be at least 1"):
+        Setting(5, pilot=0)
     with pytest.raises(ValueError, match="options must be a dict"):
         Setting(5, model=3)
