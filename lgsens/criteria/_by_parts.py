@@ -63,7 +63,8 @@ def reverse_by_parts(
     steps = None if exact else given[0]
     (found, details), of_scene = call(_motion, system, state0, t0, t1, steps, given[1], method, exact)
     count = None if exact else task.num_steps
-    value, rows, result, note = call(_values, task.criteria, names, found, system, details["jacobian"], p, count)
+    moves = given[1].moves(system)
+    value, rows, result, note = call(_values, task.criteria, names, found, moves, system, details["jacobian"], p, count)
     gradient = call(_pulled_to_p, of_p, call(_pulled_to_scene, of_scene, rows), rows)
     parts = Parts(value, gradient, result, details, system.constraint_names, note)
     return parts, dataclasses.replace(found, system=system)
@@ -85,30 +86,40 @@ def _motion(system, state0, t0, t1, steps: Steps | None, integrator, method, exa
     def of(system, state0):
         begun = begin(integrator.scheme, system, t0, state0)
         found, details = run(system, begun, t0, t1, exact or steps or 0, integrator, method)
-        return (found.states, found.stages, found.error), (dataclasses.replace(found, system=None), details)
+        t = found.t if integrator.moves(system) else None  # else it is constant
+        return _Motion(found.states, found.stages, found.error, t), (dataclasses.replace(found, system=None), details)
 
     _, pull_back, found = jax.vjp(of, system, state0, has_aux=True)
     return found, Packed.of(pull_back)
 
 
+class _Motion(NamedTuple):
+    """What of a trajectory depends on the scene."""
+
+    states: State
+    stages: Any
+    error: Any
+    t: Any  # None: it does not
+
+
 class _Rows(NamedTuple):
     """dΨ by what criteria depend on, one row for each criterion."""
 
-    motion: tuple[State, Any, Any]
+    motion: _Motion
     system: Any
     p: Any
 
 
 @eqx.filter_jit
-def _values(criteria, names, found: Trajectory, system, jacobian, p, count: int | None):
+def _values(criteria, names, found: Trajectory, moves: bool, system, jacobian, p, count: int | None):
     def of(motion, system, p):
-        states, stages, error = motion
-        trajectory = dataclasses.replace(found, states=states, stages=stages, error=error, system=system)
+        own = {name: part for name, part in motion._asdict().items() if part is not None}
+        trajectory = dataclasses.replace(found, system=system, **own)
         trajectory = trajectory if count is None else cut(trajectory, count)
         values = jnp.stack([criterion(trajectory, p) for criterion in criteria])
         return values, values
 
-    at = (found.states, found.stages, found.error), system, p
+    at = _Motion(found.states, found.stages, found.error, found.t if moves else None), system, p
     rows, values = jax.jacrev(of, argnums=(0, 1, 2), has_aux=True)(*at)
     uses = [Use.of(criterion, system, found.t[0], p) for criterion in criteria if names]
     return tuple(values), _Rows(*rows), *unique(found.result, system, jacobian, names, uses)

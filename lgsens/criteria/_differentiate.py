@@ -261,7 +261,8 @@ def _on_the_fly(task: _Task, p) -> _Found:
         state0 = begun.start.at(system, laid.grid.first_size)
         return (state0, Parameters(system, laid.grid)), (begun, laid._replace(found=None, stats=None))
 
-    found = direct_on_the_fly(scheme, start, stacked(task.criteria, task.unravel), p)
+    constant = not integrator.moves(task.system(p))
+    found = direct_on_the_fly(scheme, start, stacked(task.criteria, task.unravel), p, constant)
     begun, laid = found.begun
     t = laid.grid.times()
     ended = outcome(scheme, begun, found.stats, Turns.between(t, found.turning), t, laid)

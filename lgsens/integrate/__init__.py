@@ -35,7 +35,13 @@ from lgsens.integrate._march import (
     march_on as march_on,
     states_of as states_of,
 )
-from lgsens.integrate._pieces import MANY as MANY, PieceEnds as PieceEnds, piece_lengths as piece_lengths
+from lgsens.integrate._pieces import (
+    MANY as MANY,
+    PieceEnds as PieceEnds,
+    moved as moved,
+    piece_ends as piece_ends,
+    piece_lengths as piece_lengths,
+)
 from lgsens.integrate._radau import RadauIIA as RadauIIA
 from lgsens.integrate._scheme import (
     AbstractScheme as AbstractScheme,

@@ -13,7 +13,7 @@ N − 2 K others are theirs in proportion to length, by rounding what adds up: w
 So that 2n steps are the halves of n, this is done for N = n/2^r, as small as it may be and still 48 or more and 2 K or
 more; each of these is divided into 2^r. With fewer than 2 K steps, all are equal.
 
-Where steps end is constant for derivatives, as with `AdaptiveSteps`: criteria do not know the derivative of a grid.
+Numbers of steps are constant for derivatives; where steps end moves with the breaks (`_pieces.moved`).
 """
 
 import equinox as eqx
@@ -21,11 +21,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lgsens.dynamics import breaks_of
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
 from lgsens.integrate._given import AbstractUnevenSteps, GivenSteps
 from lgsens.integrate._grid import Steps
 from lgsens.integrate._integrator import Laid
-from lgsens.integrate._pieces import piece_lengths, pieces_within
+from lgsens.integrate._pieces import moved, piece_ends, piece_lengths, pieces_within
 from lgsens.integrate._scheme import AbstractScheme, scheme_of
 from lgsens.integrate._uneven_grid import UnevenGrid
 
@@ -41,18 +42,19 @@ class AlignedSteps(AbstractUnevenSteps):
     (`AbstractSignal.breaks`): both ends of a `BumpRoad` and of a `Ramp`, the samples of a `SampledRoad` and of
     `Sampled`. Where derivatives jump, what is computed in so many steps has the order of the scheme, and can be
     extrapolated: `Richardson(AlignedSteps())`. Where the signal itself jumps, it is of first order, as in any steps,
-    and so are derivatives by the times of samples at which a slope jumps. Breaks at times that depend on the motion (a
-    contact that opens) are not known.
+    and so is an integral of accelerations or forces over a time at which these jump, with its derivatives. Breaks at
+    times that depend on the motion (a contact that opens) are not known.
 
     Arguments:
         integrator: the scheme, `GeneralizedAlpha` or another one.
 
     `num_steps` steps are shared among the pieces between breaks in proportion to their lengths, and each piece has two
     at least. Where there are not so many, all steps are equal, and so they are where nothing breaks. Twice as many
-    steps are the halves of these, from 48 steps on. Under `vmap` each design has its own. The derivative is that on the
-    grid of these numbers, exactly. The times of breaks move the grid, and by whole steps from piece to piece, so a
-    search over them goes better on a grid that stays, `GivenSteps.of(trajectory)`; on that finite differences agree,
-    but for those by the times of breaks themselves: a step that ends at one sees one side of it.
+    steps are the halves of these, from 48 steps on. Under `vmap` each design has its own. The derivative is that of the
+    numerical solution at these numbers of steps, exactly: the ends of pieces move with the times of breaks, t0 and t1,
+    and steps with them, the times of a `Trajectory` too. But numbers of steps change by whole ones from piece to piece,
+    and what is computed jumps there by as much as it is wrong, so a search over times of breaks goes better in numbers
+    that stay: `GivenSteps.of(trajectory)`.
 
     Raises `ValueError` for what is no scheme in steps. Source: Hairer, Nørsett & Wanner, Solving Ordinary Differential
     Equations I (2008), §II.6 (discontinuities).
@@ -66,13 +68,16 @@ class AlignedSteps(AbstractUnevenSteps):
     def lay(self, system, start, t0, t1, num_steps):
         counted = isinstance(num_steps, Steps)
         steps, room = (num_steps.count, num_steps.room) if counted else (jnp.asarray(num_steps, t0.dtype), num_steps)
-        lengths, steps = jax.lax.stop_gradient((piece_lengths(system, t0, t1), steps))
-        fractions = aligned_sizes(lengths / jnp.sum(lengths), steps, room)
-        count = steps if counted else None
-        restarts = self.integrator.restarts(system)
-        return Laid(
-            UnevenGrid.first(t0, (t1 - t0) * fractions, room=counted, count=count, fixed=True, restarts=restarts)
+        steps, lengths, ends, total = jax.lax.stop_gradient(
+            (steps, piece_lengths(system, t0, t1), piece_ends(system, t0, t1), t1 - t0)
         )
+        sizes = total * aligned_sizes(lengths / jnp.sum(lengths), steps, room)
+        sizes, begins = moved(sizes, ends, piece_ends(system, t0, t1))
+        how = {"room": counted, "count": steps if counted else None, "fixed": True, "moving": begins}
+        return Laid(UnevenGrid.first(t0, sizes, restarts=self.integrator.restarts(system), **how))
+
+    def moves(self, system):
+        return breaks_of(system).size > 0
 
     def frozen(self, trajectory):
         return GivenSteps.of(trajectory, self.integrator)

@@ -52,6 +52,10 @@ class AbstractIntegrator(eqx.Module):
         """The grid of a run from t0 to t1: here equal steps. `num_steps`: an int, or `Steps`."""
         return Laid(EqualGrid.between(t0, t1, num_steps, self.scheme.restarts(system)))
 
+    def moves(self, system: AbstractSystem) -> bool:
+        """Whether where steps end depends on numbers of the system, for derivatives too."""
+        return False
+
     def as_data(self, dtype) -> "AbstractIntegrator":
         """With its numbers as arrays, so that one program serves all of them; here as it is."""
         return self

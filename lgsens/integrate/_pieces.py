@@ -1,4 +1,15 @@
-"""The pieces of an interval between the times at which equations of motion break."""
+"""The pieces of an interval between the times at which equations of motion break.
+
+Steps that end at breaks move with them. Let breaks at times s_j − t0 have been where the sizes h_n of steps were found,
+and be at e_j now, 0 and t1 − t0 among both, at the ends of steps m_j. Then the steps between two of them are
+
+    h_n (e_{j+1} − e_j)/(s_{j+1} − s_j),        m_j ≤ n < m_{j+1},
+
+which is h_n where nothing has moved, but has the derivative by times of breaks, t0 and t1. Without it a criterion whose
+integrand jumps at a break, as accelerations and forces of drivers do, would lack the share [F] ė_j of its derivative in
+any number of steps, and others be right to first order only. Ratios of sizes change in the first step of a piece
+alone. Several breaks at one end of a step move it by half of the first and half of the last.
+"""
 
 from typing import Any, NamedTuple
 
@@ -10,14 +21,51 @@ from lgsens.dynamics import breaks_of
 
 MANY = 256  # pieces: more are the samples of a table, which are many for steps to end at each
 _SHORTEST = 1e-6  # of the interval: a break that is no farther from another one is that
+_MET = 0.1  # of a step: so near to its end a break is there
 _SEEN = 3.0  # steps in a piece, at whose ends something of what happens there is seen
 
 
+def piece_ends(scene: Any, t0, t1) -> Float[Array, " k+1"]:
+    """The ends of the pieces into which the breaks of a scene divide the time from t0 to t1, as times from t0 on."""
+    breaks, total = breaks_of(scene).astype(t0.dtype) - t0, t1 - t0
+    before, behind = breaks <= 0.0, breaks >= total
+    return jnp.append(jnp.sort(jnp.where(before, 0.0, jnp.where(behind, total, breaks))), total)
+
+
 def piece_lengths(scene: Any, t0, t1) -> Float[Array, " k+1"]:
-    """The lengths of the pieces into which the breaks of a scene divide the time from t0 to t1; some are 0."""
-    ends = jnp.concatenate([jnp.sort(jnp.clip(breaks_of(scene).astype(t0.dtype), t0, t1)), t1[None]])
-    lengths = jnp.diff(ends, prepend=t0[None])
+    """The lengths of these pieces; some are 0."""
+    lengths = jnp.diff(piece_ends(scene, t0, t1), prepend=0.0)
     return jnp.where(lengths > _SHORTEST * (t1 - t0), lengths, 0.0)
+
+
+def moved(
+    sizes: Float[Array, " n"], known: Float[Array, " k"], ends: Float[Array, " k"]
+) -> tuple[Float[Array, " n"], Float[Array, " n"] | None]:
+    """Steps that were laid where pieces ended at `known`, for pieces that end at `ends`; and 1 for each step that is
+    the first of a piece, else 0, None: all are of one piece."""
+    if known.size == 1:
+        return sizes * (ends[0] / known[0]), None
+    nodes = jnp.concatenate([jnp.zeros_like(sizes[:1]), jnp.cumsum(sizes)])
+    after = jnp.clip(jnp.searchsorted(nodes, known), 1, sizes.size)
+    to_after, to_before = nodes[after] - known, known - nodes[after - 1]
+    at = jnp.where(to_after <= to_before, after, after - 1)
+    met = jnp.minimum(jnp.abs(to_after), jnp.abs(to_before)) <= _MET * (to_after + to_before)
+    # A break at which no step ends is none: like the last one before it.
+    last = lax.cummax(jnp.where(met.at[-1].set(True), jnp.arange(at.size), -1))
+    at = jnp.where(last < 0, 0, at[last])
+    first, final = jnp.searchsorted(at, at), jnp.searchsorted(at, at, side="right") - 1
+
+    def anchors(ends):
+        """With the begin; several at one end of a step are one."""
+        own = jnp.where(last < 0, 0.0, ends[last])
+        own = jnp.where(at == at[-1], ends[-1], jnp.where(at == 0, 0.0, 0.5 * (own[first] + own[final])))
+        return jnp.concatenate([jnp.zeros_like(own[:1]), own])
+
+    n = jnp.arange(sizes.size, dtype=at.dtype)
+    through = jnp.minimum(jnp.searchsorted(at, n, side="right"), at.size - 1)  # the piece of each step
+    now, then = (of[through + 1] - of[through] for of in map(anchors, (ends, known)))
+    begins = (n > 0) & (n < at[-1]) & (jnp.searchsorted(at, n) != jnp.searchsorted(at, n, side="right"))
+    return sizes * jnp.where(then > 0.0, now / jnp.where(then > 0.0, then, 1.0), 1.0), begins.astype(sizes.dtype)
 
 
 def pieces_within(lengths: Float[Array, " k"]) -> Float[Array, " k"]:

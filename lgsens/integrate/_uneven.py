@@ -41,7 +41,7 @@ from jaxtyping import Array, Bool, Float, Int
 from lgsens._brief import brief
 from lgsens._validate import require_setting
 from lgsens._xla import alike, in_any_lane, scan, while_loop
-from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk, unsteady_rate
+from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk, breaks_of, unsteady_rate
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
 from lgsens.integrate._given import AbstractUnevenSteps, GivenSteps
 from lgsens.integrate._grid import Start, renewed
@@ -49,7 +49,7 @@ from lgsens.integrate._integrator import Laid
 from lgsens.integrate._linearized import Node
 from lgsens.integrate._loops import with_first
 from lgsens.integrate._march import Progress, Walk, selected
-from lgsens.integrate._pieces import PieceEnds
+from lgsens.integrate._pieces import PieceEnds, moved, piece_ends
 from lgsens.integrate._scheme import AbstractScheme, Stats, scheme_of
 from lgsens.integrate._uneven_grid import UnevenGrid, without_round_off
 
@@ -86,9 +86,9 @@ class AdaptiveSteps(AbstractUnevenSteps):
     repeat t1 and the state there, so that integrals and `state(-1)` are right, and its `stats` are `ControlledStats`.
     They take next to no time, but memory.
 
-    The derivative is that of the numerical solution on the grid found, exactly, in both modes; under `vmap` each lane
-    has its own. The sizes themselves change a little with the parameters, which the derivative leaves out: finite
-    differences agree with it on the same grid (`GivenSteps.of`). **Sensitivities**: their errors are not controlled,
+    The derivative is that of the numerical solution on the grid found, exactly, in both modes, breaks moving the steps
+    that end at them; under `vmap` each lane has its own. The sizes themselves change a little with the parameters,
+    which the derivative leaves out: finite differences agree with it on the same grid (`GivenSteps.of`). **Sensitivities**: their errors are not controlled,
     but the scheme is stable at any step size for the motion and so for its linearization: across a bump gradients by
     hardpoints converge as Ψ does (`benchmarks/variable_steps.py`). The criterion's trapezoidal rule sees the grid too.
     **Multipliers**, and with them forces in joints and drivers, converge as the motion does.
@@ -110,15 +110,18 @@ class AdaptiveSteps(AbstractUnevenSteps):
         require_setting(self, "longest", valid, "in (0, 1]", "; 0.02 is the default")
 
     def lay(self, system, start, t0, t1, num_steps):
-        mean = (t1 - t0) / num_steps
-        # What error control decides has no derivative: its sizes, as parts of the interval, are constants of the run.
-        frozen = lax.stop_gradient((system, start, t0, mean))
+        ends = piece_ends(system, t0, t1)
+        # What error control decides has no derivative: its sizes, as parts of their pieces, are constants of the run.
+        frozen = lax.stop_gradient((system, start, t0, (t1 - t0) / num_steps))
         found = lax.stop_gradient(_controlled_steps(self, num_steps, *frozen))
         sizes, states, stats, reached = found
-        grid = UnevenGrid.first(
-            t0, sizes / frozen[-1] * mean, room=True, fixed=True, restarts=self.integrator.restarts(system)
-        )
+        sizes, begins = moved(sizes, lax.stop_gradient(ends), ends)
+        restarts = self.integrator.restarts(system)
+        grid = UnevenGrid.first(t0, sizes, room=True, fixed=True, restarts=restarts, moving=begins)
         return Laid(grid, (states, Stats(*stats[: len(Stats._fields)])), stats, reached)
+
+    def moves(self, system):
+        return breaks_of(system).size > 0
 
     def frozen(self, trajectory):
         return GivenSteps.of(trajectory, self.integrator)

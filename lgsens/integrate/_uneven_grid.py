@@ -24,6 +24,7 @@ class Place(NamedTuple):
     size: Float[Array, ""]  # as given
     h: Float[Array, ""]  # that before, where it is 0
     ratio: Float[Array, ""]
+    moving: Float[Array, ""] | None = None
 
 
 def without_round_off(ratio):
@@ -53,13 +54,18 @@ class UnevenGrid(AbstractGrid):
     count: Float[Array, ""] | None = None  # of the steps that are not empty, where it is known
     fixed: bool = eqx.field(static=True, default=False)
     restarts: Float[Array, " k"] | None = None
+    moving: Float[Array, " n"] | None = (
+        None  # 1 for steps whose ratio varies though it is `fixed`, else 0; None: of all
+    )
     with_empty: ClassVar[bool] = True
     num_steps: ClassVar[Any] = property(lambda self: self.h.shape[-1])  # no argument, where the base has a field
 
     @classmethod
-    def first(cls, t0, h, *, room: bool = False, count=None, fixed: bool = False, restarts=None) -> "UnevenGrid":
+    def first(
+        cls, t0, h, *, room: bool = False, count=None, fixed: bool = False, restarts=None, moving=None
+    ) -> "UnevenGrid":
         """From a state at t0 that belongs to the first step."""
-        return cls(t0=t0, h=h, before=h[0], room=room, count=count, fixed=fixed, restarts=restarts)
+        return cls(t0=t0, h=h, before=h[0], room=room, count=count, fixed=fixed, restarts=restarts, moving=moving)
 
     @property
     def resizes(self):
@@ -87,8 +93,10 @@ class UnevenGrid(AbstractGrid):
         last = jax.lax.cummax(jnp.where(h != 0.0, jnp.arange(1, h.shape[0] + 1), 0))
         size = jnp.concatenate([self.before[None], h])[last]
         ratio = without_round_off(size / jnp.concatenate([self.before[None], size[:-1]]))
-        ratio = jax.lax.stop_gradient(ratio) if self.fixed else ratio
-        return Place(self.t0 + jnp.cumsum(h) - h, h, size, ratio)
+        if self.fixed:
+            constant = jax.lax.stop_gradient(ratio)
+            ratio = constant if self.moving is None else jnp.where(self.moving > 0.0, ratio, constant)
+        return Place(self.t0 + jnp.cumsum(h) - h, h, size, ratio, self.moving)
 
     def node(self, place):
         return Node(place.begin, place.begin + place.size, place.h)
@@ -99,7 +107,8 @@ class UnevenGrid(AbstractGrid):
         return _begun_in_turn(scheme, system, self, place, state)
 
     def changes(self, place):
-        return (jax.lax.stop_gradient(place.ratio) != 1.0) | self.renews(place)
+        changes = (jax.lax.stop_gradient(place.ratio) != 1.0) | self.renews(place)
+        return changes if place.moving is None else changes | (jax.lax.stop_gradient(place.moving) > 0.0)
 
     def ratio(self, place):
         return place.ratio
@@ -109,12 +118,18 @@ class UnevenGrid(AbstractGrid):
 
     def halved(self):
         count = None if self.count is None else 2.0 * self.count
-        h = jnp.repeat(self.h / 2.0, 2)
-        return dataclasses.replace(self, h=h, before=self.before / 2.0, count=count)
+        h, moving = jnp.repeat(self.h / 2.0, 2), self.moving
+        moving = None if moving is None else jnp.stack([moving, jnp.zeros_like(moving)], axis=1).ravel()
+        return dataclasses.replace(self, h=h, before=self.before / 2.0, count=count, moving=moving)
 
     def segments(self, count, length):
-        h = jnp.concatenate([self.h, jnp.zeros(count * length - self.num_steps, self.h.dtype)]).reshape(count, length)
+        filling = jnp.zeros(count * length - self.num_steps, self.h.dtype)
+        h, moving = (
+            None if steps is None else jnp.concatenate([steps, filling]).reshape(count, length)
+            for steps in (self.h, self.moving)
+        )
         sizes = jnp.concatenate([self.before[None], self.places().h])
         begins = length * np.arange(count)
         restarts = for_each(count, self.restarts)
-        return UnevenGrid(t0=self.times()[begins], h=h, before=sizes[begins], fixed=self.fixed, restarts=restarts)
+        how = {"fixed": self.fixed, "restarts": restarts, "moving": moving}
+        return UnevenGrid(t0=self.times()[begins], h=h, before=sizes[begins], **how)

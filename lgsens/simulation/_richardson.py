@@ -82,6 +82,9 @@ class Richardson(AbstractIntegrator):
     def lay(self, system, start, t0, t1, num_steps):
         return self.integrator.lay(system, start, t0, t1, num_steps)
 
+    def moves(self, system):
+        return self.integrator.moves(system)
+
     @property
     def extrapolated(self):
         return True
