@@ -203,6 +203,15 @@ def test_trajectories_say_whether_they_succeeded():
     assert found.values.states.v.shape == (4, 4, 2)
 
 
+@pytest.mark.parametrize("save", [None, lambda s: s.body("top").position[2]], ids=["trajectory", "saved"])
+def test_what_was_not_looked_at_in_a_run_is_no_failure(save):
+    """Modified Newton makes no matrix in most steps, and knows no margin there."""
+    run = lambda angle: lg.simulate(spinning_top(angle), t1=0.02, num_steps=10, save=save)
+    found = lg.sweep(run, jnp.asarray([0.5, jnp.nan]), progress=False)
+    np.testing.assert_array_equal(found.ok, [True, False])
+    assert not np.isfinite(found.values.stats.margin[0]).all()
+
+
 @pytest.mark.slow
 def test_gradients_and_models():
     """A stack of models as designs; the gradient is a stack of models. A list of models is the same."""
@@ -314,6 +323,8 @@ def test_other_bad_arguments():
         lg.sweep(jnp.sin, np.ones(3), batch_size=0)
     with pytest.raises(ValueError, match=says("`fn` must return at least one array")):
         lg.sweep(lambda x: None, np.ones(3))
+    with pytest.raises(ValueError, match="`devices` is empty"):
+        lg.sweep(jnp.sin, np.ones(3), devices=[])
 
 
 @pytest.mark.parametrize("progress", [True, False])

@@ -4,6 +4,7 @@ Every device works through its share of the batch on its own (`shard_map` of `vm
 instead, the loops of the lanes would wait for each other across devices at every iteration of Newton.
 """
 
+import dataclasses
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -43,10 +44,13 @@ class BatchProgram(NamedTuple):
 
 
 def succeeded(values: PyTree) -> jax.Array:
-    """Whether the values of one design are finite, and every `Trajectory` or `Saved` among them successful."""
+    """Whether the values of one design are finite, and every `Trajectory` or `Saved` among them successful, of whose
+    `stats` some are infinite where nothing was looked at."""
     is_run = lambda node: isinstance(node, Trajectory | Saved)
-    floats = [leaf for leaf in jax.tree.leaves(values) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
-    runs = filter(is_run, jax.tree.leaves(values, is_leaf=is_run))
+    parts = jax.tree.leaves(values, is_leaf=is_run)
+    runs = [part for part in parts if is_run(part)]
+    asked = [dataclasses.replace(part, stats=None) if is_run(part) else part for part in parts]
+    floats = [leaf for leaf in jax.tree.leaves(asked) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
     checks = [jnp.all(jnp.isfinite(leaf)) for leaf in floats] + [run.result == RESULTS.successful for run in runs]
     return jnp.all(jnp.stack(checks)) if checks else jnp.ones((), bool)
 

@@ -105,11 +105,13 @@ def sweep(
     `SweepResult.ok` and leaves the others alone.
 
     Raises `ValueError` for designs without arrays or of different lengths, a `fn` that returns no array, a bad
-    `batch_size`, and a folder of another sweep.
+    `batch_size`, no devices, and a folder of another sweep.
     """
     designs, count = as_designs(designs)
     batch_size = None if batch_size is None else as_count(batch_size, "batch_size")
     devices = jax.devices() if devices is None else list(devices)
+    if not devices:
+        raise ValueError("`devices` is empty; leave it out for all of `jax.devices()`.")
     traced = trace(fn, designs)
     first = jax.process_index() == 0
     store = in_memory(traced.shapes, count)
