@@ -93,7 +93,8 @@ class Certificate(NamedTuple):
                 said.append(
                     f"accelerations jump inside of a step: {_some(jumps)}. Where the time of a jump depends on p the "
                     "gradient lacks what its shift does, in any number of steps, and may have the wrong sign: make the "
-                    "force continuous over several steps, or end a run there and begin another (`t1` may depend on p)"
+                    "force continuous over several steps, or let a step end there that moves with it: `AlignedSteps` "
+                    "where a signal tells the time in `breaks`, else another run (`t1` may depend on p)"
                 )
         if self.jumps:
             at = ", ".join(f"{t:.6g}" for t in self.jumps[:4]) + (" …" if len(self.jumps) > 4 else "")

@@ -88,18 +88,18 @@ def certify(
             the trajectory in its integrals (`time_integral(…, order=trajectory.order)`); or a pytree of them, all of
             one run.
         build, p, t0, t1, num_steps, state0: as in `differentiate`.
-        integrator: one with equal steps.
+        integrator: one with equal steps, or such between breaks of the scene (`AlignedSteps`).
         tolerance: the relative error of value and gradient that is wanted.
         throw: raise if the simulation fails; with False the certificate says so.
 
     The errors are those of the discretization in time, to leading order: from this one run for `GeneralizedAlpha` of
-    index 3 where no driver breaks, else from a second one in steps half as long, whose criteria are extrapolated. What
-    the model leaves out is no part of them. Kinks are told from second differences of accelerations, in steps that
-    resolve what is around.
+    index 3 in equal steps where no driver breaks, else from a second one in steps half as long, whose criteria are
+    extrapolated. What the model leaves out is no part of them. Kinks are told from second differences of accelerations,
+    in steps that resolve what is around, but not next to breaks at which steps end.
 
     Returns a `Certificate`, or a pytree of them as the criteria. `differentiate(…, certificate=True)` has it beside its
-    own result. Raises `ValueError` as `differentiate`, for an integrator with unequal steps or fewer than eight of
-    them, and inside of `jit`, `grad` and `vmap`.
+    own result. Raises `ValueError` as `differentiate`, for an integrator with other steps or fewer than eight of them,
+    and inside of `jit`, `grad` and `vmap`.
     """
     criteria, structure = jax.tree.flatten(criterion, is_leaf=callable)
     if not (criteria and all(map(callable, [*criteria, build]))):
@@ -111,7 +111,7 @@ def certify(
         raise ValueError(f"`tolerance` must be a number between 0 and 1, got {tolerance!r}.")
     t0, t1 = interval(t0, t1)
     p = as_parameters(p)
-    motion = known_motion(build, state0, p, t0, t1, num_steps, integrator.scheme)
+    motion = known_motion(build, state0, p, t0, t1, num_steps, integrator)
     found, shared, trajectory, rough = _certified(tuple(criteria), motion, p, integrator)
     if throw:
         raise_if_failed(trajectory)
@@ -124,10 +124,10 @@ def check_certifiable(integrator: AbstractIntegrator, num_steps: int | None, num
     """Raise `ValueError` for what `certify` has no answer to; `num_steps` None: enough of them."""
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(numbers)):
         raise ValueError("A certificate is of known numbers: ask for it outside of `jit`, `grad` and `vmap`.")
-    if not integrator.equal_steps or integrator.extrapolated:
+    if not integrator.equal_pieces or integrator.extrapolated:
         raise ValueError(
-            f"`integrator` must be a scheme with equal steps, got {integrator!r}; certify the scheme that it lays or "
-            "extrapolates, `integrator.scheme`."
+            f"`integrator` must be a scheme with equal steps, or AlignedSteps(…), got {integrator!r}; certify the "
+            "scheme that it lays or extrapolates, `integrator.scheme`."
         )
     require_order(integrator.scheme)
     if num_steps is not None and num_steps < _LEAST_STEPS:
@@ -154,7 +154,7 @@ def _certified(criteria, motion, p, integrator: AbstractIntegrator) -> tuple[lis
         parameters = known.parameters._replace(system=system)
         defects = smooth_defects(known.scheme, system, parameters.grid, trajectory.states)
         if defects is None:
-            finer = refined_run(known.scheme, trajectory)
+            finer = refined_run(known.scheme, trajectory, motion.grid(integrator, system))
             return extrapolated(known.scheme, values_of(trajectory, flat), values_of(finer, flat))
         error = error_by_defects(known.scheme, trajectory.states, parameters, defects, known.linear)
         return values_of(corrected(trajectory, error), flat)
@@ -185,7 +185,8 @@ def _certified(criteria, motion, p, integrator: AbstractIntegrator) -> tuple[lis
     newton = jnp.full(each, jnp.nan, flat.dtype)
     if known.scheme.physical(system, states) is states:  # nothing of them was left out
         newton = _left_by_newton(known, jax.tree.map(lambda leaf: leaf[:each], mu))
-    rough = roughness(trajectory)
+    told = known.parameters.grid.begins_pieces
+    rough = roughness(trajectory, told)
     found = [
         {
             "value": values[i],
@@ -194,7 +195,7 @@ def _certified(criteria, motion, p, integrator: AbstractIntegrator) -> tuple[lis
             "gradient_error": unravel(better[i] - gradient[i]),
             "duality": duality[i],
             "newton": newton[i],
-            "jumps": jumps_of(_integrand(criteria[i], trajectory, p)),
+            "jumps": jumps_of(_integrand(criteria[i], trajectory, p), told),
         }
         for i in range(each)
     ]

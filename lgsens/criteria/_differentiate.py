@@ -106,7 +106,7 @@ def differentiate(
             that is less work: the largest relative error of a value and of a gradient, of this by its norm, as far as
             runs in n, 2n, 4n, … steps tell. `reached` says what was reached and how. `num_steps` is then the first
             number of steps, 64 by default: enough of them to see the shortest event. Edges of roads and signals are
-            seen, and steps end there (`AlignedSteps`; not with a certificate, which is of equal steps).
+            seen, and steps end there (`AlignedSteps`).
         certificate: also say what value and gradient are worth, outside of `jit`: their errors, what may spoil them,
             and whether they are good to `accuracy`, or to 1e-3 (`certify`; a run of its own where a `method` is given
             or an `accuracy`). Runs are not extrapolated then.
@@ -134,19 +134,19 @@ def differentiate(
     if method is not None and not isinstance(method, Method):
         raise ValueError(f"`method` must be a method such as AdjointVariable() or ContinuousAdjoint(), got {method!r}.")
     settings = {"t0": t0, "t1": t1, "integrator": integrator, "state0": state0}
-    worth = lambda **own: certify(criteria, build, p, **own, **settings) if certificate else None
+    worth = lambda **own: certify(criteria, build, p, **settings | own) if certificate else None
     if accuracy is not None:
         if not throw:
             raise ValueError("`accuracy` raises where it is not reached; leave `throw` out.")
         check_accuracy(accuracy, num_steps, integrator, (p, t0, t1))
-        if certificate:  # which is of equal steps
+        if certificate:
             check_certifiable(integrator, None, (p, t0, t1))
-        else:
-            integrator, num_steps = aligned(integrator, build(as_parameters(p)), t0, t1, num_steps)
+        integrator, num_steps = aligned(integrator, build(as_parameters(p)), t0, t1, num_steps)
         own = settings | {"method": method, "integrator": integrator}
         run = lambda n, throw: differentiate(criteria, build, p, num_steps=n, throw=throw, **own)
         found = differentiate_to(run, float(accuracy), integrator, num_steps, extrapolate=not certificate)
-        return found._replace(certificate=worth(num_steps=found.reached.num_steps, tolerance=float(accuracy)))
+        about = {"num_steps": found.reached.num_steps, "integrator": integrator, "tolerance": float(accuracy)}
+        return found._replace(certificate=worth(**about))
     num_steps = as_count(num_steps, "num_steps", " (it is static), unless `accuracy` is given")
     check_integrator(integrator, num_steps)
     if certificate:

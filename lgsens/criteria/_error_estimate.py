@@ -114,9 +114,9 @@ def _estimated(integrator: AbstractIntegrator, trajectory: Trajectory) -> StateE
 
 
 def smooth_defects(scheme: AbstractScheme, system: AbstractSystem, grid: AbstractGrid, states: State):
-    """The `defects` of a run; None where they are not known, or not all: where steps begin anew behind a break, what
-    they begin with misses something as well."""
-    return None if grid.restarts is not None else scheme.defects(system, grid, states)
+    """The `defects` of a run; None where they are not known, or not all: where steps begin with another state than the
+    last ones ended with, that misses something as well."""
+    return None if grid.resizes else scheme.defects(system, grid, states)
 
 
 def error_by_defects(

@@ -22,6 +22,7 @@ _SPIKE = 8.0  # differences beside a smooth change differ by less
 _INSIDE = 0.1
 _VISIBLE = 1e-4  # of the largest value of a run: smaller kinks move a result by less than the scheme does
 _ROUND_OFF = 1e5  # of a configuration of some turns, over h²
+_REACH = 5  # times before and behind one, of the differences below
 _AS_LARGE = 0.5  # of the largest acceleration of a run: second differences that are not resolved
 
 
@@ -54,8 +55,8 @@ class Roughness(NamedTuple):
     unresolved: Float[Array, ""]
 
 
-def roughness(trajectory: Trajectory) -> Roughness:
-    """Of a motion in equal steps."""
+def roughness(trajectory: Trajectory, told: Float[Array, " n"] | None = None) -> Roughness:
+    """Of a motion in equal steps, or in such from each step on that is `told`, beside which nothing is looked for."""
     system = trajectory.system
     scale = system.coordinate_scale()
     if scene_of(system) is not None:
@@ -72,12 +73,24 @@ def roughness(trajectory: Trajectory) -> Roughness:
     seen = jnp.maximum(size, _ROUND_OFF * jnp.finfo(size.dtype).eps / h**2)  # a uniform motion has none but that
     turns = jnp.any(jnp.max(jnp.abs(jnp.diff(a, 2, axis=0)), axis=2) > _AS_LARGE * seen[None], axis=1)
     none = jnp.zeros((2, a.shape[0], 0), bool)
-    return Roughness(_rough(a, size), jnp.concatenate([none, *forces], axis=2), jnp.mean(turns))
+    others = _beside_none(told, a.shape[0])
+    seen_of = lambda rough: rough & others[None, :, None]
+    return Roughness(seen_of(_rough(a, size)), seen_of(jnp.concatenate([none, *forces], axis=2)), jnp.mean(turns))
 
 
-def jumps_of(values: Float[Array, " n+1"]) -> Bool[Array, " n+1"]:
-    """Whether a function of time jumps in the step that ends at each time, as far as that stands out."""
-    return _jumps(values[:, None, None], jnp.max(jnp.abs(values))[None])[:, 0]
+def jumps_of(values: Float[Array, " n+1"], told: Float[Array, " n"] | None = None) -> Bool[Array, " n+1"]:
+    """Whether a function of time jumps in the step that ends at each time, as far as that stands out; `told`: as in
+    `roughness`."""
+    jumps = _jumps(values[:, None, None], jnp.max(jnp.abs(values))[None])[:, 0]
+    return jumps & _beside_none(told, values.shape[0])
+
+
+def _beside_none(told: Float[Array, " n"] | None, times: int) -> Bool[Array, " n+1"]:
+    """The times of which no difference above reaches over the begin of a step that is told."""
+    if told is None:
+        return jnp.ones(times, bool)
+    near = jnp.convolve(jnp.append(told, 0.0), jnp.ones(2 * _REACH + 1, told.dtype), mode="same")
+    return near < 0.5
 
 
 def _rough(values: Float[Array, "n+1 items parts"], size: Float[Array, " items"]) -> Bool[Array, "2 n+1 items"]:

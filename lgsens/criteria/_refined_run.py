@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from lgsens.integrate import AbstractScheme, Start, UnevenGrid
+from lgsens.integrate import AbstractGrid, AbstractScheme, Start, UnevenGrid
 from lgsens.sensitivity import DirectDifferentiation, Parameters
 from lgsens.simulation import StateError, Trajectory
 
@@ -35,12 +35,13 @@ def _share(scheme: AbstractScheme) -> float:
     return 1.0 / (1.0 - 0.5**scheme.convergence_order)
 
 
-def refined_run(scheme: AbstractScheme, trajectory: Trajectory) -> Trajectory:
-    """The run of a trajectory by `scheme` in half its steps; NaN from where it failed."""
+def refined_run(scheme: AbstractScheme, trajectory: Trajectory, grid: AbstractGrid | None = None) -> Trajectory:
+    """The run of a trajectory by `scheme` in half its steps, those of `grid`; NaN from where it failed."""
     states, system, t = trajectory.states, trajectory.system, trajectory.t
     first = jax.tree.map(lambda leaf: leaf[0], states)
     start = scheme.resized(system, scheme.resumed(system, Start(first), t[0]).state, t[0]).at(system, 0.5)
-    grid = UnevenGrid.first(t[0], jnp.repeat(0.5 * jnp.diff(t), 2), restarts=scheme.restarts(system))
+    known = UnevenGrid.first(t[0], jnp.diff(t), restarts=scheme.restarts(system)) if grid is None else grid
+    grid = known.halved()
     finer, stats = DirectDifferentiation().trajectory(scheme, start, Parameters(system, grid))
     stages, finer = scheme.stages(system, grid, finer), scheme.physical(system, finer)
     stats = scheme.statistics(stats)

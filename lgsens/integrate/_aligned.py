@@ -79,6 +79,10 @@ class AlignedSteps(AbstractUnevenSteps):
     def moves(self, system):
         return breaks_of(system).size > 0
 
+    @property
+    def equal_pieces(self):
+        return True
+
     def frozen(self, trajectory):
         return GivenSteps.of(trajectory, self.integrator)
 

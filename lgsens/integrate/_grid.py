@@ -168,6 +168,11 @@ class AbstractGrid(eqx.Module):
         return self.count
 
     @property
+    def begins_pieces(self) -> Float[Array, " n"] | None:
+        """1 for each step that begins where steps end at a break, else 0; None: they end at none."""
+        return None
+
+    @property
     @abc.abstractmethod
     def first_size(self) -> Float[Array, ""]:
         """The size of the step to which the state at t0 belongs."""

@@ -45,6 +45,11 @@ class AbstractIntegrator(eqx.Module):
         """Whether all steps of a run are equal."""
         return True
 
+    @property
+    def equal_pieces(self) -> bool:
+        """Whether steps are equal between the breaks at which they end."""
+        return self.equal_steps
+
     def check(self, num_steps: int) -> None:
         """Raise `ValueError` for a number of steps that these are not."""
 

@@ -88,9 +88,10 @@ class AdaptiveSteps(AbstractUnevenSteps):
 
     The derivative is that of the numerical solution on the grid found, exactly, in both modes, breaks moving the steps
     that end at them; under `vmap` each lane has its own. The sizes themselves change a little with the parameters,
-    which the derivative leaves out: finite differences agree with it on the same grid (`GivenSteps.of`). **Sensitivities**: their errors are not controlled,
-    but the scheme is stable at any step size for the motion and so for its linearization: across a bump gradients by
-    hardpoints converge as Ψ does (`benchmarks/variable_steps.py`). The criterion's trapezoidal rule sees the grid too.
+    which the derivative leaves out: finite differences agree with it on the same grid (`GivenSteps.of`).
+    **Sensitivities**: their errors are not controlled, but the scheme is stable at any step size for the motion and so
+    for its linearization: across a bump gradients by hardpoints converge as Ψ does (`benchmarks/variable_steps.py`).
+    The criterion's trapezoidal rule sees the grid too.
     **Multipliers**, and with them forces in joints and drivers, converge as the motion does.
 
     All static and hashable. Raises `ValueError` for settings out of range.

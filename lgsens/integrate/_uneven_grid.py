@@ -75,6 +75,10 @@ class UnevenGrid(AbstractGrid):
         return scheme.resized(system, state, place.begin, factors).at(system, place.ratio)
 
     @property
+    def begins_pieces(self):
+        return self.moving
+
+    @property
     def first_size(self):
         return self.before
 

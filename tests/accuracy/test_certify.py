@@ -118,6 +118,30 @@ def pushed(p):
     return scene(p, lg.Sampled((0.0, 0.5037, 1.0), (0.0, 3.0, 0.0), "linear"))
 
 
+def peaked(p):
+    return scene(p["mass"], lg.Sampled(jnp.stack([0.0 * p["peak"], p["peak"], 1.0 + 0.0 * p["peak"]]), (0.0, 3.0, 0.0)))
+
+
+def test_of_steps_that_end_at_breaks():
+    """To the next term, O(ωh) with ωh = 0.045 as above, by mass and by the time at which the force has its kink."""
+    p = {"mass": jnp.asarray(1.0), "peak": jnp.asarray(0.5037)}
+    settings = {"t1": 1.0, "integrator": lg.AlignedSteps()}
+    found = certify(HEIGHT, peaked, p, num_steps=100, **settings)
+    better = lg.differentiate(HEIGHT, peaked, p, num_steps=3200, **settings)
+    assert not found.warnings
+    np.testing.assert_allclose(found.value_error, better.value - found.value, rtol=0.1)
+    for name in p:
+        np.testing.assert_allclose(found.gradient_error[name], better.gradient[name] - found.gradient[name], rtol=0.1)
+
+
+@pytest.mark.slow
+def test_a_certificate_at_an_accuracy_is_of_steps_that_end_at_breaks():
+    p = {"mass": 1.0, "peak": 0.5037}
+    accurate = lg.differentiate(HEIGHT, peaked, p, t1=1.0, accuracy=1e-3, certificate=True)
+    assert accurate.certificate.good
+    np.testing.assert_allclose(accurate.certificate.value, accurate.value, rtol=1e-12)  # of the same steps, round-off
+
+
 def test_a_kink_inside_of_a_step_is_found():
     trajectory = lg.simulate(pushed(1.0), t1=1.0, num_steps=100)
     ((t, body, forces, jump),) = kinks(trajectory, eqx.filter_jit(roughness)(trajectory))
@@ -280,6 +304,8 @@ def test_the_edge_of_a_road_is_named_where_no_step_ends_there():
     found = certify(lifted, lambda p: on_a_ramp(p, 0.2037), 2e4, t1=0.5, num_steps=500)
     assert {(round(kink.t, 3), kink.forces) for kink in found.kinks} == {(0.204, ("tyre",))}
     assert not found.good
+    there = certify(lifted, lambda p: on_a_ramp(p, 0.2037), 2e4, t1=0.5, num_steps=500, integrator=lg.AlignedSteps())
+    assert there.good and not there.kinks
 
 
 def double_pendulum(p):
@@ -308,6 +334,7 @@ def test_the_chaotic_double_pendulum_is_named():
     "changes, message",
     [
         ({"integrator": lg.AdaptiveSteps()}, says("`integrator`", "equal steps", "AdaptiveSteps")),
+        ({"integrator": lg.GivenSteps(np.ones(100))}, says("`integrator`", "equal steps", "GivenSteps")),
         ({"num_steps": 4}, says("`num_steps`", "at least 8", "got 4")),
         ({"tolerance": 2.0}, says("`tolerance`", "between 0 and 1", "2.0")),
         ({"p": {}}, says("`p`", "at least one number")),
