@@ -89,7 +89,7 @@ def quarter_car(bushings: Sequence[str] = ()) -> Scene:
             *grid((8000,), IndexReducedODE()),
             *grid((5000,), dopri8),
         )
-    else:  # three pairs of scene and scheme, in at most 256 steps: three programs forward and three backward
+    else:  # three pairs of scene and scheme, in at most 256 steps: three programs forward and backward, and the placed
         settings = (
             *grid((28, 52, 76), loose),
             *grid((52, 76), loose, pilot=80),
