@@ -128,12 +128,10 @@ class UnevenGrid(AbstractGrid):
 
     def segments(self, count, length):
         filling = jnp.zeros(count * length - self.num_steps, self.h.dtype)
-        h, moving = (
-            None if steps is None else jnp.concatenate([steps, filling]).reshape(count, length)
-            for steps in (self.h, self.moving)
-        )
+        filled = lambda steps: jnp.concatenate([steps, filling]).reshape(count, length)
         sizes = jnp.concatenate([self.before[None], self.places().h])
         begins = length * np.arange(count)
         restarts = for_each(count, self.restarts)
+        moving = None if self.moving is None else filled(self.moving)
         how = {"fixed": self.fixed, "restarts": restarts, "moving": moving}
-        return UnevenGrid(t0=self.times()[begins], h=h, before=sizes[begins], **how)
+        return UnevenGrid(t0=self.times()[begins], h=filled(self.h), before=sizes[begins], **how)

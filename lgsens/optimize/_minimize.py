@@ -123,8 +123,9 @@ def minimize(
 
     A step into a region where f, g or the gradient is not finite is halved until they are. Raises
     `ValueError` for bounds of another shape than x0, lower ≥ upper, x0 outside them, a logarithmic scale over
-    0, `num_steps` < 1, a tolerance that is out of range, an f or g that is not finite at x0, and a checkpoint of
-    another problem. Derivations and sources: `lgsens/optimize/_slsqp.py` and `_augmented_lagrangian.py`.
+    0, `num_steps` < 1, a tolerance that is out of range, an f or g that is not finite at x0 or has no derivative in the
+    mode, and a checkpoint of another problem. Derivations and sources: `lgsens/optimize/_slsqp.py` and
+    `_augmented_lagrangian.py`.
     """
     as_count(num_steps, "num_steps")  # before anything is compiled
     search = Minimization(
@@ -173,7 +174,15 @@ class Minimization:
         started = time.perf_counter()
         self._method, self._shape = prepared(fun, self._x, self._unravel, self._box, self._tolerances, forward)
         with compiling("objective, constraints and their derivatives", progress):
-            self._method.compile(self._x)
+            try:
+                self._method.compile(self._x)
+            except TypeError as error:
+                if "custom_vjp" not in str(error):
+                    raise
+                raise ValueError(
+                    "`fun` has a function in it that forward mode does not pass through, as `AdjointVariable()` is; "
+                    "leave `sensitivity` out of `simulate`, or give `forward=False`."
+                ) from error
         self.compile_seconds = time.perf_counter() - started
 
     def _flat(self, x: PyTree, name: str) -> Array:
