@@ -228,6 +228,52 @@ def test_kinematics_takes_it():
         np.testing.assert_allclose(what(found), what(expected), rtol=1e-11, atol=1e-11)  # round-off
 
 
+def turned(angle, axis):
+    """A homogeneous transform about x or z."""
+    c, s = np.cos(angle), np.sin(angle)
+    found, plane = np.eye(4), [1, 2] if axis == "x" else [0, 1]
+    found[np.ix_(plane, plane)] = [[c, -s], [s, c]]
+    return found
+
+
+def bennett(angle=0.7, twists=(0.6, 1.1), **options):
+    """Four links whose hinges are skew, of lengths in proportion to the sines of their twists: three of 21 equations
+    repeat others, in no plane. Source: Hunt, Kinematic Geometry of Mechanisms (1978), §11.3."""
+    first, second = twists
+    lengths = np.array([1.0, np.sin(second) / np.sin(first)] * 2)
+    ratio = np.sin((second + first) / 2) / np.sin((second - first) / 2)
+    other = 2.0 * np.arctan2(ratio * np.cos(angle / 2), np.sin(angle / 2))
+    frames = [np.eye(4)]
+    for turn, length, twist in zip((angle, other, -angle), lengths, (first, second, first)):
+        along = np.eye(4)
+        along[0, 3] = length
+        frames.append(frames[-1] @ turned(turn, "z") @ along @ turned(twist, "x"))
+    names = [None, "1", "2", "3"]
+    bodies = {
+        name: lg.RigidBody(1.0, (0.02, 0.05, 0.06), position=(begin[:3, 3] + end[:3, 3]) / 2)
+        for name, begin, end in zip(names[1:], frames, frames[1:])
+    }
+    joints = {
+        f"hinge {i}": lg.RevoluteJoint(names[i], names[(i + 1) % 4], at=frame[:3, 3], axis=frame[:3, 2])
+        for i, frame in enumerate(frames)
+    }
+    motor = {"motor": lg.RotationDriver(None, "1", axis=Z)}
+    return lg.Model(bodies, joints | motor, **options)
+
+
+def test_kinematics_that_meet_what_is_left_in_another_way_have_failed():
+    """Steps of 0.9 rad lead to a configuration at which the removed equations do not hold, steps of half of that do
+    not."""
+    model, way = bennett(redundant="remove"), 2.0 * np.linspace(0.0, 3.0, 13) + 0.3 * np.linspace(0.0, 3.0, 13) ** 2
+    assert len(model.removed) == 3
+    with pytest.raises(ValueError, match=says("No position satisfies", "redundant='remove'", "position 12", "hinge")):
+        lg.kinematics(model, {"motor": way})
+    lost = lg.kinematics(model, {"motor": way}, throw=False)
+    assert int(lost.result) == lg.RESULTS.position_failed and np.isnan(lost.states.v[-1]).all()
+    found = lg.kinematics(model, {"motor": np.sort(np.concatenate([way, (way[1:] + way[:-1]) / 2]))})
+    np.testing.assert_allclose(found.joint("hinge 1").position, 0.0, atol=1e-11)  # round-off × condition
+
+
 def engine(phase, **options):
     """A slider-crank in space, as many equations as coordinates: on a ball at the crank, so that in the dead centre rod
     and piston turn freely about the bore."""

@@ -61,10 +61,9 @@ def reverse_by_parts(
     given = for_any_number(task.num_steps, task.integrator, method, None, (system, state0, t0, t1 - t0))
     exact = given[0] if isinstance(given[0], int) else None
     steps = None if exact else given[0]
-    (found, details), of_scene = call(_motion, system, state0, t0, t1, steps, given[1], method, exact)
+    found, times, details, of_scene = call(_motion, system, state0, t0, t1, steps, given[1], method, exact)
     count = None if exact else task.num_steps
-    moves = given[1].moves(system)
-    value, rows, result, note = call(_values, task.criteria, names, found, moves, system, details["jacobian"], p, count)
+    value, rows, result, note = call(_values, task.criteria, names, found, times, system, details["jacobian"], p, count)
     gradient = call(_pulled_to_p, of_p, call(_pulled_to_scene, of_scene, rows), rows)
     parts = Parts(value, gradient, result, details, system.constraint_names, note)
     return parts, dataclasses.replace(found, system=system)
@@ -83,14 +82,17 @@ def _scene(functions, numbers, p):
 
 @partial(jax.jit, static_argnums=7)
 def _motion(system, state0, t0, t1, steps: Steps | None, integrator, method, exact: int | None):
+    """The trajectory, its times if they depend on the scene, and what is said of it; and how it is pulled back."""
+
     def of(system, state0):
         begun = begin(integrator.scheme, system, t0, state0)
         found, details = run(system, begun, t0, t1, exact or steps or 0, integrator, method)
-        t = found.t if integrator.moves(system) else None  # else it is constant
-        return _Motion(found.states, found.stages, found.error, t), (dataclasses.replace(found, system=None), details)
+        times = found.t if integrator.moves(system) else None
+        motion = _Motion(found.states, found.stages, found.error, times)
+        return motion, (dataclasses.replace(found, system=None), times, details)
 
     _, pull_back, found = jax.vjp(of, system, state0, has_aux=True)
-    return found, Packed.of(pull_back)
+    return *found, Packed.of(pull_back)
 
 
 class _Motion(NamedTuple):
@@ -99,7 +101,7 @@ class _Motion(NamedTuple):
     states: State
     stages: Any
     error: Any
-    t: Any  # None: it does not
+    t: Any  # None: they are constant
 
 
 class _Rows(NamedTuple):
@@ -111,7 +113,7 @@ class _Rows(NamedTuple):
 
 
 @eqx.filter_jit
-def _values(criteria, names, found: Trajectory, moves: bool, system, jacobian, p, count: int | None):
+def _values(criteria, names, found: Trajectory, times, system, jacobian, p, count: int | None):
     def of(motion, system, p):
         own = {name: part for name, part in motion._asdict().items() if part is not None}
         trajectory = dataclasses.replace(found, system=system, **own)
@@ -119,7 +121,7 @@ def _values(criteria, names, found: Trajectory, moves: bool, system, jacobian, p
         values = jnp.stack([criterion(trajectory, p) for criterion in criteria])
         return values, values
 
-    at = _Motion(found.states, found.stages, found.error, found.t if moves else None), system, p
+    at = _Motion(found.states, found.stages, found.error, times), system, p
     rows, values = jax.jacrev(of, argnums=(0, 1, 2), has_aux=True)(*at)
     uses = [Use.of(criterion, system, found.t[0], p) for criterion in criteria if names]
     return tuple(values), _Rows(*rows), *unique(found.result, system, jacobian, names, uses)

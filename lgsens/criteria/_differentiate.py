@@ -244,7 +244,7 @@ def _differentiate_jit(task: _Task, p, names: tuple[str, ...], method):
     elif isinstance(method, ContinuousAdjoint):
         found = _continuous_adjoint(task, flat, method, uses)
     elif _flies(method, integrator):
-        found = _on_the_fly(task, flat)
+        found = _on_the_fly(task, flat, constant=not integrator.moves(system))
     else:
         found = _forwards(task, flat, method)
     result, note = unique(found.result, system, found.details["jacobian"], names, uses)
@@ -252,7 +252,7 @@ def _differentiate_jit(task: _Task, p, names: tuple[str, ...], method):
     return Parts(tuple(found.value), gradient, result, found.details, system.constraint_names, note)
 
 
-def _on_the_fly(task: _Task, p) -> _Found:
+def _on_the_fly(task: _Task, p, constant: bool) -> _Found:
     integrator, scheme = task.integrator, task.integrator.scheme
 
     def start(p):
@@ -261,7 +261,6 @@ def _on_the_fly(task: _Task, p) -> _Found:
         state0 = begun.start.at(system, laid.grid.first_size)
         return (state0, Parameters(system, laid.grid)), (begun, laid._replace(found=None, stats=None))
 
-    constant = not integrator.moves(task.system(p))
     found = direct_on_the_fly(scheme, start, stacked(task.criteria, task.unravel), p, constant)
     begun, laid = found.begun
     t = laid.grid.times()

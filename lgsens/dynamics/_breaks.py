@@ -18,8 +18,9 @@ class AbstractTimeFunction(eqx.Module):
     @property
     def breaks(self) -> Float[Array, " k"]:
         """The times [s] at which it, or a derivative of it, jumps, shape (k,), in any order; here those of functions of
-        time that it holds. `AlignedSteps` and steps under error control end at them, and the forces of a driver that
-        follows it ring behind those that it does not tell."""
+        time that it holds. `AlignedSteps` and steps under error control end at them and move with them, so they are
+        to be functions of its numbers that JAX can differentiate; and the forces of a driver that follows it ring
+        behind those that it does not tell."""
         return breaks_of([getattr(self, field.name) for field in dataclasses.fields(self)])
 
 

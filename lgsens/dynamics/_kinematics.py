@@ -56,6 +56,7 @@ from lgsens.dynamics._matrices import require_linear
 from lgsens.dynamics._system import AbstractSystem, State
 
 _MAX_ITERATIONS = 40
+_BROKEN = 1e-3  # rad, or of the scene: more than given lengths and axes of repeated equations contradict each other
 _SINGULAR = 8.0  # a multiple of √eps: so near to a singular position Newton's iteration ends, there or beside it
 
 
@@ -182,12 +183,23 @@ def _configurations_jvp(primals, tangents):
     return (q, size, singular), (q_dot, jnp.zeros_like(size), np.zeros(singular.shape, jax.dtypes.float0))
 
 
-def positions(drive: AbstractDrive, values: Float[Array, "n d"], t: Float[Array, " n"]) -> Positions:
+def positions(
+    drive: AbstractDrive, values: Float[Array, "n d"], t: Float[Array, " n"], whole: AbstractDrive | None = None
+) -> Positions:
     """The configurations for each row of driven values and times, differentiable by the rule above; NaN where none was
-    found, or a singular one."""
+    found, or a singular one.
+
+    `whole`: with the equations that `drive` leaves out because they repeat others. Without them there may be ways to
+    assemble the mechanism at which these do not hold, to which a long step leads.
+    """
     q, size, singular = _configurations(drive, values, t)
-    violation = jax.vmap(lambda q, s, t: drive.at(s).constraint(q, t))(q, values, t)
-    satisfied = jnp.max(jnp.abs(violation), axis=1) <= drive.system.constraint_round_off()  # NaN is not
+    left = lambda drive: jax.vmap(lambda q, s, t: drive.at(s).constraint(q, t))(q, values, t)
+    worst = lambda violation: jnp.max(jnp.abs(violation), axis=1)
+    violation = left(drive)
+    satisfied = worst(violation) <= drive.system.constraint_round_off()  # NaN is not
+    if whole is not None:
+        violation = left(whole)
+        satisfied &= worst(violation) <= _BROKEN * jnp.minimum(jnp.max(drive.system.coordinate_scale()), 1.0)
     found = _small(size) & satisfied & ~singular
     poison = lambda leaf: jnp.where(found.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.nan)
     return Positions(jax.tree.map(poison, q), found, satisfied & singular, violation)
