@@ -8,10 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from lgsens._validate import as_float, require
-from lgsens.dynamics import AbstractSystem, State
+from lgsens.dynamics import AbstractSystem, State, breaks_of
 from lgsens.sensitivity import Functional
 from lgsens.simulation import Instant, Trajectory
 
@@ -77,7 +77,8 @@ class Criterion(eqx.Module):
             stages = trajectory.stages
             return value + stages.weights @ rate(stages.states, stages.t)
         rates = rate(states, t)
-        return value + time_integral(t, rates, order=trajectory.order)
+        breaks = breaks_of(system) if trajectory.order == 4 else None  # the trapezoidal rule has no use for them
+        return value + time_integral(t, rates, order=trajectory.order, breaks=breaks)
 
 
 def _takes_two(function: Pointwise) -> bool:
@@ -106,7 +107,9 @@ def _scalar(name: str, function: Pointwise | None, system, state: State, t, p) -
     return jnp.asarray(value, t.dtype)
 
 
-def time_integral(t: Float[Array, " n"], f: Float[Array, " n ..."], *, order: int = 2) -> Float[Array, " ..."]:
+def time_integral(
+    t: Float[Array, " n"], f: Float[Array, " n ..."], *, order: int = 2, breaks: Float[Array, " k"] | None = None
+) -> Float[Array, " ..."]:
     """∫ f dt: by the trapezoidal rule, second order like the integrator, or by Gregory's rule of fourth order.
 
         order 2:  T = Σ_n (t_{n+1} − t_n) (f_n + f_{n+1})/2
@@ -119,6 +122,8 @@ def time_integral(t: Float[Array, " n"], f: Float[Array, " n ..."], *, order: in
             least, or pieces of such (`AlignedSteps`), and an integrand whose slope jumps from one piece to the next
             only; with a slope that jumps elsewhere both rules are of second order. Unlike Simpson's rule it weighs all
             times inside of a piece alike.
+        breaks: times at which the slope of the integrand jumps [s], shape (k,): pieces end at those of them at which a
+            step does, also where steps before and behind are equal. None: pieces are told from sizes of steps alone.
 
     Returns the integral [unit of f × s], shape (…). Raises `ValueError` for lengths that differ, another order, and for
     order 4 with too few times, or a step that is equal to none beside it. Sources: Sonneville & Brüls (2014), eq. (31);
@@ -145,6 +150,8 @@ def time_integral(t: Float[Array, " n"], f: Float[Array, " n ..."], *, order: in
         t,
     )
     equal = _equal_to_next(jax.lax.stop_gradient(t))  # of the steps from t_n and t_{n+1}
+    if breaks is not None and breaks.size:
+        equal &= ~_met(*jax.lax.stop_gradient((t, breaks.astype(t.dtype))))[1:-1]
     begins = jnp.where(equal & ~jnp.pad(equal, (1, 0))[:-1], h[:-1], 0.0)
     ends = jnp.where(equal & ~jnp.pad(equal, (0, 1))[1:], h[1:], 0.0)
     slopes, bends = jnp.diff(f, axis=0), jnp.diff(f, 2, axis=0)
@@ -157,6 +164,15 @@ def _equal_to_next(t):
     xp = np if isinstance(t, np.ndarray) else jnp
     h = xp.diff(t)
     return xp.abs(xp.diff(h)) <= 1e-6 * h[1:] + 32 * float(np.finfo(t.dtype).eps) * xp.max(xp.abs(t))
+
+
+def _met(t: Float[Array, " n"], breaks: Float[Array, " k"]) -> Bool[Array, " n"]:
+    """Which times a break is at, up to a thousandth of a step."""
+    after = jnp.clip(jnp.searchsorted(t, breaks), 1, t.size - 1)
+    before = after - 1
+    nearest = jnp.where(t[after] - breaks < breaks - t[before], after, before)
+    there = jnp.abs(t[nearest] - breaks) <= 1e-3 * (t[after] - t[before])
+    return jnp.zeros(t.size, bool).at[nearest].max(there)
 
 
 def _in_pieces(t: np.ndarray) -> bool:

@@ -72,7 +72,9 @@ class AlignedSteps(AbstractUnevenSteps):
             (steps, piece_lengths(system, t0, t1), piece_ends(system, t0, t1), t1 - t0)
         )
         sizes = total * aligned_sizes(lengths / jnp.sum(lengths), steps, room)
-        sizes, begins = moved(sizes, ends, piece_ends(system, t0, t1))
+        fit = _LEAST * pieces_within(lengths)[-1] <= steps  # else no step ends at a break, but by chance
+        known, now = (jnp.where(fit, ends, ends[-1]) for ends in (ends, piece_ends(system, t0, t1)))
+        sizes, begins = moved(sizes, known, now)
         how = {"room": counted, "count": steps if counted else None, "fixed": True, "moving": begins}
         return Laid(UnevenGrid.first(t0, sizes, restarts=self.integrator.restarts(system), **how))
 

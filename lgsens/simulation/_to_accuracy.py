@@ -47,7 +47,6 @@ _MOST_SINGLE = 2**13  # in single precision: changes of a pendulum do not fall a
 _CLEAR = (0.7, 1.5)  # of 2^p
 _SAFETY = 2.0  # of what the order of extrapolated runs says
 _LEAST = 1.4  # below that runs do not converge
-_ON_TIME = 1e-6  # of a step
 _COARSE = (RESULTS.newton_failed, RESULTS.turn_not_resolved, RESULTS.singular_configuration)  # more steps may help
 
 
@@ -178,15 +177,13 @@ def simulate_to(simulate: Callable[..., Any], accuracy, model, num_steps: int | 
 
 def aligned(integrator: AbstractIntegrator, scene: Any, t0, t1, fewest: int | None):
     """The integrator in steps that end at the breaks of the scene, and the first number of them. Both are as given
-    where equal steps do so too, four times as many, and where breaks are too many for that."""
+    where there are no breaks, or too many for that. (Equal steps that meet all breaks are not enough: they stay where
+    these move, and derivatives by their times are of first order.)"""
     t0, t1 = interval(t0, t1)
-    lengths = np.asarray(piece_lengths(scene, t0, t1))
-    lengths, first = lengths[lengths > 0.0], fewest or _FEWEST
-    ends = 4 * first * np.cumsum(lengths) / lengths.sum()
-    equal = lengths.size > MANY or np.all(np.abs(ends - np.round(ends)) < _ON_TIME)
-    if equal and integrator.equal_steps:
+    pieces = int(np.sum(np.asarray(piece_lengths(scene, t0, t1)) > 0.0))
+    if integrator.equal_steps and not 1 < pieces <= MANY:
         return integrator, fewest
-    return AlignedSteps(integrator.scheme), max(first, int(undivided(lengths.size)))
+    return AlignedSteps(integrator.scheme), max(fewest or _FEWEST, int(undivided(pieces)))
 
 
 @eqx.filter_jit

@@ -201,8 +201,18 @@ def test_an_accuracy_is_reached_by_them(accuracy):
     length = float(jnp.max(run.system.coordinate_scale()))
     assert abs(float(run.body("mass").position[-1, 2]) - END) <= accuracy * length
     assert run.reached.num_steps <= 1024  # in equal steps 1e-7 takes 32768
-    on_time = lg.BumpRoad(height=0.1, duration=0.125, start=0.25)  # equal steps end there as well
-    assert lg.simulate(on(on_time), t1=T1, accuracy=accuracy).reached.integrator == lg.GeneralizedAlpha()
+
+
+@pytest.mark.slow
+def test_an_accuracy_of_a_derivative_by_the_time_of_a_break():
+    """At 0.5 s, where equal steps end as well, which stay there: it is of first order then."""
+    criterion = lg.Criterion(integrand=lambda s, p: s.body("mass").acceleration[2] ** 2)
+    build = lambda at: on(lg.SampledRoad(jnp.stack([0.0 * at, at, 1.0 + 0.0 * at]), jnp.asarray([0.0, 0.1, 0.0])))
+    found = lg.differentiate(criterion, build, 0.5, t1=T1, accuracy=1e-4)
+    assert found.reached.integrator == lg.AlignedSteps() and found.reached.num_steps <= 512  # equal: more than 131072
+    beside = lg.differentiate(criterion, build, 0.4999, t1=T1, accuracy=1e-6)
+    # both accuracies, and 1e-4 s of curvature of order 1/T
+    np.testing.assert_allclose(found.gradient, beside.gradient, rtol=1e-3)
 
 
 def test_where_they_are_taken_and_how_many_at_first():
@@ -211,7 +221,7 @@ def test_where_they_are_taken_and_how_many_at_first():
     assert aligned(plain, on(BUMP), 0.0, T1, None) == (of, 64)
     assert aligned(plain, on(BUMP), 0.0, T1, 200) == (of, 200)
     assert aligned(plain, on(BUMP), 0.0, 0.2, None) == (plain, None)  # before it
-    assert aligned(plain, table(41), 0.0, T1, 100) == (plain, 100)  # on times of 400 steps
+    assert aligned(plain, table(41), 0.0, T1, 100) == (of, 100)  # on times of 400 steps, which do not move
     assert aligned(plain, table(42), 0.0, T1, None) == (of, 82)  # two for each piece
     assert aligned(of, table(41), 0.0, T1, 30) == (of, 80)
     assert aligned(plain, table(MANY + 2), 0.0, T1, None) == (plain, None)

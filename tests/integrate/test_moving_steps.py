@@ -218,6 +218,35 @@ def test_steps_move_with_the_ends_of_their_pieces():
     np.testing.assert_allclose(found, 2.0 * sizes)
 
 
+def pushed(signal) -> lg.Model:
+    """A body under a force."""
+    push = lg.AppliedForce("mass", at=(0.0, 0.0, 0.0), force=(0.0, 0.0, 1.0), signal=signal)
+    return lg.Model({"mass": lg.RigidBody(2.0, None, free="z")}, {}, {"push": push})
+
+
+def test_none_move_where_there_are_too_few_for_all_pieces():
+    """Equal steps end at breaks by chance only; derivatives are those of what is computed."""
+    signal = lambda at: lg.Sampled(jnp.linspace(0.0, 0.9, 11) + at, jnp.zeros(11))
+    run = lambda at: lg.simulate(pushed(signal(at)), t1=1.0, num_steps=10, integrator=lg.AlignedSteps())
+    at = jnp.asarray(0.05)
+    np.testing.assert_allclose(run(at).t, np.linspace(0.0, 1.0, 11), rtol=1e-14)
+    np.testing.assert_array_equal(jax.jacfwd(lambda at: run(at).t)(at), 0.0)
+
+
+def of_peak(at, integrator):
+    push = lg.Sampled(jnp.stack([0.0 * at, at, 1.0 + 0.0 * at]), (0.0, 5.0, -1.0))
+    run = lg.simulate(pushed(push), t1=1.0, num_steps=48, integrator=integrator)
+    return lg.Criterion(integrand=lambda s, p: s.body("mass").acceleration[2] ** 2)(run)
+
+
+def test_pieces_of_equal_steps_are_two_in_the_rule_of_fourth_order():
+    """∫ a² dt of a force that rises to 5 N and falls to −1 N, linearly: of quadratic pieces, without an error."""
+    exact = lambda at: (25.0 * at + (1.0 - at) * (25.0 - 5.0 + 1.0)) / 3.0 / 2.0**2
+    value, slope = jax.value_and_grad(of_peak)(jnp.asarray(0.5), lg.Richardson(lg.AlignedSteps()))
+    np.testing.assert_allclose(value, exact(0.5), rtol=1e-12)  # taken as one piece: 1e-4
+    np.testing.assert_allclose(slope, jax.grad(exact)(0.5), rtol=1e-11)
+
+
 def test_steps_of_one_scene_in_another():
     """With as many breaks steps end at those; with others, they are of the given sizes."""
     first = lg.Ramp(end=1.0, t_start=0.2, duration=0.3)
