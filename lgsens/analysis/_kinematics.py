@@ -141,7 +141,7 @@ def kinematics(
 
 @eqx.filter_jit
 def _kinematics_jit(drive: Drive, whole: Drive | None, driven, rates):
-    found = positions(drive, *driven, whole)
+    found = positions(drive, *driven, whole=whole)
     states = jax.vmap(lambda *args: forces_of_motion(drive, *args))(found.q, driven, rates)
     sound = found.found & jnp.all(jnp.isfinite(jnp.hstack([states.v, states.vdot, states.lam])), axis=1)
     first = jnp.argmin(sound)  # the first that was not found or has no rates, 0 if all have

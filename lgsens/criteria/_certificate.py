@@ -20,6 +20,10 @@ def _some(kinks: Sequence[Kink]) -> str:
     return ", ".join(map(str, kinks[:4])) + more
 
 
+def _times(times: Sequence[float]) -> str:
+    return ", ".join(f"{t:.6g}" for t in times[:4]) + (" …" if len(times) > 4 else "")
+
+
 class Certificate(NamedTuple):
     """What a value and its gradient are worth; `print` it.
 
@@ -35,6 +39,7 @@ class Certificate(NamedTuple):
         kinks: where in time an acceleration has a kink or a jump inside of a step, of which body, by which forces, as
             far as it stands out: such as are small beside a smooth change are not seen, nor two within five steps.
         jumps: the ends of steps in which the integrand of a `Criterion` jumps [s], likewise: an angle that comes round.
+        coincident: where two breaks coincide that depend on p in different ways, and accelerations jump [s].
         unresolved: the share of steps in which accelerations change as much as they are large, shape ().
         result: a value of `RESULTS`, shape (), int32.
     """
@@ -51,6 +56,7 @@ class Certificate(NamedTuple):
     margin: Float[Array, ""]
     kinks: tuple[Kink, ...]
     jumps: tuple[float, ...]
+    coincident: tuple[float, ...]
     unresolved: Float[Array, ""]
     result: Int[Array, ""]
 
@@ -97,11 +103,16 @@ class Certificate(NamedTuple):
                     "where a signal tells the time in `breaks`, else another run (`t1` may depend on p)"
                 )
         if self.jumps:
-            at = ", ".join(f"{t:.6g}" for t in self.jumps[:4]) + (" …" if len(self.jumps) > 4 else "")
             said.append(
-                f"the integrand jumps inside of a step, at t = {at} s, which estimates and the gradient do not see: "
-                "take a continuous one, of an angle that comes round its sine and cosine or, to count turns, what a "
-                "TorsionSpringDamper(…, stiffness=0, turns=True) measures (`s.force(name).angle`)"
+                f"the integrand jumps inside of a step, at t = {_times(self.jumps)} s, which estimates and gradient "
+                "do not see: take a continuous one, of an angle that comes round its sine and cosine or, to count "
+                "turns, what a TorsionSpringDamper(…, stiffness=0, turns=True) measures (`s.force(name).angle`)"
+            )
+        if self.coincident:
+            said.append(
+                f"breaks coincide at t = {_times(self.coincident)} s whose times depend on p in different ways, and "
+                "accelerations jump there: derivatives by each time have half of both jumps, only their sum is right. "
+                "Let one number be both times, or leave some time between them"
             )
         if self.margin < _NEAR:
             said.append(

@@ -44,7 +44,7 @@ from lgsens._validate import as_count, as_parameters
 from lgsens.criteria._certificate import Certificate
 from lgsens.criteria._criterion import Criterion
 from lgsens.criteria._error_estimate import corrected, error_by_defects, smooth_defects
-from lgsens.criteria._kinks import jumps_of, kinks, roughness
+from lgsens.criteria._kinks import breaks_apart, jumps_of, kinks, roughness
 from lgsens.criteria._known_motion import known_motion, unpacked
 from lgsens.criteria._refined_run import extrapolated, refined_run, require_order
 from lgsens.dynamics import State
@@ -117,6 +117,8 @@ def certify(
         raise_if_failed(trajectory)
     own = {"tolerance": float(tolerance), "kinks": kinks(trajectory, rough)}
     at = lambda jumps: tuple(np.asarray(trajectory.t)[np.asarray(jumps)].tolist())
+    times, apart = map(np.asarray, shared["coincident"])
+    shared = shared | {"coincident": tuple(times[apart].tolist())}
     return structure.unflatten([Certificate(**one | {"jumps": at(one["jumps"])}, **shared, **own) for one in found])
 
 
@@ -205,6 +207,7 @@ def _certified(criteria, motion, p, integrator: AbstractIntegrator) -> tuple[lis
         "margin": margin,
         "unresolved": rough.unresolved,
         "result": trajectory.result,
+        "coincident": breaks_apart(trajectory, tangents[1]),
     }
     return found, shared, trajectory, rough
 

@@ -11,10 +11,12 @@ parameters is missed by the gradient: the velocity changes by −[v̇] δt for a
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from lgsens.dynamics import AbstractSystem, breaks_of
 from lgsens.model import element_forces, scene_of
 from lgsens.simulation import Trajectory
 
@@ -22,6 +24,8 @@ _SPIKE = 8.0  # differences beside a smooth change differ by less
 _INSIDE = 0.1
 _VISIBLE = 1e-4  # of the largest value of a run: smaller kinks move a result by less than the scheme does
 _ROUND_OFF = 1e5  # of a configuration of some turns, over h²
+_TOGETHER = 1e-6  # of a run: breaks that steps take for one
+_SAME = 1e-9  # of the largest change of a break
 _REACH = 5  # times before and behind one, of the differences below
 _AS_LARGE = 0.5  # of the largest acceleration of a run: second differences that are not resolved
 
@@ -55,19 +59,23 @@ class Roughness(NamedTuple):
     unresolved: Float[Array, ""]
 
 
+def _accelerations(trajectory: Trajectory) -> Float[Array, "n+1 items parts"]:
+    """Of each body, in rad and lengths of the scene."""
+    bodies, scale = scene_of(trajectory.system), trajectory.system.coordinate_scale()
+    if bodies is None:
+        return (trajectory.states.vdot / scale[None])[:, :, None]
+    motions, length = [trajectory.body(name) for name in bodies.body_names], jnp.max(scale)
+    return jnp.stack([jnp.concatenate([m.acceleration / length, m.angular_acceleration], axis=1) for m in motions], 1)
+
+
 def roughness(trajectory: Trajectory, told: Float[Array, " n"] | None = None) -> Roughness:
     """Of a motion in equal steps, or in such from each step on that is `told`, beside which nothing is looked for."""
-    system = trajectory.system
-    scale = system.coordinate_scale()
+    system, a, forces = trajectory.system, _accelerations(trajectory), []
     if scene_of(system) is not None:
+        length = jnp.max(system.coordinate_scale())
         system, states, t = trajectory.of_bodies()
-        length = jnp.max(scale)
-        motions = [trajectory.body(name) for name in system.body_names]
-        a = jnp.stack([jnp.concatenate([m.acceleration / length, m.angular_acceleration], axis=1) for m in motions], 1)
         found = element_forces(system, states.q, states.v, states.lam, t, length)
         forces = [_rough(force, jnp.max(jnp.abs(force), axis=(0, 2))) for _, force in found]
-    else:
-        a, forces = (trajectory.states.vdot / scale[None])[:, :, None], []
     size = jnp.max(jnp.abs(a), axis=(0, 2))
     h = (trajectory.t[-1] - trajectory.t[0]) / (trajectory.t.shape[0] - 1)
     seen = jnp.maximum(size, _ROUND_OFF * jnp.finfo(size.dtype).eps / h**2)  # a uniform motion has none but that
@@ -83,6 +91,24 @@ def jumps_of(values: Float[Array, " n+1"], told: Float[Array, " n"] | None = Non
     `roughness`."""
     jumps = _jumps(values[:, None, None], jnp.max(jnp.abs(values))[None])[:, 0]
     return jumps & _beside_none(told, values.shape[0])
+
+
+def breaks_apart(trajectory: Trajectory, change: AbstractSystem) -> tuple[Float[Array, " k"], Bool[Array, " k"]]:
+    """The times of breaks, ascending, and whether each is at the next one, moves otherwise than that by a `change` of
+    the system, and accelerations jump there. A step that ends at both moves with each by half."""
+    t, a = trajectory.t, _accelerations(trajectory)
+    breaks, moving = jax.jvp(breaks_of, (trajectory.system,), (change,))
+    order = jnp.argsort(breaks)
+    breaks, moving = breaks[order], moving[order]
+    inside = (breaks[:-1] > t[0]) & (breaks[1:] < t[-1])
+    together = inside & (jnp.diff(breaks) <= _TOGETHER * (t[-1] - t[0]))
+    apart = jnp.abs(jnp.diff(moving)) > _SAME * jnp.max(jnp.abs(moving), initial=0.0)
+    n = jnp.searchsorted(t, breaks[:-1])
+    near = lambda k: a[jnp.clip(n + k, 0, t.size - 1)]
+    changed = lambda first, last: jnp.max(jnp.abs(near(last) - near(first)), axis=(1, 2))
+    across, around = changed(-2, 2), jnp.maximum(changed(-6, -2), changed(2, 6))
+    jumps = (across > _SPIKE * around) & (across > _VISIBLE * jnp.max(jnp.abs(a)))
+    return breaks[:-1], together & apart & jumps
 
 
 def _beside_none(told: Float[Array, " n"] | None, times: int) -> Bool[Array, " n+1"]:

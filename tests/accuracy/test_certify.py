@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import says
+from jaxtyping import Array, Float
 from oscillator import CRITERION, T1, P, build, exact
 
 import lgsens as lg
@@ -140,6 +141,41 @@ def test_a_certificate_at_an_accuracy_is_of_steps_that_end_at_breaks():
     accurate = lg.differentiate(HEIGHT, peaked, p, t1=1.0, accuracy=1e-3, certificate=True)
     assert accurate.certificate.good
     np.testing.assert_allclose(accurate.certificate.value, accurate.value, rtol=1e-12)  # of the same steps, round-off
+
+
+class Pulse(lg.AbstractSignal):
+    """1 for a while, else 0."""
+
+    begin: Float[Array, ""]
+    length: Float[Array, ""]
+
+    def __call__(self, t):
+        return jnp.where((t >= self.begin) & (t <= self.begin + self.length), 1.0, 0.0)
+
+    @property
+    def breaks(self):
+        return jnp.stack([self.begin, self.begin + self.length])
+
+
+def pushed_twice(p):
+    """By 2 N from 0.1 s on, for a while, and by 5 N for 0.2 s."""
+    push = lambda force, signal: lg.AppliedForce("mass", at=(0.0, 0.0, 0.0), force=(0.0, 0.0, force), signal=signal)
+    forces = push(2.0, Pulse(jnp.asarray(0.1), p["length"])), push(5.0, Pulse(p["begin"], jnp.asarray(0.2)))
+    return lg.Model({"mass": lg.RigidBody(1.0, None, free="z")}, {}, dict(zip("ab", forces)))
+
+
+@pytest.mark.slow
+def test_breaks_that_coincide_and_move_apart_are_named():
+    """z(1) by the length is 2 (0.9 − length): by the begin −5 · 0.2; but a step ends at both."""
+    settings = {"t1": 1.0, "num_steps": 200, "integrator": lg.AlignedSteps(), "tolerance": 0.05}
+    exact = {"length": 2.0 * 0.7, "begin": -1.0}
+    found = certify(HEIGHT, pushed_twice, {"length": 0.2, "begin": 0.3}, **settings)
+    assert not found.good and "breaks coincide at t = 0.3 s" in str(found)
+    assert all(abs(found.gradient[name] - value) > 1.0 for name, value in exact.items())
+    np.testing.assert_allclose(sum(found.gradient.values()), sum(exact.values()), atol=0.03)  # h times the jump
+    both = certify(HEIGHT, lambda p: pushed_twice({"length": p - 0.1, "begin": p}), jnp.asarray(0.3), **settings)
+    assert both.good
+    np.testing.assert_allclose(both.gradient, sum(exact.values()), atol=0.03)
 
 
 def test_a_kink_inside_of_a_step_is_found():
