@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oscillator import CRITERION, T1, P, build, exact_with_gradient
+from oscillator import CRITERION, T1, P, V, build, exact_with_gradient
 
 import lgsens as lg
 from lgsens import accuracy
@@ -115,25 +115,35 @@ def test_the_recommended_setting_is_used_as_it_is(table):
     assert setting.trajectory(build, P, t1=T1).t.shape == (setting.num_steps + 1,)
 
 
+EARLY = lg.Criterion(integrand=lambda s, p: jnp.exp(-((s.t / 0.15) ** 2)) * (s.body("mass").position[2] - 1.0) ** 2)
+PLACED = Setting(40, pilot=40)
+
+
+def early(p):
+    """Its value, by a trapezoidal rule whose error is (h/0.15 s)² = 1e-8 of it at most."""
+    t = jnp.linspace(0.0, T1, 70_001)
+    w = jnp.sqrt(p["k"] / p["m"])
+    return jnp.trapezoid(jnp.exp(-((t / 0.15) ** 2)) * (V / w * jnp.sin(w * t)) ** 2, t)
+
+
 def test_steps_placed_for_a_criterion():
-    """Of one that looks at the begin only: as many steps, those of `steps_for`, leave less than half of the errors."""
-    early = lg.Criterion(integrand=lambda s, p: jnp.exp(-((s.t / 0.15) ** 2)) * (s.body("mass").position[2] - 1.0) ** 2)
-    settings = (Setting(40), Setting(40, pilot=40))
-    fine = accuracy.grid((2000,))[0]
-    value, gradient = jax.value_and_grad(lambda p: fine.evaluate(early, build, p, t1=T1))(jax.tree.map(jnp.asarray, P))
-    # 40 steps have 1e-2; the errors of 2000 are 2500 times smaller
-    exact = accuracy.Reference(float(value), np.array([gradient["k"] * P["k"], gradient["m"] * P["m"]]), 1e-5, 1e-5)
-    equal, placed = work_precision(early, build, P, settings, t1=T1, reference=exact, progress=False)
+    """Of one that looks at the begin only: as many steps leave less than half of the errors."""
+    value, gradient = jax.value_and_grad(early)(jax.tree.map(jnp.asarray, P))
+    exact = accuracy.Reference(float(value), np.array([gradient[name] * P[name] for name in sorted(P)]), 1e-8, 1e-8)
+    equal, placed = work_precision(EARLY, build, P, (Setting(40), PLACED), t1=T1, reference=exact, progress=False)
     assert equal.error > 1e-3 and placed.value_error < 0.5 * equal.value_error
     assert placed.gradient_error < 0.5 * equal.gradient_error
     assert (placed.setting.label, placed.setting.curve) == ("placed GeneralizedAlpha()", "placed GeneralizedAlpha")
-    steps = lg.steps_for(early, build, P, t1=T1, pilot=40, num_steps=40)
-    own = lg.differentiate(early, build, P, t1=T1, num_steps=40, integrator=steps.integrator)
-    assert placed.value == pytest.approx(float(own.value), rel=1e-12)  # the same program but for round-off
-    used = jax.jit(lambda p: settings[1].evaluate(early, build, p, t1=T1))(jax.tree.map(jnp.asarray, P))
-    assert float(used) == pytest.approx(placed.value, rel=1e-12)
     with pytest.raises(ValueError, match="placed for a criterion"):
-        settings[1].trajectory(build, P, t1=T1)
+        PLACED.trajectory(build, P, t1=T1)
+
+
+@pytest.mark.slow
+def test_they_are_those_of_steps_for():
+    steps = lg.steps_for(EARLY, build, P, t1=T1, pilot=40, num_steps=40)
+    own = lg.differentiate(EARLY, build, P, t1=T1, num_steps=40, integrator=steps.integrator)
+    used = jax.jit(lambda p: PLACED.evaluate(EARLY, build, p, t1=T1))(jax.tree.map(jnp.asarray, P))
+    assert float(used) == pytest.approx(float(own.value), rel=1e-12)  # the same steps, round-off
 
 
 def test_text_and_json(table, tmp_path):

@@ -52,7 +52,11 @@ def gradient(integrator, method, num_steps):
     return lg.differentiate(WORK, build, P, t1=T1, num_steps=num_steps, integrator=integrator, method=method).gradient
 
 
-@pytest.mark.parametrize("method", [lg.DirectDifferentiation(), lg.AdjointVariable()], ids=["direct", "adjoint"])
+@pytest.mark.parametrize(
+    "method",
+    [pytest.param(lg.DirectDifferentiation(), marks=pytest.mark.slow), lg.AdjointVariable()],
+    ids=["direct", "adjoint"],
+)
 @pytest.mark.parametrize(
     "integrator",
     [
@@ -144,9 +148,8 @@ METHODS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", ["adjoint", *(pytest.param(name, marks=pytest.mark.slow) for name in ("direct", "at once"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", METHODS)
 def test_by_all_methods_on_a_ramp(name):
     mode, method = METHODS[name]
     check(jax.jit(mode(functools.partial(of_ramp, integrator=lg.AlignedSteps(), sensitivity=method)))(arrays()))
@@ -191,7 +194,11 @@ def test_second_derivatives():
         assert float(second[name]) == pytest.approx(float(found), abs=2e-5 * float(second["length"]))  # as in `check`
 
 
-@pytest.mark.parametrize("method", [lg.DirectDifferentiation(), lg.AdjointVariable()], ids=["on the fly", "by parts"])
+@pytest.mark.parametrize(
+    "method",
+    [lg.DirectDifferentiation(), pytest.param(lg.AdjointVariable(), marks=pytest.mark.slow)],
+    ids=["on the fly", "by parts"],
+)
 @pytest.mark.parametrize("given", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["aligned", "given"])
 def test_criteria_know_the_times(method, given):
     integrator = reference()[0] if given else lg.AlignedSteps()
@@ -250,9 +257,9 @@ def test_pieces_of_equal_steps_are_two_in_the_rule_of_fourth_order():
 def test_steps_of_one_scene_in_another():
     """With as many breaks steps end at those; with others, they are of the given sizes."""
     first = lg.Ramp(end=1.0, t_start=0.2, duration=0.3)
-    run = lg.simulate(turned(first), t1=1.0, num_steps=50, integrator=lg.AlignedSteps())
+    run = lg.simulate(pushed(first), t1=1.0, num_steps=50, integrator=lg.AlignedSteps())
     steps = lg.GivenSteps.of(run)
-    of = lambda signal: np.asarray(lg.simulate(turned(signal), t1=2.0, num_steps=50, integrator=steps).t)
+    of = lambda signal: np.asarray(lg.simulate(pushed(signal), t1=2.0, num_steps=50, integrator=steps).t)
     later = of(lg.Ramp(end=1.0, t_start=0.7, duration=0.9))
     for edge in (0.7, 1.6):
         assert np.abs(later - edge).min() < 1e-14 * 50  # of sums of 50 sizes
