@@ -128,7 +128,7 @@ def kinematics(
     drive = Drive(system, tuple(where[name] for name in names))
     whole = None
     if model.removed:
-        whole = dataclasses.replace(with_numbers(model, start, names), redundant="minimum_norm").system()
+        whole = dataclasses.replace(with_numbers(model, start, names), redundant="refuse").system()
         whole = Drive(whole, tuple(drivers(whole)[name] for name in names))
     time = jnp.broadcast_to(start, shape) if t is None else times["t"]
     clock = jnp.zeros_like(time) if t is None else jnp.ones_like(time)

@@ -39,7 +39,6 @@ from lgsens.integrate._pieces import (
     MANY as MANY,
     PieceEnds as PieceEnds,
     moved as moved,
-    piece_ends as piece_ends,
     piece_lengths as piece_lengths,
 )
 from lgsens.integrate._radau import RadauIIA as RadauIIA

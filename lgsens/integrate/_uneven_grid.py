@@ -54,9 +54,7 @@ class UnevenGrid(AbstractGrid):
     count: Float[Array, ""] | None = None  # of the steps that are not empty, where it is known
     fixed: bool = eqx.field(static=True, default=False)
     restarts: Float[Array, " k"] | None = None
-    moving: Float[Array, " n"] | None = (
-        None  # 1 for steps whose ratio varies though it is `fixed`, else 0; None: of all
-    )
+    moving: Float[Array, " n"] | None = None  # 1 for steps whose ratio varies though `fixed`, else 0; None: for none
     with_empty: ClassVar[bool] = True
     num_steps: ClassVar[Any] = property(lambda self: self.h.shape[-1])  # no argument, where the base has a field
 
