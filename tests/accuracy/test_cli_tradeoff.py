@@ -107,11 +107,13 @@ def test_a_ladder_of_three_programs():
 
 @pytest.mark.slow  # two minutes
 def test_compilations_of_the_command(tmp_path, compiled):
-    """Of fourteen settings and of the reference: three programs forward, three backward."""
+    """Of fourteen settings and of the reference: three programs forward, three backward; and one for each number of
+    steps that are placed."""
     jax.clear_caches()
     names, status = compiled(main, ["tradeoff", "quarter-car", "--quiet", "--out", str(tmp_path / "found")])
     assert status == 0
-    assert names.count("_motion") == 3 and names.count("_pulled_to_scene") == 3
+    placed = sum(setting.pilot is not None for setting in SCENES["quarter-car"]().settings)
+    assert names.count("_motion") == names.count("_pulled_to_scene") == 3 + placed
 
 
 def committed(name: str):
