@@ -54,7 +54,7 @@ def gradient(integrator, method, num_steps):
 
 @pytest.mark.parametrize(
     "method",
-    [pytest.param(lg.DirectDifferentiation(), marks=pytest.mark.slow), lg.AdjointVariable()],
+    [lg.DirectDifferentiation(), pytest.param(lg.AdjointVariable(), marks=pytest.mark.slow)],
     ids=["direct", "adjoint"],
 )
 @pytest.mark.parametrize(
@@ -194,12 +194,9 @@ def test_second_derivatives():
         assert float(second[name]) == pytest.approx(float(found), abs=2e-5 * float(second["length"]))  # as in `check`
 
 
-@pytest.mark.parametrize(
-    "method",
-    [lg.DirectDifferentiation(), pytest.param(lg.AdjointVariable(), marks=pytest.mark.slow)],
-    ids=["on the fly", "by parts"],
-)
-@pytest.mark.parametrize("given", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["aligned", "given"])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [lg.DirectDifferentiation(), lg.AdjointVariable()], ids=["on the fly", "by parts"])
+@pytest.mark.parametrize("given", [False, True], ids=["aligned", "given"])
 def test_criteria_know_the_times(method, given):
     integrator = reference()[0] if given else lg.AlignedSteps()
     settings = {"t1": RAMP["t1"], "num_steps": 48, "integrator": integrator, "method": method}
