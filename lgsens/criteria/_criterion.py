@@ -8,10 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from lgsens._validate import as_float, require
 from lgsens.dynamics import AbstractSystem, State, breaks_of
+from lgsens.integrate import nearest_ends
 from lgsens.sensitivity import Functional
 from lgsens.simulation import Instant, Trajectory
 
@@ -125,15 +126,18 @@ def time_integral(
         breaks: times at which the slope of the integrand jumps [s], shape (k,): pieces end at those of them at which a
             step does, also where steps before and behind are equal. None: pieces are told from sizes of steps alone.
 
-    Returns the integral [unit of f × s], shape (…). Raises `ValueError` for lengths that differ, another order, and for
-    order 4 with too few times, or a step that is equal to none beside it. Sources: Sonneville & Brüls (2014), eq. (31);
-    Hildebrand, Introduction to Numerical Analysis (1974), §5.8 (Gregory).
+    Returns the integral [unit of f × s], shape (…). Raises `ValueError` for lengths that differ, another order, breaks
+    of another shape, and for order 4 with too few times, or a step that is equal to none beside it. Sources: Sonneville
+    & Brüls (2014), eq. (31); Hildebrand, Introduction to Numerical Analysis (1974), §5.8 (Gregory).
     """
     t, f = as_float(t, None, "`t`"), as_float(f, None, "`f`")
     if t.ndim != 1 or f.ndim < 1 or t.shape[0] != f.shape[0]:
         raise ValueError(
             f"`time_integral`: `t` must have shape (n,) and `f` shape (n, …), got {t.shape} and {f.shape}."
         )
+    breaks = None if breaks is None else as_float(breaks, None, "`breaks`").astype(t.dtype)
+    if breaks is not None and breaks.ndim != 1:
+        raise ValueError(f"`time_integral`: `breaks` must have shape (k,), got {breaks.shape}.")
     if order not in (2, 4):
         raise ValueError(f"`time_integral`: `order` must be 2 (trapezoidal) or 4 (Gregory), got {order!r}.")
     h = jnp.diff(t)
@@ -151,7 +155,8 @@ def time_integral(
     )
     equal = _equal_to_next(jax.lax.stop_gradient(t))  # of the steps from t_n and t_{n+1}
     if breaks is not None and breaks.size:
-        equal &= ~_met(*jax.lax.stop_gradient((t, breaks.astype(t.dtype))))[1:-1]
+        nearest, met = nearest_ends(*jax.lax.stop_gradient((t, breaks)), 1e-3)
+        equal &= ~jnp.zeros(t.size, bool).at[nearest].max(met)[1:-1]
     begins = jnp.where(equal & ~jnp.pad(equal, (1, 0))[:-1], h[:-1], 0.0)
     ends = jnp.where(equal & ~jnp.pad(equal, (0, 1))[1:], h[1:], 0.0)
     slopes, bends = jnp.diff(f, axis=0), jnp.diff(f, 2, axis=0)
@@ -164,15 +169,6 @@ def _equal_to_next(t):
     xp = np if isinstance(t, np.ndarray) else jnp
     h = xp.diff(t)
     return xp.abs(xp.diff(h)) <= 1e-6 * h[1:] + 32 * float(np.finfo(t.dtype).eps) * xp.max(xp.abs(t))
-
-
-def _met(t: Float[Array, " n"], breaks: Float[Array, " k"]) -> Bool[Array, " n"]:
-    """Which times a break is at, up to a thousandth of a step."""
-    after = jnp.clip(jnp.searchsorted(t, breaks), 1, t.size - 1)
-    before = after - 1
-    nearest = jnp.where(t[after] - breaks < breaks - t[before], after, before)
-    there = jnp.abs(t[nearest] - breaks) <= 1e-3 * (t[after] - t[before])
-    return jnp.zeros(t.size, bool).at[nearest].max(there)
 
 
 def _in_pieces(t: np.ndarray) -> bool:

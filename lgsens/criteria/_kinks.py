@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from lgsens.dynamics import AbstractSystem, breaks_of
+from lgsens.integrate import SHORTEST
 from lgsens.model import element_forces, scene_of
 from lgsens.simulation import Trajectory
 
@@ -24,7 +25,6 @@ _SPIKE = 8.0  # differences beside a smooth change differ by less
 _INSIDE = 0.1
 _VISIBLE = 1e-4  # of the largest value of a run: smaller kinks move a result by less than the scheme does
 _ROUND_OFF = 1e5  # of a configuration of some turns, over h²
-_TOGETHER = 1e-6  # of a run: breaks that steps take for one
 _SAME = 1e-9  # of the largest change of a break
 _REACH = 5  # times before and behind one, of the differences below
 _AS_LARGE = 0.5  # of the largest acceleration of a run: second differences that are not resolved
@@ -101,7 +101,7 @@ def breaks_apart(trajectory: Trajectory, change: AbstractSystem) -> tuple[Float[
     order = jnp.argsort(breaks)
     breaks, moving = breaks[order], moving[order]
     inside = (breaks[:-1] > t[0]) & (breaks[1:] < t[-1])
-    together = inside & (jnp.diff(breaks) <= _TOGETHER * (t[-1] - t[0]))
+    together = inside & (jnp.diff(breaks) <= SHORTEST * (t[-1] - t[0]))
     apart = jnp.abs(jnp.diff(moving)) > _SAME * jnp.max(jnp.abs(moving), initial=0.0)
     n = jnp.searchsorted(t, breaks[:-1])
     near = lambda k: a[jnp.clip(n + k, 0, t.size - 1)]

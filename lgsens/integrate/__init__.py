@@ -37,8 +37,10 @@ from lgsens.integrate._march import (
 )
 from lgsens.integrate._pieces import (
     MANY as MANY,
+    SHORTEST as SHORTEST,
     PieceEnds as PieceEnds,
     moved as moved,
+    nearest_ends as nearest_ends,
     piece_lengths as piece_lengths,
 )
 from lgsens.integrate._radau import RadauIIA as RadauIIA

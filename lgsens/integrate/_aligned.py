@@ -21,7 +21,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import breaks_of
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
 from lgsens.integrate._given import AbstractUnevenSteps, GivenSteps
 from lgsens.integrate._grid import Steps
@@ -77,9 +76,6 @@ class AlignedSteps(AbstractUnevenSteps):
         sizes, begins = moved(sizes, known, now)
         how = {"room": counted, "count": steps if counted else None, "fixed": True, "moving": begins}
         return Laid(UnevenGrid.first(t0, sizes, restarts=self.integrator.restarts(system), **how))
-
-    def moves(self, system):
-        return breaks_of(system).size > 0
 
     @property
     def equal_pieces(self):

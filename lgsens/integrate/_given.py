@@ -30,6 +30,9 @@ class AbstractUnevenSteps(AbstractIntegrator):
     def equal_steps(self):
         return False
 
+    def moves(self, system):
+        return breaks_of(system).size > 0
+
 
 class GivenSteps(AbstractUnevenSteps):
     """Steps of given sizes: an integrator of `simulate`.

@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.dynamics import breaks_of
 
 MANY = 256  # pieces: more are the samples of a table, which are many for steps to end at each
-_SHORTEST = 1e-6  # of the interval: a break that is no farther from another one is that
+SHORTEST = 1e-6  # of the interval: a break that is no farther from another one is that
 _MET = 0.1  # of a step: so near to its end a break is there
 _SEEN = 3.0  # steps in a piece, at whose ends something of what happens there is seen
 
@@ -35,7 +35,17 @@ def piece_ends(scene: Any, t0, t1) -> Float[Array, " k+1"]:
 def piece_lengths(scene: Any, t0, t1) -> Float[Array, " k+1"]:
     """The lengths of these pieces; some are 0."""
     lengths = jnp.diff(piece_ends(scene, t0, t1), prepend=0.0)
-    return jnp.where(lengths > _SHORTEST * (t1 - t0), lengths, 0.0)
+    return jnp.where(lengths > SHORTEST * (t1 - t0), lengths, 0.0)
+
+
+def nearest_ends(
+    t: Float[Array, " n+1"], times: Float[Array, " k"], within: float
+) -> tuple[Int[Array, " k"], Bool[Array, " k"]]:
+    """Which of the ends of steps is nearest to each of some times, and whether it is within such a part of a step."""
+    after = jnp.clip(jnp.searchsorted(t, times), 1, t.size - 1)
+    to_after, to_before = t[after] - times, times - t[after - 1]
+    nearest = jnp.where(to_after <= to_before, after, after - 1)
+    return nearest, jnp.minimum(jnp.abs(to_after), jnp.abs(to_before)) <= within * (to_after + to_before)
 
 
 def moved(
@@ -46,10 +56,7 @@ def moved(
     if known.size == 1:
         return sizes * (ends[0] / known[0]), None
     nodes = jnp.concatenate([jnp.zeros_like(sizes[:1]), jnp.cumsum(sizes)])
-    after = jnp.clip(jnp.searchsorted(nodes, known), 1, sizes.size)
-    to_after, to_before = nodes[after] - known, known - nodes[after - 1]
-    at = jnp.where(to_after <= to_before, after, after - 1)
-    met = jnp.minimum(jnp.abs(to_after), jnp.abs(to_before)) <= _MET * (to_after + to_before)
+    at, met = nearest_ends(nodes, known, _MET)
     # A break at which no step ends is none: like the last one before it.
     last = lax.cummax(jnp.where(met.at[-1].set(True), jnp.arange(at.size), -1))
     at = jnp.where(last < 0, 0, at[last])

@@ -41,7 +41,7 @@ from jaxtyping import Array, Bool, Float, Int
 from lgsens._brief import brief
 from lgsens._validate import require_setting
 from lgsens._xla import alike, in_any_lane, scan, while_loop
-from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk, breaks_of, unsteady_rate
+from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk, unsteady_rate
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
 from lgsens.integrate._given import AbstractUnevenSteps, GivenSteps
 from lgsens.integrate._grid import Start, renewed
@@ -120,9 +120,6 @@ class AdaptiveSteps(AbstractUnevenSteps):
         restarts = self.integrator.restarts(system)
         grid = UnevenGrid.first(t0, sizes, room=True, fixed=True, restarts=restarts, moving=begins)
         return Laid(grid, (states, Stats(*stats[: len(Stats._fields)])), stats, reached)
-
-    def moves(self, system):
-        return breaks_of(system).size > 0
 
     def frozen(self, trajectory):
         return GivenSteps.of(trajectory, self.integrator)

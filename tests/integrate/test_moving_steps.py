@@ -267,3 +267,8 @@ def test_steps_of_one_scene_in_another():
 def test_bad_input(ends):
     with pytest.raises(ValueError, match="GivenSteps: `ends` must"):
         lg.GivenSteps([1.0, 2.0], ends=ends)
+
+
+def test_bad_breaks():
+    with pytest.raises(ValueError, match=r"`breaks` must have shape \(k,\), got \(\)"):
+        lg.time_integral(jnp.linspace(0.0, 1.0, 5), jnp.ones(5), order=4, breaks=0.5)
