@@ -1,6 +1,5 @@
 """`kinematics`: the motion that joints and prescribed coordinates alone determine."""
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -24,7 +23,7 @@ from lgsens.analysis._driven import (
     unless_jumped,
     with_numbers,
 )
-from lgsens.dynamics import RESULTS, State, forces_of_motion, positions
+from lgsens.dynamics import RESULTS, State, forces_of_motion, names_of_all, positions
 from lgsens.model import Model, MultibodySystem
 from lgsens.simulation import AbstractRun, throw_if_failed
 
@@ -126,22 +125,18 @@ def kinematics(
         )
     where = drivers(system)
     drive = Drive(system, tuple(where[name] for name in names))
-    whole = None
-    if model.removed:
-        whole = dataclasses.replace(with_numbers(model, start, names), redundant="refuse").system()
-        whole = Drive(whole, tuple(drivers(whole)[name] for name in names))
     time = jnp.broadcast_to(start, shape) if t is None else times["t"]
     clock = jnp.zeros_like(time) if t is None else jnp.ones_like(time)
-    (states, result), details = _kinematics_jit(*alike((drive, whole, (given, time), (speed, clock))))
+    (states, result), details = _kinematics_jit(*alike((drive, (given, time), (speed, clock))))
     if throw:
         details = details if isinstance(result, Tracer) else details | {"names": names}
-        states = throw_if_failed(states, result, details, (system if whole is None else whole.system).constraint_names)
+        states = throw_if_failed(states, result, details, names_of_all(system))
     return Kinematics(values=values, t=time, states=states, result=result, system=system)
 
 
 @eqx.filter_jit
-def _kinematics_jit(drive: Drive, whole: Drive | None, driven, rates):
-    found = positions(drive, *driven, whole=whole)
+def _kinematics_jit(drive: Drive, driven, rates):
+    found = positions(drive, *driven)
     states = jax.vmap(lambda *args: forces_of_motion(drive, *args))(found.q, driven, rates)
     sound = found.found & jnp.all(jnp.isfinite(jnp.hstack([states.v, states.vdot, states.lam])), axis=1)
     first = jnp.argmin(sound)  # the first that was not found or has no rates, 0 if all have

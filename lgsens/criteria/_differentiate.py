@@ -20,7 +20,7 @@ from lgsens.criteria._criterion_use import Use, checked_for
 from lgsens.criteria._index_reduced_method import by_index_reduced
 from lgsens.criteria._reference_methods import STENCIL, FiniteDifferences, IndexReduced
 from lgsens.criteria._to_accuracy import differentiate_to
-from lgsens.dynamics import RESULTS, AbstractSystem, State, Turns
+from lgsens.dynamics import RESULTS, AbstractSystem, Faults, State
 from lgsens.integrate import AbstractIntegrator, EqualGrid, GeneralizedAlpha, UnevenGrid
 from lgsens.model import Model
 from lgsens.sensitivity import (
@@ -264,7 +264,7 @@ def _on_the_fly(task: _Task, p, constant: bool) -> _Found:
     found = direct_on_the_fly(scheme, start, stacked(task.criteria, task.unravel), p, constant)
     begun, laid = found.begun
     t = laid.grid.times()
-    ended = outcome(scheme, begun, found.stats, Turns.between(t, found.turning), t, laid)
+    ended = outcome(scheme, begun, found.stats, Faults.between(t, found.unseen), t, laid)
     return _Found(found.value, found.gradient, *ended)
 
 

@@ -17,6 +17,7 @@ from lgsens.dynamics._constraints import (
     constraint_velocity as constraint_velocity,
     fixed_velocity_rate as fixed_velocity_rate,
     full_jacobian as full_jacobian,
+    names_of_all as names_of_all,
     prescribed_velocity as prescribed_velocity,
 )
 from lgsens.dynamics._equilibrium import equilibrium as equilibrium
@@ -75,9 +76,9 @@ from lgsens.dynamics._system import (
     autodiff_tangents as autodiff_tangents,
     finite as finite,
 )
-from lgsens.dynamics._turning import (
-    Turning as Turning,
-    Turns as Turns,
+from lgsens.dynamics._unseen import (
+    Faults as Faults,
+    Unseen as Unseen,
     jumped as jumped,
     unsteady_rate as unsteady_rate,
 )

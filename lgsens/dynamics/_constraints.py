@@ -23,10 +23,12 @@ homogeneous J x = 0, a velocity is made consistent by J v = −c(q, 0, t) (`_ini
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem
 
+_BROKEN = 1e-3  # rad, or of the scene: more than given lengths and axes of repeated equations contradict each other
 _CALLS = ("jit", "pjit")  # operations of JAX with the program of a function in `jaxpr`
 
 
@@ -36,6 +38,26 @@ def full_jacobian(system: AbstractSystem, q, t) -> Float[Array, "m k"]:
         return system.sparse_constraint_jacobian(q, t).dense()
     jacobian = system.constraint_jacobian(q, t)
     return jnp.concatenate([jacobian, system.velocity_jacobian(q, t)]) if system.num_velocity_rows else jacobian
+
+
+def missing(system: AbstractSystem, q, t) -> Float[Array, " r"]:
+    """Φ of the equations that were left out, where it is more than numbers of the scene contradict each other; else 0.
+    Without derivative."""
+    left = lax.stop_gradient(system.repeated_constraint(q, t))
+    if not left.size:
+        return left
+    most = _BROKEN * jnp.minimum(jnp.max(system.coordinate_scale()), 1.0)
+    return jnp.where(jnp.abs(left) > lax.stop_gradient(most), left, 0.0)
+
+
+def violation_of_all(system: AbstractSystem, q, t, violation) -> Float[Array, " m+r"]:
+    """Φ = `violation`, 0 for the rows of velocity level, and what is `missing`: in the order of `names_of_all`."""
+    return jnp.concatenate([violation, jnp.zeros(system.num_velocity_rows, violation.dtype), missing(system, q, t)])
+
+
+def names_of_all(system: AbstractSystem) -> tuple[str, ...]:
+    """A name for each equation, also of those that were left out."""
+    return (*system.constraint_names, *system.repeated_names)
 
 
 def _with_level(system: AbstractSystem, q, v, t, rate) -> Float[Array, " m"]:

@@ -28,7 +28,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._xla import while_loop
-from lgsens.dynamics._constraints import depends_on_time
+from lgsens.dynamics._constraints import depends_on_time, violation_of_all
 from lgsens.dynamics._initial import Initial, accelerations, consistent_velocity, is_redundant
 from lgsens.dynamics._matrices import constraint_jacobian, mass_scale
 from lgsens.dynamics._redundant import softness
@@ -164,5 +164,8 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
         if softness(system) is None:
             redundant = (result == RESULTS.successful) & is_redundant(system, constraint_jacobian(system, q, t))
             result = jnp.where(redundant, RESULTS.redundant_constraints, result).astype(jnp.int32)
+    violation = violation_of_all(system, q, t, system.constraint(q, t))
+    apart = jnp.any(violation[m:] != 0.0) & (result == RESULTS.successful)
+    result = jnp.where(apart, RESULTS.joints_apart, result)
     result = jnp.where(system.is_valid(), result, RESULTS.invalid_numbers).astype(jnp.int32)
-    return Initial(State(q=q, v=v, vdot=vdot, lam=lam, a=vdot), result, system.constraint(q, t))
+    return Initial(State(q=q, v=v, vdot=vdot, lam=lam, a=vdot), result, violation)

@@ -14,6 +14,7 @@ from lgsens.dynamics._constraints import (
     fixed_velocity_rate,
     full_jacobian,
     prescribed_velocity,
+    violation_of_all,
 )
 from lgsens.dynamics._matrices import ConstrainedMass, constraint_jacobian, factorized, for_once, mass_scale
 from lgsens.dynamics._redundant import softness
@@ -29,7 +30,7 @@ class Initial(NamedTuple):
 
     state: State
     result: Int[Array, ""]  # a value of RESULTS
-    violation: Float[Array, " m_p"]  # Φ after assembly
+    violation: Float[Array, " m+r"]  # after assembly, that of all equations (`violation_of_all`)
     factors: Factors | None = None  # of `ConstrainedMass` there
 
 
@@ -213,6 +214,7 @@ def initial_state(system: AbstractSystem, t) -> Initial:
     joints leaves of v_ref, and what the rates of drivers add.
     """
     q, violation = assemble(system, t)
+    violation = violation_of_all(system, q, t, violation)
     _, v_ref = system.reference()
     factors = ConstrainedMass.of(system, q, t).factors
     v = system.settled(q, consistent_velocity(system, q, v_ref, t, factors), t)

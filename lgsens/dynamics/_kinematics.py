@@ -52,11 +52,11 @@ from jax.scipy.linalg import lu_factor, lu_solve
 from jaxtyping import Array, Bool, Float
 
 from lgsens._xla import scan, while_loop
+from lgsens.dynamics._constraints import violation_of_all
 from lgsens.dynamics._matrices import require_linear
 from lgsens.dynamics._system import AbstractSystem, State
 
 _MAX_ITERATIONS = 40
-_BROKEN = 1e-3  # rad, or of the scene: more than given lengths and axes of repeated equations contradict each other
 _SINGULAR = 8.0  # a multiple of √eps: so near to a singular position Newton's iteration ends, there or beside it
 
 
@@ -183,23 +183,17 @@ def _configurations_jvp(primals, tangents):
     return (q, size, singular), (q_dot, jnp.zeros_like(size), np.zeros(singular.shape, jax.dtypes.float0))
 
 
-def positions(
-    drive: AbstractDrive, values: Float[Array, "n d"], t: Float[Array, " n"], whole: AbstractDrive | None = None
-) -> Positions:
+def positions(drive: AbstractDrive, values: Float[Array, "n d"], t: Float[Array, " n"]) -> Positions:
     """The configurations for each row of driven values and times, differentiable by the rule above; NaN where none was
     found, or a singular one.
 
-    `whole`: with the equations that `drive` leaves out because they repeat others. Without them there may be ways to
-    assemble the mechanism at which these do not hold, to which a long step leads.
+    Equations that were left out hold, too: without them there may be ways to assemble the mechanism at which they do
+    not, to which a long step leads.
     """
     q, size, singular = _configurations(drive, values, t)
-    left = lambda drive: jax.vmap(lambda q, s, t: drive.at(s).constraint(q, t))(q, values, t)
-    worst = lambda violation: jnp.max(jnp.abs(violation), axis=1)
-    violation = left(drive)
-    satisfied = worst(violation) <= drive.system.constraint_round_off()  # NaN is not
-    if whole is not None:
-        violation = left(whole)
-        satisfied &= worst(violation) <= _BROKEN * jnp.minimum(jnp.max(drive.system.coordinate_scale()), 1.0)
+    at = lambda system, q, t: violation_of_all(system, q, t, system.constraint(q, t))
+    violation = jax.vmap(lambda q, s, t: at(drive.at(s), q, t))(q, values, t)
+    satisfied = jnp.max(jnp.abs(violation), axis=1) <= drive.system.constraint_round_off()  # NaN is not
     found = _small(size) & satisfied & ~singular
     poison = lambda leaf: jnp.where(found.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.nan)
     return Positions(jax.tree.map(poison, q), found, satisfied & singular, violation)

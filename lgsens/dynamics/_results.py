@@ -22,6 +22,7 @@ class RESULTS(IntEnum):
     not_held = 13
     off_joints = 14
     angle_jumped = 15
+    joints_apart = 16
 
     @property
     def message(self) -> str:
@@ -71,6 +72,12 @@ _MESSAGES = {
         "a spring count whole turns (`TorsionSpringDamper` or `CoordinateForce` with turns=True), divide a beam into "
         "more elements; give gears and couplings `teeth` of which the ratio makes an integer, or None where there are "
         "none (`GearJoint`); couple an angle to a displacement, not that to the angle (`CoordinateCoupling`)."
+    ),
+    RESULTS.joints_apart: (
+        "Equations of joints that redundant='remove' left out do not hold any more. Others imply them for lengths and "
+        "axes that fit, as parallel axes of a planar linkage do, and on one branch of the motion: these numbers do not "
+        "fit, or the motion has changed the branch. Keep what has to fit in the parameters of a design, or let a joint "
+        "give way (`Bushing`); for a branch take smaller steps."
     ),
     RESULTS.position_failed: (
         "No position satisfies the joints for these values of the driven ones: they are out of reach, or the mechanism "

@@ -48,6 +48,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from lgsens._xla import in_any_lane, scan, while_loop
+from lgsens.dynamics._constraints import missing
 from lgsens.dynamics._kinematics import AbstractDrive
 from lgsens.linear import LU, Inverse, LinearEquations, linear_solve
 
@@ -310,6 +311,8 @@ def static_path(
     the rule above; NaN where none was found."""
     q, lam, w, lam_rate, *ended = _path(starts, drive, values, rates, t)
     done, free, stable, snapped = (flag > 0 for flag in ended)
+    apart = jax.vmap(lambda q, s: jnp.any(missing(drive.at(s), q, t) != 0.0))(q, values)
+    done = done & ~apart
     held = done & ~free
     poison = lambda leaf: jnp.where(held.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.nan)
     q, lam, w, lam_rate = jax.tree.map(poison, (q, lam, w, lam_rate))

@@ -151,6 +151,15 @@ class AbstractSystem(eqx.Module):
         """Angles that q tells within half a turn and that forces depend on, which jump there [rad]; of none."""
         return jnp.zeros_like(self.reference()[1], shape=0)
 
+    @property
+    def repeated_names(self) -> tuple[str, ...]:
+        """A name for each equation that was left out because the m constraints imply it."""
+        return ()
+
+    def repeated_constraint(self, q, t) -> Float[Array, " r"]:
+        """Φ of these equations, zero as long as that is so."""
+        return jnp.zeros_like(self.reference()[1], shape=0)
+
     # Forces that depend on the multipliers, as friction of joints does: f(q, v, λ, t).
 
     @property

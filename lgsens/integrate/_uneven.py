@@ -20,7 +20,7 @@ and not 342, with the same number of steps and error, 72 of 616 instead of 513 o
 0.85 as many, but three times as many steps are rejected; up to 1.3 steps are 4 % more.)
 
 From π in a step on the samples of an unsteady body, and with them the estimate of the error, say nothing of its motion
-(`dynamics._turning`): no step turns one by more than half of it, whatever its error.
+(`dynamics._unseen`): no step turns one by more than half of it, whatever its error.
 
 The derivative is that of the scheme on the grid found, so nothing here is differentiated.
 

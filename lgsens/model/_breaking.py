@@ -6,7 +6,7 @@ import numpy as np
 
 from lgsens.dynamics import Breaking, breaks_of
 from lgsens.linear import added
-from lgsens.model._stack import at_ends
+from lgsens.model._stack import position_values
 
 
 def breaking_of(system: Any) -> Breaking | None:
@@ -21,8 +21,7 @@ def breaking_of(system: Any) -> Breaking | None:
         broken[each[each >= 0]] = True
 
     def constraint(q, t):
-        placed = zip(stacks, at_ends(stacks, system._placed(q)), rows)
-        values = [(stack.map(lambda e, *args: e.value(*args), ends, (t,)), of) for stack, ends, of in placed]
+        values = list(zip(position_values(stacks, system._placed(q), t), rows))
         return added(values, system.topology.num_constraints - system.num_velocity_rows, system.mass.dtype)
 
     return Breaking(breaks_of(stacks), broken, constraint)

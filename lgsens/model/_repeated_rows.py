@@ -7,7 +7,7 @@ repeats others, they determine already what it prescribes.
 """
 
 import dataclasses
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 import jax.numpy as jnp
@@ -16,9 +16,11 @@ from jaxtyping import Bool
 
 from lgsens._validate import is_concrete
 from lgsens.dynamics import jacobians_on_the_way, rank_near_reference, redundant_names, repeated_rows
+from lgsens.model._constraints import AbstractRows
 from lgsens.model._frames import ROTATION
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._signals import AbstractSignal
+from lgsens.model._stack import Stack
 from lgsens.model._system import MultibodySystem
 
 # Of each equation its joint, which of the joint's basic constraints, and which row of that.
@@ -92,15 +94,21 @@ def without(system: MultibodySystem, equations: Equations) -> MultibodySystem:
     """The equations of motion without those of joints, also of parts that are merged."""
     if not equations:
         return system
-    gone, constraints = frozenset(equations), []
-    for stack in system.constraints:
-        kept = tuple(
-            tuple(own and (owner, place, i) not in gone for i, own in enumerate(of))
-            for owner, place, of in zip(stack.owners, stack.places, stack.kept)
-        )
-        if which := [i for i, of in enumerate(kept) if any(of)]:
-            constraints.append(dataclasses.replace(stack, kept=kept).only(*which))
+    gone, constraints, repeated = frozenset(equations), [], []
+    for i, stack in enumerate(system.constraints):
+        constraints += _those(stack, lambda row: row not in gone)
+        repeated += _those(stack, lambda row: row in gone) if i < system.topology.num_positions else []
     parts = system.parts
     if parts is not None:
         parts = dataclasses.replace(parts, system=without(parts.system, equations))
-    return dataclasses.replace(system, constraints=tuple(constraints), parts=parts)
+    return dataclasses.replace(system, constraints=tuple(constraints), repeated=tuple(repeated), parts=parts)
+
+
+def _those(stack: Stack[AbstractRows], chosen: Callable[[tuple[str, int, int]], bool]) -> list[Stack[AbstractRows]]:
+    """The elements of a stack with those of its equations; none, or one stack."""
+    kept = tuple(
+        tuple(own and chosen((owner, place, i)) for i, own in enumerate(of))
+        for owner, place, of in zip(stack.owners, stack.places, stack.kept)
+    )
+    which = [i for i, of in enumerate(kept) if any(of)]
+    return [dataclasses.replace(stack, kept=kept).only(*which)] if which else []

@@ -117,6 +117,13 @@ class SE3System(AbstractRedundantSystem):
         vdot = self.to_bodies(q, self._acceleration(v, vdot))
         return self._from_bodies(q, self.bodies.residual(q, self.to_bodies(q, v), vdot, lam, t))
 
+    @property
+    def repeated_names(self):
+        return self.bodies.repeated_names
+
+    def repeated_constraint(self, q, t):
+        return self.bodies.repeated_constraint(q, t)
+
     def constraint(self, q, t):
         return self.bodies.constraint(q, t)
 

@@ -225,6 +225,12 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
     return tuple(sorted(stacks, key=lambda stack: stack.ends.velocity))
 
 
+def position_values(stacks: Sequence[Stack[Any]], q: Pose, t) -> list[Float[Array, "e rows"]]:
+    """Φ of the elements of each stack, those that are not kept too."""
+    of_elements = lambda element, *args: element.value(*args)
+    return [stack.map(of_elements, ends, (t,)) for stack, ends in zip(stacks, at_ends(stacks, q))]
+
+
 # Elements with closed-form tangents use them; for the others autodiff perturbs by R (I + θ̃).
 
 

@@ -19,6 +19,7 @@ from lgsens.model._checks import are_bodies, far_from_rotation
 from lgsens.model._constraints import AbstractRows
 from lgsens.model._frames import BODY_DIM, ROTATION, Frame, motion_at
 from lgsens.model._given_joints import GivenJoints, JointsOf
+from lgsens.model._left_out import names_left_out, values_left_out
 from lgsens.model._loads import AbstractDynamicLoad, AbstractLoad, generalized_force
 from lgsens.model._merged_parts import Parts
 from lgsens.model._sizes import compliance, coordinate_scale
@@ -30,13 +31,13 @@ from lgsens.model._stack import (
     constraint_stiffness,
     load_by_multipliers,
     load_tangents,
+    position_values,
     square_blocks,
     state_coordinates,
 )
 from lgsens.model._topology import Topology, topology
 
-# A gradient evaluates these five times in its program. `inline` leaves no call behind; what it saves is tracing,
-# a third of it on the quarter-car.
+# A gradient evaluates these five times; `inline` leaves no call behind, and saves a third of tracing the quarter-car.
 _traced_once = partial(jax.jit, inline=True)
 
 
@@ -69,6 +70,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     assembled: bool = eqx.field(static=True)
     linear_solver: AbstractLinearSolver | None = eqx.field(static=True)  # None: the cheaper one
     minimum_norm: bool = eqx.field(static=True)  # whether constraints may be redundant
+    repeated: tuple[Stack[AbstractRows], ...] = ()  # those of position level that are left out
 
     @property
     def topology(self) -> Topology:
@@ -90,8 +92,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
 
     def twists(self, v: Float[Array, "*batch k"]) -> Float[Array, "*batch N 6"]:
         """[ẋ, Ω] of each body, or their rates of change, from v or v̇: zero where a body is not free."""
-        group = self.group
-        return group.rows(v) if isinstance(group, Poses) else v.reshape(*v.shape[:-1], -1, BODY_DIM)
+        return group.rows(v) if isinstance(group := self.group, Poses) else v.reshape(*v.shape[:-1], -1, BODY_DIM)
 
     def angular_velocities(self, v):
         return self.twists(v)[..., ROTATION]
@@ -140,6 +141,10 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         return np.concatenate([np.zeros(0, int), *(own[i][own[i] >= 0] for i in sorted(own))])
 
     breaking: ClassVar[Any] = property(breaking_of)
+    repeated_names: ClassVar[Any] = property(names_left_out)
+
+    def repeated_constraint(self, q, t):
+        return values_left_out(self, q, t)
 
     def of_parts(self, q, v, vdot):
         """The system of the bodies as they are named, and their q, v, v̇: those of this one unless some are merged."""
@@ -278,12 +283,9 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
 
     @_traced_once
     def constraint(self, q, t):
-        q, stacks = self._placed(q), self.constraints[: self.topology.num_positions]
-        values = [
-            (stack.map(lambda e, *args: e.value(*args), ends, (t,)), rows)
-            for stack, ends, rows in zip(stacks, at_ends(stacks, q), self.topology.rows)
-        ]
-        return added(values, self.topology.num_constraints - self.num_velocity_rows, self.mass.dtype)
+        of = self.topology
+        values = position_values(self.constraints[: of.num_positions], self._placed(q), t)
+        return added(list(zip(values, of.rows)), of.num_constraints - self.num_velocity_rows, self.mass.dtype)
 
     @_traced_once
     def velocity_constraint(self, q, v, t):
@@ -300,8 +302,7 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
         return every[: -self.num_velocity_rows] if self.num_velocity_rows else every
 
     def velocity_jacobian(self, q, t):
-        every = self.sparse_constraint_jacobian(q, t).dense()
-        return every[every.shape[0] - self.num_velocity_rows :]
+        return self.sparse_constraint_jacobian(q, t).dense()[self.topology.num_constraints - self.num_velocity_rows :]
 
     @_traced_once
     def sparse_constraint_jacobian(self, q, t):

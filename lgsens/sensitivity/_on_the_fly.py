@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import State, Turning
+from lgsens.dynamics import State, Unseen
 from lgsens.integrate import AbstractScheme, Stats, Variation, Walk, over_steps, with_first
 from lgsens.sensitivity._criterion_terms import Functional
 from lgsens.sensitivity._linearization import (
@@ -35,7 +35,7 @@ class OnTheFly(NamedTuple):
     value: Float[Array, " c"]
     gradient: Float[Array, "c p"]
     stats: Stats
-    turning: Turning  # at all instants
+    unseen: Unseen  # at all instants
     begun: Any
 
 
@@ -93,19 +93,19 @@ def direct_on_the_fly(
         total = jax.tree.map(lambda total, f: total + weigh(node.h) * f, total, both)
         if d_node is not None:
             total = total[0], total[1] + jnp.outer(weigh(d_node.h), both[0])
-        return (progress, delta, rate, total), (stats, Turning.at(system, progress.state))
+        return (progress, delta, rate, total), (stats, Unseen.at(system, progress.state, node.t))
 
     delta0 = jax.vmap(lambda tangent: to_algebra(group, state0, tangent))(d_state0)
     first = with_derivative(functional.rate, state0, grid.t0, delta0, None if constant else d.grid.t0)
     start = (walk.begin(grid, state0, exact=True), delta0, first, jax.tree.map(jnp.zeros_like, first))
     # places are numbered along the first axis, parameters along the second
     d_places = jax.vmap(lambda d: place_tangents(grid, d), out_axes=1)(d.grid)
-    begin_turning = Turning.at(system, state0)
-    (end, delta, _, integral), (stats, turning) = over_steps(
-        step, start, (grid.places(), d_places), grid.count, (Stats.none(grid.t0), begin_turning)
+    first_unseen = Unseen.at(system, state0, grid.t0)
+    (end, delta, _, integral), (stats, unseen) = over_steps(
+        step, start, (grid.places(), d_places), grid.count, (Stats.none(grid.t0), first_unseen)
     )
     times = lambda grid: grid.times()[-1]
     d_end = None if constant else jax.vmap(lambda d: jax.jvp(times, (grid,), (d,))[1])(d.grid)
     final = with_derivative(functional.final, end.state, times(grid), delta, d_end)
     value, derivative = jax.tree.map(jnp.add, integral, final)
-    return OnTheFly(value, derivative.T, stats, with_first(begin_turning, turning), begun)
+    return OnTheFly(value, derivative.T, stats, with_first(first_unseen, unseen), begun)

@@ -47,6 +47,8 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
     step, num_steps = int(details.get("step", 0)), int(details.get("num_steps", 0))
     place, time = f"step {step} of {num_steps}", f"t = {details.get('time', 0.0):.6g} s"
     violation, worst = np.abs(details.get("violation", ())), ""
+    if code is RESULTS.joints_apart and len(missing := np.abs(details.get("missing", ()))):
+        violation, names = missing, names[len(names) - len(missing) :]
     if violation.size and np.all(np.isfinite(violation)):
         i = int(np.argmax(violation))
         worst = f"Left over: |Φ| = {violation[i]:.3g}, largest in joint {names[i]!r}."
@@ -85,6 +87,8 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
             more += "position before: let them be less than half a turn apart. `throw=False` returns the data."
         case RESULTS.angle_jumped:
             more = f"It did so in {place}, {time}. `throw=False` returns the data."
+        case RESULTS.joints_apart:
+            more = f"It is so at {place}, {time}. {worst} `throw=False` returns the data." if step else worst
         case RESULTS.position_failed:
             more = f"It failed at position {int(details['position'])}{_driven(details)}, {time}. {worst}"
         case RESULTS.statics_failed | RESULTS.not_held:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from lgsens.dynamics import AbstractSystem, State, Turning
+from lgsens.dynamics import AbstractSystem, State, Unseen
 from lgsens.simulation._trajectory import Instant
 
 Save = Callable[[Instant], Any]
@@ -57,4 +57,4 @@ class Output(eqx.Module):
                 raise ValueError(
                     f"`save` must return numbers and arrays, or a dict or another pytree of them, got {leaf!r}."
                 )
-        return found, Turning.at(system, state)
+        return found, Unseen.at(system, state, t)

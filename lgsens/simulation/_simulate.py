@@ -12,7 +12,7 @@ from jax.core import Tracer
 
 from lgsens._validate import as_count
 from lgsens._xla import alike, tracing
-from lgsens.dynamics import RESULTS, AbstractSystem, State, Turning, Turns
+from lgsens.dynamics import RESULTS, AbstractSystem, Faults, State, Unseen, names_of_all
 from lgsens.integrate import (
     AbstractIntegrator,
     AbstractScheme,
@@ -170,7 +170,7 @@ def simulate(
     if throw:
         fields = ("states", "error", "stages") if save is None else ("values", "final")  # the others say what happened
         motion = {name: getattr(found, name) for name in fields}
-        motion = throw_if_failed(motion, found.result, details, system.constraint_names)
+        motion = throw_if_failed(motion, found.result, details, names_of_all(system))
         found = dataclasses.replace(found, **motion)
     return found
 
@@ -223,18 +223,22 @@ def _simulate_jit(system, t0, t1, num_steps, integrator, sensitivity, state0, sa
     return run(system, begun, t0, t1, num_steps, integrator, sensitivity, save)
 
 
-def outcome(scheme: AbstractScheme, begun: Begin, stats: Stats, turns: Turns, t, laid: Laid):
+def outcome(scheme: AbstractScheme, begun: Begin, stats: Stats, faults: Faults, t, laid: Laid):
     """The result code of a simulation, and what its message needs."""
     failed = jnp.argmin(stats.converged)  # the first step that did not converge, 0 if all did
     newton = jnp.where(jnp.all(stats.converged), RESULTS.successful, scheme.failure)
     singular = singular_steps(stats.margin)
     newton = jnp.where(jnp.any(singular), RESULTS.singular_configuration, newton)
     failed = jnp.where(jnp.any(singular), jnp.argmax(singular), failed)
-    for code, steps in ((RESULTS.angle_jumped, turns.jumped), (RESULTS.turn_not_resolved, turns.of_bodies > jnp.pi)):
+    for code, steps in ((RESULTS.angle_jumped, faults.jumped), (RESULTS.turn_not_resolved, faults.turned > jnp.pi)):
         found = jnp.any(steps) & (newton != scheme.failure)  # which may look singular later
         newton = jnp.where(found, code, newton)
         failed = jnp.where(found, jnp.argmax(steps), failed)
-    newton = jnp.where((newton != RESULTS.successful) & turns.jumping[failed], RESULTS.angle_jumped, newton)
+    newton = jnp.where((newton != RESULTS.successful) & faults.jumping[failed], RESULTS.angle_jumped, newton)
+    if faults.missing.size:
+        apart = jnp.any(faults.apart)  # before Newton's iteration fails, if it does
+        newton = jnp.where(apart, RESULTS.joints_apart, newton)
+        failed = jnp.where(apart, jnp.argmax(faults.apart), failed)
     result = jnp.where(begun.result == RESULTS.successful, newton, begun.result).astype(jnp.int32)
     time = t[failed + 1]
     if laid.reached is not None:
@@ -252,7 +256,8 @@ def outcome(scheme: AbstractScheme, begun: Begin, stats: Stats, turns: Turns, t,
         "iterations": stats.iterations[failed],
         "increment": stats.increment[failed],
         "residual": stats.residual[failed],
-        "turn": turns.of_bodies[failed],
+        "turn": faults.turned[failed],
+        "missing": faults.missing[failed],
         "tolerance": jnp.asarray(scheme.tolerance),
     }
     return result, jax.lax.stop_gradient(details)
@@ -300,10 +305,10 @@ def _single_run(
             states, newton = integrate_ode(scheme, system, grid, scheme.physical(system, state0))
         else:
             states, newton = sensitivity.trajectory(scheme, state0, parameters, laid.found)
-        turning = Turning.along(system, states)
+        unseen = Unseen.along(system, states, t)
     else:
-        (values, turning), final, newton = saved_run(sensitivity, save, scheme, state0, parameters)
-    result, details = outcome(scheme, begun, newton, Turns.between(t, turning), t, laid)
+        (values, unseen), final, newton = saved_run(sensitivity, save, scheme, state0, parameters)
+    result, details = outcome(scheme, begun, newton, Faults.between(t, unseen), t, laid)
     stats = scheme.statistics(newton) if laid.stats is None else laid.stats
     if save is None:
         stages = scheme.stages(system, grid, states)

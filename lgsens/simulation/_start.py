@@ -21,6 +21,7 @@ from lgsens.dynamics import (
     finite,
     full_jacobian,
     initial_state as _initial,
+    names_of_all,
     prescribed_velocity,
 )
 from lgsens.integrate import AbstractScheme, Start
@@ -95,7 +96,7 @@ def _found_state(find: Callable[..., Initial], model: Model | AbstractSystem, t0
     if isinstance(system, MultibodySystem) and is_concrete(initial):
         details["moved"] = jnp.linalg.norm(initial.state.q.position - system.reference()[0].position, axis=1)
         details["bodies"] = system.body_names
-    return throw_if_failed(initial.state, initial.result, details, system.constraint_names)
+    return throw_if_failed(initial.state, initial.result, details, names_of_all(system))
 
 
 def check_state0(system: AbstractSystem, state0: State | Start | None, t0) -> None:

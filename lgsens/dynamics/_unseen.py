@@ -1,4 +1,4 @@
-"""Turns that time steps do not resolve, and such that poses do not tell.
+"""What no equation of a step tells: turns that steps do not resolve or poses do not tell, and joints that came apart.
 
 A load that is fixed in space turns against a body of angular velocity Ω, in the frame of the body: by h|Ω| in a step.
 From π on its samples are those of a slower turn as well, or of none at 2π, and Newton converges to the
@@ -14,6 +14,9 @@ for a pendulum that turns over, does not help. So a body counts as unsteady if
 where round-off makes Ω̇ = ε Ω², and more by the multipliers of joints, and no unsteady body may turn by π in a step.
 
 A force that depends on an angle which poses tell within half a turn jumps where that jumps from π to −π.
+
+Equations that were left out because others imply them are implied on one branch of the motion, for lengths and axes
+that fit (the axes of a planar linkage are parallel). Beyond that the mechanism is another one.
 """
 
 from typing import NamedTuple
@@ -23,6 +26,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from lgsens.dynamics._constraints import missing
 from lgsens.dynamics._system import AbstractSystem, State
 
 
@@ -39,34 +43,44 @@ def jumped(before: Float[Array, "n w"], after: Float[Array, "n w"]) -> Bool[Arra
     return jnp.any(jnp.abs(after - before) > jnp.pi, axis=1)
 
 
-class Turning(NamedTuple):
-    """What tells turns, at some instants: `unsteady_rate` [rad/s], and `AbstractSystem.branches` [rad]."""
+class Unseen(NamedTuple):
+    """What tells it, at some instants: `unsteady_rate` [rad/s], `AbstractSystem.branches` [rad], and what is `missing`
+    of equations that were left out."""
 
     rates: Float[Array, "*n"]
     branches: Float[Array, "*n w"]
+    missing: Float[Array, "*n r"]
 
     @classmethod
-    def at(cls, system: AbstractSystem, state: State) -> "Turning":
-        branches = lax.stop_gradient(system.branches(state.q))
-        return cls(unsteady_rate(system, state.v, state.vdot), branches)
+    def at(cls, system: AbstractSystem, state: State, t) -> "Unseen":
+        q, t = lax.stop_gradient((state.q, t))
+        branches = lax.stop_gradient(system.branches(q))
+        return cls(unsteady_rate(system, state.v, state.vdot), branches, missing(system, q, t))
 
     @classmethod
-    def along(cls, system: AbstractSystem, states: State) -> "Turning":
+    def along(cls, system: AbstractSystem, states: State, t: Float[Array, " n+1"]) -> "Unseen":
         """At all instants of a motion."""
-        return jax.vmap(lambda state: cls.at(system, state))(states)
+        return jax.vmap(lambda state, t: cls.at(system, state, t))(states, t)
 
 
-class Turns(NamedTuple):
-    """Of each step: how far an unsteady body turns in it [rad], whether an angle jumps, and whether one comes to half a
-    turn, at the rate of the step before: where Φ jumps, Newton fails or makes something up."""
+class Faults(NamedTuple):
+    """Of each step: how far an unsteady body turns in it [rad], whether an angle jumps, whether one comes to half a
+    turn, at the rate of the step before: where Φ jumps, Newton fails or makes something up; and what is missing of
+    equations that were left out at its end."""
 
-    of_bodies: Float[Array, " n"]
+    turned: Float[Array, " n"]
     jumped: Bool[Array, " n"]
     jumping: Bool[Array, " n"]
+    missing: Float[Array, "n r"]
 
     @classmethod
-    def between(cls, t: Float[Array, " n+1"], turning: Turning) -> "Turns":
-        h, angles = jnp.diff(t), turning.branches
+    def between(cls, t: Float[Array, " n+1"], unseen: Unseen) -> "Faults":
+        h, angles = jnp.diff(t), unseen.branches
         before = jnp.concatenate([angles[:1], angles[:-2]])
         ahead = jnp.any((jnp.abs(angles[:-1]) <= jnp.pi) & (jnp.abs(2.0 * angles[:-1] - before) > jnp.pi), axis=1)
-        return cls(h * turning.rates[1:], jumped(angles[:-1], angles[1:]) & (h > 0.0), ahead)
+        return cls(h * unseen.rates[1:], jumped(angles[:-1], angles[1:]) & (h > 0.0), ahead, unseen.missing[1:])
+
+    @property
+    def apart(self) -> Bool[Array, " n"]:
+        """Whether these do not hold."""
+        return jnp.any(self.missing != 0.0, axis=1)
