@@ -20,6 +20,11 @@ class Drive(AbstractDrive):
     system: MultibodySystem
     where: tuple[tuple[str, int, int], ...] = eqx.field(static=True)
 
+    @property
+    def own(self):
+        at = [getattr(self.system, kind)[stack].elements.driven[i] for kind, stack, i in self.where]
+        return jnp.stack(at) if at else jnp.zeros_like(self.system.mass, shape=0)
+
     def at(self, values):
         system = self.system
         for kind, stack in dict.fromkeys((kind, stack) for kind, stack, _ in self.where):

@@ -71,8 +71,9 @@ def kinematics(
             repeat each other with `redundant="minimum_norm"`, which says what their multipliers are then, or "remove".
         driven: values by name of a `TranslationDriver` (displacement [m]), a `RotationDriver` (angle [rad]) or a
             `DistanceJoint` (length [m]), in place of its own number or signal, shape (n,) each. The first position is
-            found from the reference configuration, each other one from that before: begin near it, and take steps
-            that cannot be mistaken for another way to assemble the mechanism. None or {}: signals drive it.
+            found from the reference configuration, each other one from that before: where they are far apart, or near
+            a dead centre, in parts, so that no other way to assemble the mechanism is met. A dead centre itself, as
+            that of a parallelogram that lies flat, is passed straight on. None or {}: signals drive it.
         rates: rates of the driven values [m/s], [rad/s], shape () or (n,), by name; those left out are 0. None: 1 for
             all of them. With the one rate 1, velocities are derivatives by the driven value (a motion ratio); with 0,
             forces are those at rest. Beside `t` they must be given: what their rates by time are, values do not tell.

@@ -4,7 +4,16 @@ A driven mechanism has as many equations as coordinates, Φ(q, s, t; p) = 0 with
 numbers p of the system. Where A = B(q, t) is regular, it has one solution q(s, t; p) nearby (Haug 1989, §3.6). What is
 said of s below includes t.
 
-Position. Newton's iteration on the group, q ← q exp(−(A⁻¹Φ)~), from one s to the next.
+Position. Newton's iteration on the group, q ← q exp(−(A⁻¹Φ)~), from one s to the next. Its first step is that along
+the tangent; what the others add, the curvature of the way, is a share of it where s changes by little. But near a dead
+centre two ways to assemble the mechanism come close to each other, and the tangent of one leads to the other. There A
+is singular in between, in the same order for all of its k × k minors: with A₀ at the start, A₁ at the end of a step,
+
+    det A₀ᵀA₁ = Σ (minor of A₀)(minor of A₁)   (Cauchy, Binet)
+
+is negative. So a step from s₀ to s₁ is taken in two, again and again, where it turns too far (`_FAR`), is bent too much
+(`_BENT`), or has this sign. What is so at the shortest steps too (`_LEAST`) passes a singular position itself, as a
+parallelogram that lies flat: the way that goes straight on is followed.
 
 Derivatives of the position. Let δq = q w̃. By the chain rule, with DΦ·(q w̃) = A w,
 
@@ -49,14 +58,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import lu_factor, lu_solve
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from lgsens._xla import scan, while_loop
+from lgsens._xla import while_loop
 from lgsens.dynamics._constraints import violation_of_all
 from lgsens.dynamics._matrices import require_linear
 from lgsens.dynamics._system import AbstractSystem, State
 
 _MAX_ITERATIONS = 40
+_AT_ONCE = 0.2  # rad, or of the scene: of an iteration that looks for the first position
+_FAR = 1.0  # likewise: the first step of an iteration from one position to the next
+_BENT = 1.25  # what the others add, of the first: as much on the way to a dead centre, where s is its square
+_SLOW = 0.75  # a step of that iteration, of the one before; to a singular position it is half of that
+_NEAR = 1e-3  # what they may add always, rad or of the scene
+_LEAST = 2.0**-14  # the shortest part of a step
 _SINGULAR = 8.0  # a multiple of √eps: so near to a singular position Newton's iteration ends, there or beside it
 
 
@@ -65,6 +80,11 @@ class AbstractDrive(eqx.Module):
     more where they may be redundant."""
 
     system: eqx.AbstractVar[AbstractSystem]
+
+    @property
+    @abc.abstractmethod
+    def own(self) -> Float[Array, " d"]:
+        """The values of s that the system has."""
 
     @abc.abstractmethod
     def at(self, values: Float[Array, " d"]) -> AbstractSystem:
@@ -107,65 +127,138 @@ def _solved(matrix: Float[Array, "m k"], rhs: Array, *, transposed: bool = False
 
 
 def _last_step(matrix: Float[Array, "m k"], violation: Float[Array, " m"], scale: Float[Array, " k"]):
-    """A⁻¹ Φ and 1/|w|, which is NaN or 0 where A is exactly singular, by one factorization; not differentiated."""
+    """A⁻¹ Φ and 1/|w|, which is NaN or 0 where A is exactly singular, by one factorization, and Â; no derivatives."""
     scaled = matrix * scale[None, :]
     size = jnp.linalg.norm(scaled, axis=1)
     size = jnp.where(size > 0.0, size, 1.0)  # redundant rows may be zero
-    factors = lu_factor(_square(scaled / size[:, None]))
+    scaled = scaled / size[:, None]
+    factors = lu_factor(_square(scaled))
     solve = lambda rhs, transposed: lu_solve(factors, rhs, trans=int(transposed))
     solved = partial(_solved_by, solve, matrix.shape)
     z = solved(jnp.asarray(np.random.default_rng(0).normal(size=size.shape), scale.dtype), False)
-    return scale * solved(violation / size, False), 1.0 / jnp.linalg.norm(solved(z / jnp.linalg.norm(z), True))
+    least = 1.0 / jnp.linalg.norm(solved(z / jnp.linalg.norm(z), True))
+    return scale * solved(violation / size, False), least, scaled
 
 
-def _newton(drive: AbstractDrive, q, values, t):
-    """The configuration for some values and t, from another one, the size of the step before the last, and whether the
-    configuration is singular."""
+class _Position(NamedTuple):
+    """What Newton's iteration comes to."""
+
+    q: Any
+    matrix: Float[Array, "m k"]  # Â
+    first: Float[Array, ""]  # the size of its first step
+    more: Float[Array, ""]  # that of what others add
+    size: Float[Array, ""]  # that of the step before the last
+    singular: Bool[Array, ""]
+
+    @property
+    def converged(self):
+        return _small(self.size)
+
+
+def _strays(first, more):
+    """Whether an iteration from one position leads too far from it to be the next one; NaN does."""
+    return ~((first <= _FAR) & (more <= jnp.maximum(_BENT * first, _NEAR)))
+
+
+def _newton(drive: AbstractDrive, q, values, t, near) -> _Position:
+    """The configuration for some values and t, from another one; `near`: given up where it strays from that."""
     system = drive.at(values)
     scale = drive.system.coordinate_scale()
 
     def equations(q):
         return system.constraint_jacobian(q, t), system.constraint(q, t)
 
+    largest = lambda x: jnp.max(jnp.abs(x) / scale)
+
     def body(carry):
-        q, _, iteration = carry
+        q, first, others, before, _, iteration = carry
         x = _solved(*equations(q))
-        # Far from the solution a full step may leave the branch: at most 0.2 rad or a fifth of the scene at a time.
-        size = jnp.max(jnp.abs(x) / scale)
-        return system.group.retract(q, -x * jnp.minimum(1.0, 0.2 / jnp.maximum(size, 0.2))), size, iteration + 1
+        size = largest(x)
+        # Far from the solution a full step may leave the branch.
+        x = x * jnp.where(near, 1.0, jnp.minimum(1.0, _AT_ONCE / jnp.maximum(size, _AT_ONCE)))
+        begins = iteration == 0
+        first, others = jnp.where(begins, size, first), jnp.where(begins, others, others + x)
+        slow = (size > _SLOW * before) & ~begins
+        return system.group.retract(q, -x), first, others, size, slow, iteration + 1
 
     def unfinished(carry):
-        _, size, iteration = carry
-        return ~_small(size) & (iteration < _MAX_ITERATIONS)  # a NaN goes on to the end, and costs nothing else
+        _, first, others, size, slow, iteration = carry
+        strays = near & (iteration > 0) & (slow | _strays(first, largest(others)))
+        return ~_small(size) & ~strays & (iteration < _MAX_ITERATIONS)  # a NaN goes on, and costs nothing else
 
-    q, size, _ = while_loop(unfinished, body, (q, jnp.full((), jnp.inf, scale.dtype), jnp.zeros((), jnp.int32)))
+    none, infinite = jnp.zeros_like(scale), jnp.full((), jnp.inf, scale.dtype)
+    start = q, infinite, none, infinite, jnp.zeros((), bool), jnp.zeros((), jnp.int32)
+    q, first, others, size, *_ = while_loop(unfinished, body, start)
     # Newton is quadratic: one step from √eps is at round-off.
-    x, least = _last_step(*equations(q), scale)
+    x, least, matrix = _last_step(*equations(q), scale)
     regular = least > _SINGULAR * jnp.sqrt(jnp.finfo(scale.dtype).eps)  # NaN is not
-    return system.group.retract(q, -x), size, _small(size) & ~regular
+    q = system.group.retract(q, -x)
+    return _Position(q, matrix, first, largest(others), size, _small(size) & ~regular)
 
 
 def _small(size):
     return size <= jnp.sqrt(jnp.finfo(size.dtype).eps)
 
 
+class _Way(NamedTuple):
+    """How far the search for n configurations has come, from one to the next."""
+
+    q: Any  # the last configuration, and
+    matrix: Float[Array, "m k"]  # Â there
+    row: Int[Array, ""]  # the one that it is on the way to
+    reached: Float[Array, ""]  # as a part of that
+    part: Float[Array, ""]  # the next part of it; −1: the way is lost, and the last try is whether it ends singular
+    again: Bool[Array, ""]  # whether the last try was a success
+    begun: Bool[Array, ""]  # whether there is a configuration to go on from
+    found: tuple[Any, Float[Array, " n"], Bool[Array, " n"]]
+
+
 @jax.custom_jvp
 def _configurations(drive: AbstractDrive, values: Float[Array, "n d"], t: Float[Array, " n"]):
-    """q(s, t) for each row of `values`, found one from the other, the first from the reference; Newton's step; and
-    whether it is singular.
+    """q(s, t) for each row of `values`, found one from the other, the first from that with the values that the system
+    has, and that from the reference; Newton's step; and whether it is singular.
 
-    Where the way ends it is lost, its step infinite: what follows may be assembled otherwise.
+    Where the way ends it is lost, its step infinite: what follows may be assembled otherwise. All tries are turns of
+    one loop: designs of a batch wait for the one with the most of them, and not at every position for the slowest.
     """
+    group, n = drive.system.group, len(t) + 1
+    rows = jax.tree.map(lambda own, others: jnp.concatenate([own[None], others]), (drive.own, t[0]), (values, t))
+    one, zero, no = jnp.ones_like(t[0]), jnp.zeros_like(t[0]), jnp.zeros((), bool)
 
-    def follow(carry, row):
-        start, begun, lost = carry
-        q, size, singular = _newton(drive, start, *row)
-        found = _small(size) & ~singular & ~lost
-        after = jax.tree.map(lambda new, old: jnp.where(found, new, old), q, start)
-        return (after, begun | found, lost | (begun & ~found)), (q, jnp.where(lost, jnp.inf, size), singular & ~lost)
+    def step(way: _Way) -> _Way:
+        end, before = (jax.tree.map(lambda of, i=i: of[i], rows) for i in (way.row, way.row - 1))
+        near, shortest = way.begun & (way.part > 0.0), way.part <= _LEAST
+        to = jnp.where(near, jnp.minimum(way.reached + way.part, 1.0), 1.0)
+        values, t = jax.tree.map(lambda end, before: end - (1.0 - to) * (end - before), end, before)
+        new = _newton(drive, way.q, values, t, near)
+        other = jnp.linalg.slogdet(way.matrix.T @ new.matrix)[0] < 0.0
+        follows = ~way.begun | (near & ~_strays(new.first, new.more) & (shortest | ~other))
+        taken = follows & new.converged & ~new.singular
+        arrived, singular = taken & (to == 1.0), new.singular & (to == 1.0)
+        over = ~taken & (~near | (follows & singular))
+        new_row = arrived | over
+        part = jnp.where(taken, jnp.where(way.again, 2.0, 1.0) * way.part, jnp.where(shortest, -1.0, 0.5 * way.part))
+        known = new.q, jnp.where(arrived | singular, new.size, jnp.inf), singular
+        keep = lambda new, old: jnp.where(taken, new, old)
+        q, matrix = jax.tree.map(keep, (new.q, new.matrix), (way.q, way.matrix))
+        return _Way(
+            q=q,
+            matrix=matrix,
+            row=jnp.where(over & way.begun, n, way.row + new_row.astype(jnp.int32)),
+            reached=jnp.where(new_row, 0.0, keep(to, way.reached)),
+            part=jnp.where(new_row, 1.0, part),
+            again=taken & ~new_row,
+            begun=way.begun | arrived,
+            found=jax.tree.map(lambda every, new: every.at[way.row].set(new), way.found, known),
+        )
 
-    no = jnp.zeros((), bool)
-    return scan(follow, (drive.system.reference()[0], no, no), (values, t))[1]
+    home = drive.system.reference()[0]
+    every = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), home)
+    none = jnp.zeros((len(drive.system.constraint_names), group.dim), t.dtype)
+    found = every, jnp.full(n, jnp.inf, t.dtype), jnp.zeros(n, bool)
+    start = _Way(home, none, jnp.zeros((), jnp.int32), zero, one, no, no, found)
+    found = while_loop(lambda way: way.row < n, step, start).found
+    return jax.tree.map(lambda leaf: leaf[1:], found)
 
 
 @_configurations.defjvp

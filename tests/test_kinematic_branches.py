@@ -1,0 +1,114 @@
+"""`kinematics` near dead centres, where two ways to assemble a linkage come close to each other: against circles that
+intersect."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lgsens as lg
+
+Z, POSITIONS, FINE = (0.0, 0.0, 1.0), 13, 400
+HOME = np.array([1.0, 0.0])
+
+
+def four_bar(p, planar=True):
+    """Hinged at the origin, at B, at C and at D."""
+    b, c, d = (jnp.append(jnp.asarray(p[k]), 0.0) for k in "BCD")
+    free = "x y rz" if planar else None
+    bar = lambda a, b: lg.RigidBody(1.0, (0.05, 0.05, 0.05), position=(a + b) / 2, free=free)
+    pin = lambda a, b, at: lg.RevoluteJoint(a, b, at=at, axis=Z)
+    joints = {"A": pin(None, "crank", jnp.zeros(3)), "B": pin("crank", "coupler", b)}
+    joints |= {"C": pin("coupler", "rocker", c), "D": pin("rocker", None, d)}
+    return lg.Model(
+        {"crank": bar(jnp.zeros(3), b), "coupler": bar(b, c), "rocker": bar(c, d)},
+        joints | {"motor": lg.RotationDriver(None, "crank", axis=Z)},
+        redundant="refuse" if planar else "minimum_norm",
+    )
+
+
+def closed(p, angles):
+    """The middle of the rocker, NaN where the circles about B and D do not intersect, for angles of the crank."""
+    b, c, d = (np.asarray(p[k]) for k in "BCD")
+    cross = lambda u, v: u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+    turn = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    pin = np.stack([b[0] * turn[:, 0] - b[1] * turn[:, 1], b[1] * turn[:, 0] + b[0] * turn[:, 1]], axis=1)
+    coupler, rocker = np.hypot(*(c - b)), np.hypot(*(c - d))
+    base = np.hypot(*(d - pin).T)[:, None]
+    along = (coupler**2 - rocker**2 + base**2) / (2 * base)
+    with np.errstate(invalid="ignore"):
+        across = np.sign(cross(d - b, c - b)) * np.sqrt(coupler**2 - along**2)
+    unit = (d - pin) / base
+    return (pin + along * unit + across * np.stack([-unit[:, 1], unit[:, 0]], axis=1) + d) / 2
+
+
+def turned(p, angles, planar=True):
+    found = lg.kinematics(four_bar(p, planar), {"motor": angles}, throw=False)
+    return found.body("rocker").position[:, :2], found.result
+
+
+def check(designs, planar):
+    angles, fine = (np.linspace(0.0, 2.0 * np.pi, n) for n in (POSITIONS, FINE * (POSITIONS - 1) + 1))
+    every = jax.jit(jax.vmap(functools.partial(turned, angles=jnp.asarray(angles), planar=planar)))
+    found, results = jax.tree.map(np.asarray, every(designs))
+    whole = 0
+    for i, (position, result) in enumerate(zip(found, results)):
+        p = {k: of[i] for k, of in designs.items()}
+        lost = np.isnan(position[:, 0])
+        first = int(np.argmax(lost)) if lost.any() else POSITIONS
+        assert (result == lg.RESULTS.successful) == (first == POSITIONS) and lost[first:].all()
+        # Newton's tolerance √eps squared, over the distance to a dead centre
+        np.testing.assert_allclose(position[:first], closed(p, angles[:first]), atol=1e-8)
+        if first < POSITIONS:  # there is no way to go on
+            assert np.isnan(closed(p, fine[: first * FINE + 1])).any()
+        whole += first == POSITIONS
+    assert 0.2 * len(found) < whole < 0.5 * len(found)
+
+
+def random_designs(count):
+    numbers = np.random.default_rng(1).uniform(size=(3, count, 2))
+    scale = np.array([[2.0, 2.0], [3.0, 3.0], [0.7, 0.6]])[:, None]
+    begin = np.array([[-1.0, -1.0], [-1.5, -1.5], [0.8, -0.3]])[:, None]
+    return dict(zip("BCD", begin + scale * numbers))
+
+
+def test_no_other_way_to_assemble_it_is_taken():
+    """Of 600 designs a dozen would be, in steps of half a radian, by Newton's iteration from one position to the
+    next."""
+    check(random_designs(600), planar=True)
+
+
+@pytest.mark.slow
+def test_nor_with_redundant_joints():
+    check(random_designs(120), planar=False)
+
+
+def test_a_dead_centre_itself_is_passed_straight_on():
+    """A parallelogram that lies flat twice in a turn, between positions, stays one: its rocker turns like its crank."""
+    p = {"B": 0.3 * HOME, "C": HOME + 0.3 * HOME, "D": HOME}
+    p = {k: np.array(of) for k, of in p.items()}
+    start, angles = 0.7, np.linspace(0.0, 2.0 * np.pi, 12)
+    direction = np.array([np.cos(start), np.sin(start)])
+    p["B"], p["C"] = 0.3 * direction, HOME + 0.3 * direction
+    found = lg.kinematics(four_bar(p), {"motor": angles})
+    expected = HOME + 0.15 * np.stack([np.cos(start + angles), np.sin(start + angles)], axis=1)
+    np.testing.assert_allclose(found.body("rocker").position[:, :2], expected, atol=1e-10)  # Newton, beside flat ones
+
+
+def test_an_optimum_is_that_of_one_way_to_assemble_it():
+    """The largest swing of a rocker, to which designs lead that come close to a dead centre."""
+    pivot = np.array([1.3, 0.0])
+    angles = jnp.linspace(0.0, 2.0 * jnp.pi, 37)
+
+    def swing(p):
+        found = lg.kinematics(four_bar(p | {"D": pivot}), {"motor": angles}, throw=False)
+        return -jnp.ptp(found.joint("D").angle)
+
+    start = {"B": jnp.array([0.3, 0.2]), "C": jnp.array([1.2, 1.0])}
+    best = lg.optimize.minimize(swing, start, num_steps=40, progress=False)
+    middle = closed(best.x | {"D": pivot}, np.asarray(angles)) - pivot
+    expected = np.ptp(np.unwrap(np.arctan2(middle[:, 1], middle[:, 0])))
+    np.testing.assert_allclose(-best.objective, expected, rtol=1e-8)  # of the round-off of positions
+    assert expected > 1.3
