@@ -508,3 +508,13 @@ def test_inertia_at_the_limits_is_accepted():
     lg.RigidBody(1.0, (1.0, 1.0, 1e-9))
     q, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
     lg.RigidBody(1.0, q @ np.diag([0.3, 0.4, 0.7]) @ q.T)
+
+
+def test_what_is_no_state_or_no_result():
+    criterion = lg.Criterion(terminal=lambda s, p: s.body("chassis").position[0])
+    build = lambda mass: lg.Model({"chassis": body(mass=mass)}, {}, {})
+    start = lg.initial_state(build(1.0))
+    with pytest.raises(ValueError, match=says("`state0` must be a function of the parameters", "got a State")):
+        lg.differentiate(criterion, build, 1.0, t1=0.1, num_steps=2, state0=start)
+    with pytest.raises(ValueError, match=says("`found` must have a `result`", "got a int")):
+        lg.raise_if_failed(3)

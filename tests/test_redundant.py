@@ -241,6 +241,27 @@ def test_what_cannot_take_redundant_constraints_says_so():
         lg.simulate(door(DOOR, redundant="refuse"), t1=0.1, num_steps=4)
 
 
+def test_what_fails_for_redundant_constraints_says_so():
+    """Their matrices are singular, which looks like bodies that nothing holds or positions out of reach."""
+    twice = door(DOOR, redundant="refuse")
+    with pytest.raises(ValueError, match=says("RadauIIA: the joints have 10 equations for 6", "redundant='remove'")):
+        lg.simulate(twice, t1=0.1, num_steps=4, integrator=lg.RadauIIA())
+    with pytest.raises(ValueError, match=says("10 equations for 6 coordinates", "redundant='remove'")):
+        lg.linearize(twice)
+    spring = lg.TorsionSpringDamper(None, "door", axis=twice.joints["upper"].axis, stiffness=5.0)
+    push = lg.AppliedForce("door", fixed_moment=Z)
+    held = lg.Model(twice.bodies, twice.joints, {"spring": spring, "push": push})
+    with pytest.raises(ValueError, match=says("constrain the same motion twice", "['lower', 'upper']")):
+        lg.statics(held, loads={"push": [0.0, 1.0]})
+    bar = lambda x: lg.RigidBody(1.0, (1.0, 1.0, 1.0), position=(x, 0.0, 0.0), free="x y rz")
+    pin = lambda kind, a, b, x, **axis: kind(a, b, at=(x, 0.0, 0.0), **axis)
+    joints = {"hinge": pin(lg.RevoluteJoint, None, "a", 0.0, axis=Z), "ball": pin(lg.SphericalJoint, None, "a", 0.0)}
+    square = lg.Model({"a": bar(0.5), "b": bar(1.5)}, joints | {"elbow": pin(lg.SphericalJoint, "a", "b", 1.0)})
+    assert len(square.system().constraint_names) == square.system().group.dim
+    with pytest.raises(ValueError, match=says("constrain the same motion twice", "['ball', 'hinge']")):
+        lg.kinematics(square, t=[0.0, 0.1])
+
+
 @pytest.mark.slow  # equal steps of the same mechanism are in the quick run
 def test_redundant_equations_are_no_singular_configuration_for_adaptive_steps():
     """Their margins come from a matrix of their own."""

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import lgsens as lg
 from lgsens.examples import PROBLEMS
 
 SINGLE = float(np.finfo(np.float32).eps)
@@ -20,6 +21,13 @@ def slopes(name: str, num_steps: int, mode) -> np.ndarray:
     rows = np.array([[own[key] * value for key, value in problem.parameters.items()] for own in found.values()])
     assert all(leaf.dtype == jnp.zeros(()).dtype for leaf in jax.tree.leaves(found))
     return rows / np.abs(rows).max(axis=1, keepdims=True)
+
+
+def test_gradients_warn():
+    criterion = lg.Criterion(terminal=lambda s, p: s.body("mass").position[2])
+    build = lambda mass: lg.Model({"mass": lg.RigidBody(mass, None)}, {}, {"gravity": lg.Gravity((0.0, 0.0, -9.81))})
+    with jax.enable_x64(False), pytest.warns(UserWarning, match="single precision.*jax_enable_x64"):
+        lg.differentiate(criterion, build, 2.0, t1=0.1, num_steps=4)
 
 
 @pytest.mark.filterwarnings("ignore:lgsens runs in single precision")

@@ -325,6 +325,8 @@ def test_other_bad_arguments():
         lg.sweep(lambda x: None, np.ones(3))
     with pytest.raises(ValueError, match="`devices` is empty"):
         lg.sweep(jnp.sin, np.ones(3), devices=[])
+    with pytest.raises(ValueError, match=says("`devices` must be some of", "got 4")):
+        lg.sweep(jnp.sin, np.ones(3), devices=4)
 
 
 @pytest.mark.parametrize("progress", [True, False])

@@ -23,6 +23,7 @@ from lgsens.analysis._driven import (
     unless_jumped,
     with_numbers,
 )
+from lgsens.analysis._rank import cause_of_failure
 from lgsens.dynamics import RESULTS, State, forces_of_motion, names_of_all, positions
 from lgsens.model import Model, MultibodySystem
 from lgsens.simulation import AbstractRun, throw_if_failed
@@ -130,8 +131,10 @@ def kinematics(
     clock = jnp.zeros_like(time) if t is None else jnp.ones_like(time)
     (states, result), details = _kinematics_jit(*alike((drive, (given, time), (speed, clock))))
     if throw:
-        details = details if isinstance(result, Tracer) else details | {"names": names}
-        states = throw_if_failed(states, result, details, names_of_all(system))
+        known, cause, of = not isinstance(result, Tracer), result, details
+        if known and int(result) != RESULTS.successful and int(details["position"]) == 0:
+            cause, of = cause_of_failure(system, start, result, details)
+        states = throw_if_failed(states, cause, of | {"names": names} if known else of, names_of_all(system))
     return Kinematics(values=values, t=time, states=states, result=result, system=system)
 
 

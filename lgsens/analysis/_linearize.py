@@ -225,8 +225,9 @@ def linearize(
         )
     if system.group.dim - system.num_states <= len(system.constraint_names):
         raise ValueError(
-            "`model`: its joints have as many equations as it has coordinates, and leave no freedom; `constraint_rank`"
-            " tells."
+            f"`model`: its joints have {len(system.constraint_names)} equations for "
+            f"{system.group.dim - system.num_states} coordinates and leave no freedom, unless some of them repeat "
+            "others: `constraint_rank` tells, and Model(…, redundant='remove') leaves these out."
         )
     if state is not None:
         require_linear(system, "`linearize` of a motion")

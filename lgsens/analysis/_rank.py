@@ -1,11 +1,12 @@
 """`constraint_rank`: how many of the constraints are independent, and the joints that say the same."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
 from lgsens._validate import as_float, is_concrete
-from lgsens.dynamics import AbstractSystem, rank_near_reference, redundant_names
+from lgsens.dynamics import RESULTS, AbstractSystem, Rank, rank_near_reference, redundant_names, softness
 from lgsens.model import Model, driven_equations, scene_of
 from lgsens.simulation import as_system
 
@@ -76,17 +77,31 @@ def constraint_rank(model: Model | AbstractSystem, *, t0=0.0) -> ConstraintRank:
 
     Raises `ValueError` for numbers that are traced.
     """
-    system = as_system(model)
+    system, t0 = as_system(model), as_float(t0, (), "`t0`")
     if not is_concrete(system, t0):
         raise ValueError(
             "`constraint_rank` counts singular values, so `model` and `t0` must be known numbers, got traced ones: "
             "call it before `jit`, `grad` or `vmap`, with one of the models."
         )
+    found = _rank(system, t0)
+    m, k = found.jacobian.shape
+    names = tuple(redundant_names(found.jacobian, system.constraint_names))
+    return ConstraintRank(k - system.num_states, m, found.near, found.reference, names)
+
+
+def _rank(system: AbstractSystem, t) -> Rank:
     scene = scene_of(system)
     if scene is not None:
         system = dataclasses.replace(scene, minimum_norm=True)  # which can be assembled whatever its rank
     none = np.zeros(len(system.constraint_names), bool)
-    found = rank_near_reference(system, as_float(t0, (), "`t0`"), none if scene is None else driven_equations(scene))
-    m, k = found.jacobian.shape
-    names = tuple(redundant_names(found.jacobian, system.constraint_names))
-    return ConstraintRank(k - system.num_states, m, found.near, found.reference, names)
+    return rank_near_reference(system, t, none if scene is None else driven_equations(scene))
+
+
+def cause_of_failure(system: AbstractSystem, t, result, details: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+    """What failed and the details of its message, of a method that needs independent constraints and does not ask for
+    that: redundant ones make its matrices singular, which looks like something else."""
+    if is_concrete(system, t) and softness(system) is None:
+        found = _rank(system, t)
+        if found.near < len(found.jacobian):
+            return np.asarray(RESULTS.redundant_constraints), {"jacobian": found.jacobian}
+    return result, details

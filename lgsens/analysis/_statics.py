@@ -24,6 +24,7 @@ from lgsens.analysis._driven import (
     unless_jumped,
     with_numbers,
 )
+from lgsens.analysis._rank import cause_of_failure
 from lgsens.dynamics import RESULTS, State, require_independent, static_path
 from lgsens.model import Model, MultibodySystem
 from lgsens.simulation import AbstractRun, throw_if_failed
@@ -139,11 +140,14 @@ def statics(
     drive, path, slopes, start = alike((drive, path, slopes, start))
     (states, responses, result), flags, details = _statics_jit(drive, path, slopes, start, tuple(starts))
     if throw:
+        cause = result
         if not isinstance(result, Tracer):
             details = details | {"names": names}
-            if int(result) == RESULTS.not_held:
+            if int(result) in (RESULTS.not_held, RESULTS.statics_failed):
+                cause, details = cause_of_failure(system, start, result, details)
+            if int(result) == RESULTS.not_held == int(cause):
                 details = details | {"free": _free_bodies(drive, details)}
-        states, responses = throw_if_failed((states, responses), result, details, system.constraint_names)
+        states, responses = throw_if_failed((states, responses), cause, details, system.constraint_names)
     time = jnp.broadcast_to(start, shape)
     found: dict[str, Any] = {"t": time, "states": states, "responses": responses, "result": result} | flags
     return Statics(values=given, **found, system=system)

@@ -45,6 +45,7 @@ from lgsens.simulation import (
     outcome,
     run,
     throw_if_failed,
+    warn_of_single_precision,
 )
 
 Method = AbstractSensitivity | ContinuousAdjoint | FiniteDifferences | IndexReduced
@@ -133,6 +134,11 @@ def differentiate(
         raise ValueError(f"`build` must be a function of the parameters that returns a Model, got {build!r}.")
     if method is not None and not isinstance(method, Method):
         raise ValueError(f"`method` must be a method such as AdjointVariable() or ContinuousAdjoint(), got {method!r}.")
+    if state0 is not None and not callable(state0):
+        raise ValueError(
+            f"`state0` must be a function of the parameters that returns a State, got a {type(state0).__name__}: "
+            "lambda p: state0 for one that does not depend on them."
+        )
     settings = {"t0": t0, "t1": t1, "integrator": integrator, "state0": state0}
     worth = lambda **own: certify(criteria, build, p, **settings | own) if certificate else None
     if accuracy is not None:
@@ -153,6 +159,7 @@ def differentiate(
         check_certifiable(integrator, num_steps, (p, t0, t1))
     t0, t1 = interval(t0, t1)
     p = as_parameters(p)
+    warn_of_single_precision(t0.dtype)
     size = sum(leaf.size for leaf in jax.tree.leaves(p))
     if certificate and method is None:  # whose own value and gradient these are
         found = worth(num_steps=num_steps, throw=False)

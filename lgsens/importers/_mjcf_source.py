@@ -46,6 +46,8 @@ class Source:
         text = str(source)
         is_text = not isinstance(source, Path) and "<" in text
         root = {"MJCF": "<mujoco", "URDF": "<robot"}[kind]
+        if not isinstance(source, str | Path) or (not is_text and Path(source).is_dir()):
+            raise ValueError(f"`source` must be the path of a file, or its text, got {source!r}.")
         self.name = f"the {kind} text" if is_text else text
         if not is_text:
             text = Path(source).read_text(encoding="utf-8")

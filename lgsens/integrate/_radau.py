@@ -56,6 +56,7 @@ from jaxtyping import Array, Float
 
 from lgsens._validate import as_count, require_setting
 from lgsens.dynamics import (
+    RESULTS,
     AbstractSystem,
     ConstrainedInertia,
     Inertia,
@@ -138,6 +139,11 @@ class RadauIIA(AbstractScheme):
     def complete(self, system, state):
         require_independent(system, "RadauIIA")
         require_linear(system, "RadauIIA")
+        if len(state.lam) > len(state.v):
+            raise ValueError(
+                f"RadauIIA: the joints have {len(state.lam)} equations for {len(state.v)} coordinates. "
+                + RESULTS.redundant_constraints.message
+            )
         three = lambda leaf: jnp.zeros((3, *leaf.shape), leaf.dtype)
         mu = state.lam[: len(state.lam) - system.num_velocity_rows]
         return dataclasses.replace(state, inner=RadauStages(*map(three, (state.v, state.v, state.lam, mu))))

@@ -16,6 +16,7 @@ from lgsens.simulation._settings import (
     check_integrator as check_integrator,
     check_sensitivity as check_sensitivity,
     interval as interval,
+    warn_of_single_precision as warn_of_single_precision,
 )
 from lgsens.simulation._simulate import (
     cut as cut,

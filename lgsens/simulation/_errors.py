@@ -184,6 +184,10 @@ def raise_if_failed(found: Any) -> Any:
     Inside `jit` failures are NaN, in values and derivatives, and `result` says why. Raises `ValueError` for a mechanism
     that cannot be assembled or has redundant constraints, and where `found` is traced; else `SimulationError`.
     """
+    if not hasattr(found, "result"):
+        raise ValueError(
+            f"`found` must have a `result`, as a Trajectory or Sensitivities have, got a {type(found).__name__}."
+        )
     if isinstance(found.result, Tracer):
         raise ValueError(
             "`raise_if_failed` is for what comes out of `jit` or `vmap`: inside, no number is known yet. Return the "

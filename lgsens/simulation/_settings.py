@@ -42,6 +42,16 @@ def interval(t0, t1):
     return t0, t1
 
 
+def warn_of_single_precision(dtype) -> None:
+    """Where numbers have it."""
+    if dtype == np.float32:
+        warnings.warn(
+            "lgsens runs in single precision: positions carry seven digits, accelerations lose them as 1/h². Call "
+            'jax.config.update("jax_enable_x64", True) before the model is built.',
+            stacklevel=3,
+        )
+
+
 def warn_of_far_times(t0, t1, num_steps: int) -> None:
     """Where round-off of times, ε t, is more than 1e-6 of a step: signals then change by as much from step to step, and
     accelerations come from the change of that, which is smaller by as many steps as the signal takes."""

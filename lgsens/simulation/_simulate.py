@@ -35,7 +35,14 @@ from lgsens.simulation._errors import primal_value, throw_if_failed
 from lgsens.simulation._index_reduced_ode import integrate_ode
 from lgsens.simulation._richardson import extrapolate_runs
 from lgsens.simulation._save import Output, Save
-from lgsens.simulation._settings import by_diffrax, check_integrator, check_sensitivity, interval, warn_of_far_times
+from lgsens.simulation._settings import (
+    by_diffrax,
+    check_integrator,
+    check_sensitivity,
+    interval,
+    warn_of_far_times,
+    warn_of_single_precision,
+)
 from lgsens.simulation._start import Begin, as_system, begin, check_state0
 from lgsens.simulation._to_accuracy import simulate_to
 from lgsens.simulation._trajectory import Saved, Trajectory
@@ -131,12 +138,7 @@ def simulate(
     Source: Sonneville & Brüls (2014), §4 and §6.2.
     """
     system = as_system(model)
-    if jax.tree.leaves(system)[0].dtype == jnp.float32:
-        warnings.warn(
-            "lgsens runs in single precision: positions carry seven digits, accelerations lose them as 1/h². Call "
-            'jax.config.update("jax_enable_x64", True) before the model is built.',
-            stacklevel=2,
-        )
+    warn_of_single_precision(jax.tree.leaves(system)[0].dtype)
     if accuracy is not None:
         if save is not None or not throw:
             raise ValueError(

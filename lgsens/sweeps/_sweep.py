@@ -109,6 +109,8 @@ def sweep(
     """
     designs, count = as_designs(designs)
     batch_size = None if batch_size is None else as_count(batch_size, "batch_size")
+    if not isinstance(devices, Sequence | np.ndarray | None):
+        raise ValueError(f"`devices` must be some of `jax.devices()`, such as jax.devices()[:2], got {devices!r}.")
     devices = jax.devices() if devices is None else list(devices)
     if not devices:
         raise ValueError("`devices` is empty; leave it out for all of `jax.devices()`.")

@@ -253,6 +253,7 @@ def test_mimic_joints_are_coupled():
 
 WRONG = {
     "no MJCF": (lambda: lg.importers.mjcf("<robot/>"), "it has no element <mujoco>"),
+    "nothing": (lambda: lg.importers.mjcf(""), "`source` must be the path of a file, or its text, got ''"),
     "nothing moves": (lambda: lg.importers.mjcf("<mujoco/>"), "no body can move"),
     "not read": (lambda: lg.importers.mjcf("<mujoco><nothing/></mujoco>"), "MuJoCo cannot read it"),
     "qpos": (lambda: lg.importers.mjcf(EQUALITIES, qpos=[0.0]), "`qpos` must be 3 finite numbers"),
