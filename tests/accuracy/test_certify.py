@@ -98,6 +98,7 @@ def test_differentiate_has_a_certificate_of_each_criterion(oscillator):
     np.testing.assert_allclose(own.value_error, at_end(P) - own.value, rtol=0.1)
 
 
+@pytest.mark.slow  # several programs; both are in the quick run
 def test_a_certificate_at_an_accuracy_is_that_of_the_run_found():
     found = lg.differentiate(CRITERION, build, P, t1=T1, accuracy=1e-4, certificate=True)
     assert not found.reached.extrapolated

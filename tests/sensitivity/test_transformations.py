@@ -128,6 +128,7 @@ def test_vmap(scene):
     np.testing.assert_allclose(total, one_by_one, rtol=0, atol=1e-11 * scale)
 
 
+@pytest.mark.slow  # a Hessian is in the quick run with every integrator
 def test_hessian(scene):
     """Forward over reverse: symmetric, and the differences of the gradient."""
     criterion = lambda x: scene.function(x)[1]
