@@ -80,6 +80,24 @@ def test_no_other_way_to_assemble_it_is_taken():
     check(random_designs(600), planar=True)
 
 
+def test_nor_where_two_loops_could_change_over_at_once():
+    """Bars on cylinders side by side, which come within 0.1 rad of their dead centres: signs of determinants change
+    twice. φ is the angle at the pin of a triangle whose third side is the cylinder."""
+    foot, head = np.array([1.0, -0.5, 0.0]), np.array([2.5, 1.6, 0.0])
+    bodies, joints = {}, {}
+    for i, away in enumerate(np.array([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]])):
+        bodies[f"bar {i}"] = lg.RigidBody(1.0, (0.1, 0.1, 0.1), position=head / 2 + away, free="x y rz")
+        joints[f"pin {i}"] = lg.RevoluteJoint(None, f"bar {i}", at=away, axis=Z)
+        joints[f"cylinder {i}"] = lg.DistanceJoint(None, f"bar {i}", at_a=foot + away, at_b=head + away)
+    model, near, far = lg.Model(bodies, joints), np.linalg.norm(foot), np.linalg.norm(head)
+    begin = np.arctan2(head[1], head[0]) - np.arctan2(foot[1], foot[0])
+    angles = np.random.default_rng(0).uniform(0.1, np.pi - 0.1, size=(40, 8))
+    lengths = jnp.asarray(np.sqrt(near**2 + far**2 - 2 * near * far * np.cos(angles)))
+    driven = lambda length: {f"cylinder {i}": length for i in range(2)}
+    found = jax.jit(jax.vmap(lambda length: lg.kinematics(model, driven(length), throw=False).joint("pin 0").angle))
+    np.testing.assert_allclose(found(lengths) + begin, angles, atol=1e-8)  # Newton's tolerance, over 0.1 rad
+
+
 @pytest.mark.slow
 def test_nor_with_redundant_joints():
     check(random_designs(120), planar=False)
@@ -87,14 +105,13 @@ def test_nor_with_redundant_joints():
 
 def test_a_dead_centre_itself_is_passed_straight_on():
     """A parallelogram that lies flat twice in a turn, between positions, stays one: its rocker turns like its crank."""
-    p = {"B": 0.3 * HOME, "C": HOME + 0.3 * HOME, "D": HOME}
-    p = {k: np.array(of) for k, of in p.items()}
-    start, angles = 0.7, np.linspace(0.0, 2.0 * np.pi, 12)
-    direction = np.array([np.cos(start), np.sin(start)])
-    p["B"], p["C"] = 0.3 * direction, HOME + 0.3 * direction
-    found = lg.kinematics(four_bar(p), {"motor": angles})
-    expected = HOME + 0.15 * np.stack([np.cos(start + angles), np.sin(start + angles)], axis=1)
-    np.testing.assert_allclose(found.body("rocker").position[:, :2], expected, atol=1e-10)  # Newton, beside flat ones
+    start = 0.7
+    arm = 0.3 * np.array([np.cos(start), np.sin(start)])
+    model = four_bar({"B": arm, "C": HOME + arm, "D": HOME})
+    for angles in (np.linspace(0.0, 2.0 * np.pi, 12), np.linspace(0.4, -0.4, 12) - start):  # as far before it as behind
+        found = lg.kinematics(model, {"motor": angles})
+        expected = HOME + 0.15 * np.stack([np.cos(start + angles), np.sin(start + angles)], axis=1)
+        np.testing.assert_allclose(found.body("rocker").position[:, :2], expected, atol=1e-10)  # Newton, near flat ones
 
 
 def test_an_optimum_is_that_of_one_way_to_assemble_it():

@@ -196,6 +196,30 @@ def test_a_cylinder_lifts_a_bar():
     close(found.multiplier("cylinder")[:, 0], -3.0 * 9.81 * 2 * lengths, ULPS)
 
 
+def test_forces_of_a_cylinder_are_those_of_its_length():
+    """Its force from the moments about the hinge, at lengths of 1.4 times the reference; with the hinge it carries the
+    weight."""
+    foot, head, weight = np.array([1.0, -0.5]), np.array([2.5, 1.6]), 98.1
+    bar = lg.RigidBody(10.0, (1.0, 1.0, 1.0), position=(2.5, 1.0, 0.0), free="x y rz")
+    joints = {
+        "pin": lg.RevoluteJoint(None, "bar", at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0)),
+        "cylinder": lg.DistanceJoint(None, "bar", at_a=(*foot, 0.0), at_b=(*head, 0.0)),
+    }
+    model = lg.Model({"bar": bar}, joints, {"gravity": lg.Gravity((0.0, -9.81, 0.0))})
+
+    def thrust(length):
+        near, far = np.hypot(*foot), np.hypot(*head)
+        cosine = (near**2 + far**2 - length**2) / (2 * near * far)
+        turn = np.arccos(cosine) + np.arctan2(*foot[::-1]) - np.arctan2(*head[::-1])
+        arm = near * far * np.sqrt(1 - cosine**2) / length
+        return weight * (2.5 * np.cos(turn) - 1.0 * np.sin(turn)) / arm
+
+    lengths = np.array([2.6, 3.0, 3.6])
+    for run in (lg.kinematics(model, {"cylinder": lengths}, rates={}), lg.statics(model, {"cylinder": lengths})):
+        close(np.abs(run.joint("cylinder").axial_force), thrust(lengths), ULPS, scale=200.0)
+        close(run.joint("cylinder").force[:, 1] + run.joint("pin").force[:, 1], np.full(3, weight), ULPS, scale=200.0)
+
+
 def test_two_drivers_move_a_body_as_they_say():
     """A slide along an axis of a tilted body, and a turn beyond a whole one about another: the products of both."""
     rng = np.random.default_rng(5)

@@ -7,13 +7,15 @@ said of s below includes t.
 Position. Newton's iteration on the group, q ← q exp(−(A⁻¹Φ)~), from one s to the next. Its first step is that along
 the tangent; what the others add, the curvature of the way, is a share of it where s changes by little. But near a dead
 centre two ways to assemble the mechanism come close to each other, and the tangent of one leads to the other. There A
-is singular in between, in the same order for all of its k × k minors: with A₀ at the start, A₁ at the end of a step,
+is singular in between. With A₀ at the start of a step and A₁ at its end no (1 − τ) A₀ + τ A₁ is, if no eigenvalue of
 
-    det A₀ᵀA₁ = Σ (minor of A₀)(minor of A₁)   (Cauchy, Binet)
+    C = A₁⁻¹ A₀,     S ← (c S + (c S)⁻¹)/2 from S = C,     c² = |S⁻¹|/|S|,
 
-is negative. So a step from s₀ to s₁ is taken in two, again and again, where it turns too far (`_FAR`), is bent too much
-(`_BENT`), or has this sign. What is so at the shortest steps too (`_LEAST`) passes a singular position itself, as a
-parallelogram that lies flat: the way that goes straight on is followed.
+is real and negative. All have a positive real part where C + Cᵀ is positive definite, as it is but near dead centres,
+or where the iteration (Newton's for the sign of a matrix) comes to S = I. (The sign of det C alone does not tell two
+loops that change over at once.) So a step from s₀ to s₁ is taken in parts where it turns too far (`_FAR`), is bent
+too much (`_BENT`), or is not sure of that. What is not at the shortest steps either (`_SHORT`) passes a singular
+position itself, as a parallelogram that lies flat: the way that goes straight on is followed.
 
 Derivatives of the position. Let δq = q w̃. By the chain rule, with DΦ·(q w̃) = A w,
 
@@ -57,6 +59,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.scipy.linalg import lu_factor, lu_solve
 from jaxtyping import Array, Bool, Float, Int
 
@@ -71,7 +74,10 @@ _FAR = 1.0  # likewise: the first step of an iteration from one position to the 
 _BENT = 1.25  # what the others add, of the first: as much on the way to a dead centre, where s is its square
 _SLOW = 0.75  # a step of that iteration, of the one before; to a singular position it is half of that
 _NEAR = 1e-3  # what they may add always, rad or of the scene
-_LEAST = 2.0**-14  # the shortest part of a step
+_LESS = 0.45  # a part of a step after one that failed; not a half, by which symmetric ones meet a dead centre
+_LEAST = 2.0**-16  # the shortest part of a step
+_TURNS = 20  # of the iteration for the sign of a matrix
+_SHORT = 4000.0  # a multiple of √eps, rad or of the scene: steps that pass a singular position, long beside `_SINGULAR`
 _SINGULAR = 8.0  # a multiple of √eps: so near to a singular position Newton's iteration ends, there or beside it
 
 
@@ -126,8 +132,9 @@ def _solved(matrix: Float[Array, "m k"], rhs: Array, *, transposed: bool = False
     return _solved_by(solve, matrix.shape, rhs, transposed)
 
 
-def _last_step(matrix: Float[Array, "m k"], violation: Float[Array, " m"], scale: Float[Array, " k"]):
-    """A⁻¹ Φ and 1/|w|, which is NaN or 0 where A is exactly singular, by one factorization, and Â; no derivatives."""
+def _last_step(matrix: Float[Array, "m k"], violation: Float[Array, " m"], scale: Float[Array, " k"], before):
+    """A⁻¹ Φ and 1/|w|, which is NaN or 0 where A is exactly singular, by one factorization, Â, and Â⁻¹ times that
+    `before`; no derivatives."""
     scaled = matrix * scale[None, :]
     size = jnp.linalg.norm(scaled, axis=1)
     size = jnp.where(size > 0.0, size, 1.0)  # redundant rows may be zero
@@ -137,7 +144,26 @@ def _last_step(matrix: Float[Array, "m k"], violation: Float[Array, " m"], scale
     solved = partial(_solved_by, solve, matrix.shape)
     z = solved(jnp.asarray(np.random.default_rng(0).normal(size=size.shape), scale.dtype), False)
     least = 1.0 / jnp.linalg.norm(solved(z / jnp.linalg.norm(z), True))
-    return scale * solved(violation / size, False), least, scaled
+    change = jax.vmap(lambda column: solved(column, False), 1, 1)(before)
+    return scale * solved(violation / size, False), least, scaled, change
+
+
+def _positive(matrix: Float[Array, "k k"], asked) -> Bool[Array, ""]:
+    """Whether all eigenvalues have a positive real part; if `asked`, else True may be missing."""
+    norm, last = jnp.linalg.norm, len(matrix) - 0.5
+
+    def turn(carry):
+        sign, _, count = carry
+        inverse = jnp.linalg.inv(sign)
+        scale = jnp.sqrt(norm(inverse) / norm(sign))
+        new = 0.5 * (scale * sign + inverse / scale)
+        return new, norm(new - sign), count + 1
+
+    definite = jnp.all(jnp.isfinite(lax.linalg.cholesky(matrix + matrix.T, symmetrize_input=False)))
+    going = lambda carry: (carry[1] > 1e-3) & (carry[2] < _TURNS)  # quadratic: then all digits are there; NaN is not
+    begin = jnp.where(asked & ~definite, jnp.inf, jnp.zeros((), matrix.dtype))
+    sign, change, _ = while_loop(going, turn, (matrix, begin, jnp.zeros((), jnp.int32)))
+    return definite | (asked & (change <= 1e-3) & (jnp.trace(sign) > last))
 
 
 class _Position(NamedTuple):
@@ -145,6 +171,7 @@ class _Position(NamedTuple):
 
     q: Any
     matrix: Float[Array, "m k"]  # Â
+    sure: Bool[Array, ""]  # whether no matrix between that before and Â is singular
     first: Float[Array, ""]  # the size of its first step
     more: Float[Array, ""]  # that of what others add
     size: Float[Array, ""]  # that of the step before the last
@@ -160,8 +187,9 @@ def _strays(first, more):
     return ~((first <= _FAR) & (more <= jnp.maximum(_BENT * first, _NEAR)))
 
 
-def _newton(drive: AbstractDrive, q, values, t, near) -> _Position:
-    """The configuration for some values and t, from another one; `near`: given up where it strays from that."""
+def _newton(drive: AbstractDrive, q, before: Float[Array, "m k"], values, t, near) -> _Position:
+    """The configuration for some values and t, from another one with Â `before`; `near`: given up where it strays from
+    that."""
     system = drive.at(values)
     scale = drive.system.coordinate_scale()
 
@@ -171,14 +199,14 @@ def _newton(drive: AbstractDrive, q, values, t, near) -> _Position:
     largest = lambda x: jnp.max(jnp.abs(x) / scale)
 
     def body(carry):
-        q, first, others, before, _, iteration = carry
+        q, first, others, last, _, iteration = carry
         x = _solved(*equations(q))
         size = largest(x)
         # Far from the solution a full step may leave the branch.
         x = x * jnp.where(near, 1.0, jnp.minimum(1.0, _AT_ONCE / jnp.maximum(size, _AT_ONCE)))
         begins = iteration == 0
         first, others = jnp.where(begins, size, first), jnp.where(begins, others, others + x)
-        slow = (size > _SLOW * before) & ~begins
+        slow = (size > _SLOW * last) & ~begins
         return system.group.retract(q, -x), first, others, size, slow, iteration + 1
 
     def unfinished(carry):
@@ -190,10 +218,11 @@ def _newton(drive: AbstractDrive, q, values, t, near) -> _Position:
     start = q, infinite, none, infinite, jnp.zeros((), bool), jnp.zeros((), jnp.int32)
     q, first, others, size, *_ = while_loop(unfinished, body, start)
     # Newton is quadratic: one step from √eps is at round-off.
-    x, least, matrix = _last_step(*equations(q), scale)
+    x, least, matrix, change = _last_step(*equations(q), scale, before)
+    sure = _positive(change, near & _small(size) & ~_strays(first, largest(others)))
     regular = least > _SINGULAR * jnp.sqrt(jnp.finfo(scale.dtype).eps)  # NaN is not
     q = system.group.retract(q, -x)
-    return _Position(q, matrix, first, largest(others), size, _small(size) & ~regular)
+    return _Position(q, matrix, sure, first, largest(others), size, _small(size) & ~regular)
 
 
 def _small(size):
@@ -230,14 +259,14 @@ def _configurations(drive: AbstractDrive, values: Float[Array, "n d"], t: Float[
         near, shortest = way.begun & (way.part > 0.0), way.part <= _LEAST
         to = jnp.where(near, jnp.minimum(way.reached + way.part, 1.0), 1.0)
         values, t = jax.tree.map(lambda end, before: end - (1.0 - to) * (end - before), end, before)
-        new = _newton(drive, way.q, values, t, near)
-        other = jnp.linalg.slogdet(way.matrix.T @ new.matrix)[0] < 0.0
-        follows = ~way.begun | (near & ~_strays(new.first, new.more) & (shortest | ~other))
+        new = _newton(drive, way.q, way.matrix, values, t, near)
+        short = new.first <= _SHORT * jnp.sqrt(jnp.finfo(values.dtype).eps)
+        follows = ~way.begun | (near & ~_strays(new.first, new.more) & (new.sure | short))
         taken = follows & new.converged & ~new.singular
         arrived, singular = taken & (to == 1.0), new.singular & (to == 1.0)
         over = ~taken & (~near | (follows & singular))
         new_row = arrived | over
-        part = jnp.where(taken, jnp.where(way.again, 2.0, 1.0) * way.part, jnp.where(shortest, -1.0, 0.5 * way.part))
+        part = jnp.where(taken, jnp.where(way.again, 2.0, 1.0) * way.part, jnp.where(shortest, -1.0, _LESS * way.part))
         known = new.q, jnp.where(arrived | singular, new.size, jnp.inf), singular
         keep = lambda new, old: jnp.where(taken, new, old)
         q, matrix = jax.tree.map(keep, (new.q, new.matrix), (way.q, way.matrix))

@@ -9,6 +9,7 @@ An element holds numbers only (no names): elements of one type are stacked and e
 """
 
 import abc
+import dataclasses
 from collections.abc import Iterable, Set
 from typing import Any
 
@@ -59,6 +60,10 @@ class AbstractRows(AbstractElement):
         """Whether it is about orientations only."""
         return {*self.acts_on} <= {*TURNING_A, *TURNING_B}
 
+    def here(self, a: Frame, b: Frame) -> "AbstractRows":
+        """The same with what it prescribes as it is at these poses, where its equations hold: its forces there."""
+        return self
+
     def violable(self, free: Set[str]) -> tuple[bool, ...]:
         """Which of its equations change where its bodies have these degrees of freedom, one rotation at most, and the
         reference configuration satisfies them all. The others are left out: their rows of B would be zero."""
@@ -71,6 +76,10 @@ class AbstractConstraint(AbstractRows):
     @abc.abstractmethod
     def value(self, a: Frame, b: Frame, t) -> Float[Array, " rows"]:
         """Φ at the given poses and time [s], zero when satisfied."""
+
+    def deviation(self, a: Frame, b: Frame, t) -> Float[Array, " rows"]:
+        """By how much what it prescribes is exceeded, in its unit, far from Φ = 0 too."""
+        return self.value(a, b, t)
 
 
 class AbstractVelocityConstraint(AbstractRows):
@@ -315,6 +324,12 @@ class Distance(AbstractClosedFormConstraint):
     @property
     def driven(self):
         return number_of(self.length)
+
+    def here(self, a, b):
+        return dataclasses.replace(self, length=jnp.linalg.norm(b.point(self.point_b) - a.point(self.point_a)))
+
+    def deviation(self, a, b, t):
+        return (self.here(a, b).length - at_time(self.length, t))[None]
 
     def value(self, a, b, t):
         d, length = b.point(self.point_b) - a.point(self.point_a), at_time(self.length, t)

@@ -36,7 +36,7 @@ class ActuatorLoad(AbstractDynamicLoad):
     states = ("output",)
 
     def force(self, a, b, va, vb, t, z):
-        return z @ constraint_jacobian(self.along, a, b, t)
+        return z @ constraint_jacobian(self.along.here(a, b), a, b, t)
 
     def rate(self, a, b, va, vb, t, z):
         return (at_time(self.command, t) - z) / self.time_constant
@@ -59,9 +59,9 @@ class ControlSignals(NamedTuple):
 
 
 def _signals(load, a, b, va, vb, t) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, "12"]]:
-    """e = −Φ, ė = −(B v + Φ_t), and B."""
-    (row,) = constraint_jacobian(load.along, a, b, t)
-    value, by_time = jax.jvp(lambda t: load.along.value(a, b, t), (t,), (jnp.ones_like(t),))
+    """e = −Φ, ė = −(B v + Φ_t), and B, Φ in the unit of what is prescribed."""
+    (row,) = constraint_jacobian(load.along.here(a, b), a, b, t)
+    value, by_time = jax.jvp(lambda t: load.along.deviation(a, b, t), (t,), (jnp.ones_like(t),))
     return -value[0], -(row @ jnp.concatenate([va, vb]) + by_time[0]), row
 
 
@@ -107,7 +107,7 @@ class PIDLoad(AbstractDynamicLoad):
         return ControlSignals(error, rate, self._command(error, rate, z) if self.time_constant is None else z[-1])
 
     def force(self, a, b, va, vb, t, z):
-        return self.measure(a, b, va, vb, t, z).output * constraint_jacobian(self.along, a, b, t)[0]
+        return self.measure(a, b, va, vb, t, z).output * constraint_jacobian(self.along.here(a, b), a, b, t)[0]
 
     def rate(self, a, b, va, vb, t, z):
         error, rate, _ = _signals(self, a, b, va, vb, t)

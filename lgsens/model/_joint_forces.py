@@ -21,7 +21,7 @@ def _wrenches(system: MultibodySystem, q, lam, t) -> list[Float[Array, "n e 6"]]
     """−Bᵀλ of each constraint on its body b: force [N], and moment about the inertial origin [N m], inertial frame."""
 
     def of_element(element, a: Frame, b: Frame, *args):
-        _, _, force, moment = jnp.split(-constraint_force(element, a, b, *args)[: 2 * BODY_DIM], 4)
+        _, _, force, moment = jnp.split(-constraint_force(element.here(a, b), a, b, *args)[: 2 * BODY_DIM], 4)
         return jnp.concatenate([force, cross(b.position, force) + b.axis(moment)])
 
     def at_time(q, lam, t):

@@ -256,3 +256,18 @@ def test_summary_and_bad_input():
     driven = lg.Model(model.bodies, {**model.joints, "turn": lg.RotationDriver(None, "arm", axis=X)}, model.forces)
     with pytest.raises(ValueError, match=says("the force elements ['pid'] have states")):
         lg.kinematics(driven, {"turn": [0.0]})
+
+
+def test_along_a_rod_forces_and_errors_are_those_of_its_length():
+    """A mass of 1 kg a metre from the foot of a rod, pushed by 2 N for a second to a distance of 2 m; and what holds it
+    half a metre farther: the force is K e, e the difference of lengths, wherever it is."""
+    mass = lambda force: lg.Model({"mass": lg.RigidBody(1.0, None, free="x")}, {}, {"force": force})
+    rod = lambda length: lg.DistanceJoint(None, "mass", at_a=(-1.0, 0.0, 0.0), at_b=(0.0, 0.0, 0.0), length=length)
+    push = lg.Actuator(along=rod(None), command=2.0, time_constant=0.01)
+    pushed = lg.simulate(mass(push), t1=1.0, num_steps=20)
+    np.testing.assert_allclose(pushed.body("mass").position[:, 0], np.asarray(pushed.t) ** 2, atol=1e-12)  # round-off
+    held = lg.PIDController(along=rod(1.5), proportional=4.0, derivative=0.0)
+    run = lg.simulate(mass(held), t1=3.0, num_steps=600)
+    expected = 0.5 * (1.0 - np.cos(2.0 * np.asarray(run.t)))
+    np.testing.assert_allclose(run.body("mass").position[:, 0], expected, atol=2e-4)  # (ω h)²/12 of ω t
+    np.testing.assert_allclose(run.force("force").output, run.body("mass").acceleration[:, 0], atol=1e-9)
