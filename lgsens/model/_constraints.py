@@ -329,7 +329,7 @@ class Distance(AbstractClosedFormConstraint):
         return dataclasses.replace(self, length=jnp.linalg.norm(b.point(self.point_b) - a.point(self.point_a)))
 
     def deviation(self, a, b, t):
-        return (self.here(a, b).length - at_time(self.length, t))[None]
+        return (at_time(self.here(a, b).length, t) - at_time(self.length, t))[None]
 
     def value(self, a, b, t):
         d, length = b.point(self.point_b) - a.point(self.point_a), at_time(self.length, t)
