@@ -129,3 +129,15 @@ def test_an_optimum_is_that_of_one_way_to_assemble_it():
     expected = np.ptp(np.unwrap(np.arctan2(middle[:, 1], middle[:, 0])))
     np.testing.assert_allclose(-best.objective, expected, rtol=1e-8)  # of the round-off of positions
     assert expected > 1.3
+
+
+def test_a_coupling_that_comes_to_half_a_turn_is_named():
+    """φ_c = 0.3 φ_a + 0.05 φ_a², of angles that poses tell within half a turn: behind that of φ_a is no position."""
+    wheel = lambda x: lg.RigidBody(1.0, (0.01, 0.01, 0.02), position=(x, 0.0, 0.0))
+    hinge = lambda name, x: lg.RevoluteJoint(None, name, at=(x, 0.0, 0.0), axis=Z)
+    joints = {"a": hinge("a", 0.0), "c": hinge("c", 0.6), "motor": lg.RotationDriver(None, "a", axis=Z)}
+    joints["cam"] = lg.CoordinateCoupling(hinge("c", 0.6), hinge("a", 0.0), (0.3, 0.05))
+    model = lg.Model({"a": wheel(0.0), "c": wheel(0.6)}, joints)
+    for count in (5, 61):
+        found = lg.kinematics(model, {"motor": np.linspace(0.0, 6.0, count)}, throw=False)
+        assert found.result == lg.RESULTS.angle_jumped

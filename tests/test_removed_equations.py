@@ -280,6 +280,27 @@ def test_kinematics_meet_what_is_left_out_or_have_failed():
     assert int(lost.result) == lg.RESULTS.position_failed and np.isnan(lost.states.v[1:]).all()
 
 
+def test_axes_that_are_not_quite_parallel_are_said():
+    """A door whose hinges are out of line by 1e-5 has none of its freedom."""
+    hinge = lambda x, z: lg.RevoluteJoint(None, "door", at=(x, 0.0, z), axis=Z)
+    door = {"door": lg.RigidBody(20.0, (4.0, 1.0, 3.0), position=(0.4, 0.0, 1.0))}
+    with pytest.warns(UserWarning, match=says("['lower', 'upper']", "but for", "out of line", "exact.removed")):
+        model = lg.Model(door, {"lower": hinge(0.0, 0.3), "upper": hinge(1e-5, 1.7)}, redundant="remove")
+    assert model.summary().degrees_of_freedom == 0
+    exact = lg.Model(door, {"lower": hinge(0.0, 0.3), "upper": hinge(0.0, 1.7)}, redundant="remove")  # no warning
+    assert exact.summary().degrees_of_freedom == 1
+
+
+def test_single_precision_in_millimetres():
+    with jax.enable_x64(False):
+        pins = 300.0 * np.array([[0.0, 0.0, 0.0], [0.3, 0.4, 0.0], [1.2, 0.8, 0.1], [1.5, 0.0, 0.05]])
+        names = [None, "crank", "coupler", "rocker"]
+        bar = lambda a, b: lg.RigidBody(1.0, (5e3, 6e3, 7e3), position=(a + b) / 2)
+        bodies = {name: bar(a, b) for name, a, b in zip(names[1:], pins, pins[1:])}
+        joints = {str(i): lg.RevoluteJoint(names[i], names[(i + 1) % 4], at=at, axis=Z) for i, at in enumerate(pins)}
+        assert len(lg.Model(bodies, joints, redundant="remove").removed) == 3
+
+
 APART = says("redundant='remove' left out do not hold", "at step", "hinge", "throw=False")
 
 

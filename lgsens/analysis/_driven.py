@@ -62,7 +62,12 @@ def unless_jumped(system: MultibodySystem, q: Any, first, result, starts: Sequen
     before[[at for at in starts if at > 0]] = 1
     found = jumped(jnp.concatenate([home[None], after])[before], after)
     an_angle = jnp.any(found) & (result == RESULTS.successful)
-    return jnp.where(an_angle, jnp.argmax(found), first), jnp.where(an_angle, RESULTS.angle_jumped, result)
+    # where it comes to half a turn, at the rate of the position before, and there is no position then
+    every = jnp.concatenate([home[None], after])
+    last, earlier = every[first], every[jnp.maximum(first - 1, 0)]
+    coming = jnp.any((jnp.abs(last) <= jnp.pi) & (jnp.abs(2.0 * last - earlier) > jnp.pi))
+    lost = coming & (result == RESULTS.position_failed)
+    return jnp.where(an_angle, jnp.argmax(found), first), jnp.where(an_angle | lost, RESULTS.angle_jumped, result)
 
 
 def drivers(system: MultibodySystem, kind: str = "constraints") -> dict[str, tuple[str, int, int]]:

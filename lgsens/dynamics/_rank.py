@@ -35,10 +35,11 @@ def rank_near_reference(system: AbstractSystem, t: Float[Array, ""], driven: Boo
     """
     q, _ = _assembled(system, t)
     at = best = _Place(q, _evaluated(system, q, t)[1])
-    reference = rank = left_null_space(at.jacobian)[1]
+    scale = np.asarray(system.coordinate_scale())
+    reference = rank = left_null_space(at.jacobian * scale)[1]
     for direction in np.random.default_rng(0).normal(size=(_DIRECTIONS, at.jacobian.shape[1])):
         there, _ = _moved(system, at, t, direction, _DISTANCE, driven)
-        if there is not None and (own := left_null_space(there.jacobian)[1]) > rank:
+        if there is not None and (own := left_null_space(there.jacobian * scale)[1]) > rank:
             best, rank = there, own
     return Rank(reference, rank, *best)
 
@@ -47,7 +48,7 @@ def jacobians_on_the_way(
     system: AbstractSystem, found: Rank, t: Float[Array, ""], driven: Bool[np.ndarray, " m"]
 ) -> list[Float[np.ndarray, "m k"]]:
     """J in configurations that the mechanism reaches, where it has the rank that was found; `driven` as above."""
-    every, k = [found.jacobian], found.jacobian.shape[1]
+    every, k, scale = [found.jacobian], found.jacobian.shape[1], np.asarray(system.coordinate_scale())
     for way in np.random.default_rng(1).normal(size=(_WAYS, k)):
         for direction in (way, -way):
             place: _Place | None = _Place(found.q, found.jacobian)
@@ -55,7 +56,7 @@ def jacobians_on_the_way(
                 place, direction = _moved(system, place, t, direction, _STRIDE, driven)
                 if place is None:
                     break
-                if left_null_space(place.jacobian)[1] == found.near:
+                if left_null_space(place.jacobian * scale)[1] == found.near:
                     every.append(place.jacobian)
     return every
 

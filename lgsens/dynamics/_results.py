@@ -77,7 +77,7 @@ _MESSAGES = {
         "Equations of joints that redundant='remove' left out do not hold any more. Others imply them for lengths and "
         "axes that fit, as parallel axes of a planar linkage do, and on one branch of the motion: these numbers do not "
         "fit, or the motion has changed the branch. Keep what has to fit in the parameters of a design, or let a joint "
-        "give way (`Bushing`); for a branch take smaller steps."
+        "give way (`Bushing`); for a branch take smaller steps, and keep Newton's `tolerance` below 1e-4."
     ),
     RESULTS.position_failed: (
         "No position satisfies the joints for these values of the driven ones: they are out of reach, or the mechanism "

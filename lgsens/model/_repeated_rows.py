@@ -7,6 +7,7 @@ repeats others, they determine already what it prescribes.
 """
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
@@ -25,6 +26,8 @@ from lgsens.model._system import MultibodySystem
 
 # Of each equation its joint, which of the joint's basic constraints, and which row of that.
 Equations = tuple[tuple[str, int, int], ...]
+# Singular values of unit rows that would repeat others but for as much; beside a dead centre there are such, too.
+_NEARLY, _NEARLY_IF_IT_MOVES = 1e-3, 1e-5
 _POINT, _FIRST = 0.1, 0.9  # of a direction, and of the last joint, 1
 _REDUNDANT = ("refuse", "minimum_norm", "remove")
 
@@ -63,6 +66,9 @@ def repeated_equations(system: MultibodySystem) -> Equations:
     scene, t = dataclasses.replace(system, minimum_norm=True), jnp.zeros((), system.mass.dtype)
     driven = driven_equations(scene)
     found = rank_near_reference(scene, t, driven)
+    locked = found.near >= found.jacobian.shape[1] and not driven.any()
+    jacobian = found.jacobian * np.asarray(system.coordinate_scale())
+    _warn_of_nearly_repeated(jacobian, system.constraint_names, _NEARLY if locked else _NEARLY_IF_IT_MOVES)
     if found.near == len(found.jacobian):
         return ()
     equations: dict[int, tuple[str, int, int]] = {}
@@ -74,7 +80,7 @@ def repeated_equations(system: MultibodySystem) -> Equations:
     if conflicts := [name for name in repeating if name in prescribing]:
         raise ValueError(
             f"Model: redundant='remove': {conflicts} prescribe what the other joints determine already; leave one out "
-            f"of {repeating}."
+            f"of {repeating}; or axes that should be parallel, and points that should coincide, do not quite."
         )
     jacobians = np.stack(jacobians_on_the_way(scene, found, t, driven)) * np.asarray(system.coordinate_scale())
     translations = system.index[:, : ROTATION.start]
@@ -82,6 +88,25 @@ def repeated_equations(system: MultibodySystem) -> Equations:
     order = np.argsort(sorted(equations, key=equations.__getitem__))
     weights = np.where(directions, 1.0, _POINT) * (_FIRST + (1.0 - _FIRST) * order / len(order))
     return tuple(sorted(equations[row] for row in repeated_rows(jacobians, weights)))
+
+
+def _warn_of_nearly_repeated(jacobian: np.ndarray, names: tuple[str, ...], most: float) -> None:
+    """Where equations would repeat others but for a little, and are kept. (In single precision that is round-off.)"""
+    if jacobian.dtype != np.float64:
+        return
+    rows = jacobian / np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), np.finfo(jacobian.dtype).tiny)
+    left, singular, _ = np.linalg.svd(rows, full_matrices=False)
+    nearly = (singular > np.sqrt(np.finfo(jacobian.dtype).eps)) & (singular < most)
+    if nearly.any():
+        weight = np.abs(left[:, nearly]).max(axis=1)
+        joints = sorted({name for name, w in zip(names, weight) if w > 0.1})
+        warnings.warn(
+            f"Model: redundant='remove': equations of {joints} would repeat each other but for "
+            f"{singular[nearly].min():.0e}: axes or points are out of line by about that, or the reference is as near "
+            "to a dead centre. They are kept, and what they leave may not move. Make axes parallel and points "
+            "coincide, or give the `removed` of a model where they do: Model(…, redundant=exact.removed).",
+            stacklevel=5,
+        )
 
 
 def _prescribes(joint: AbstractJoint) -> bool:
