@@ -3,6 +3,7 @@ redundant equations, least norm, and differences."""
 
 import dataclasses
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -301,7 +302,8 @@ def test_single_precision_in_millimetres():
         assert len(lg.Model(bodies, joints, redundant="remove").removed) == 3
 
 
-APART = says("redundant='remove' left out do not hold", "at step", "hinge", "throw=False")
+# those of Bennett's linkage that are left out are of two of its hinges
+APART = re.compile(r"(?s)redundant='remove' left out do not hold.* at step .*in joint 'hinge [12]'.*throw=False")
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,7 @@ from lgsens.dynamics import (
     accelerations,
     consistent_velocity,
     initial_state,
+    names_of_all,
     split_velocity,
 )
 from lgsens.integrate import AbstractIntegrator, GeneralizedAlpha
@@ -86,7 +87,7 @@ def sensitivity_growth(
     check_integrator(integrator, num_steps)
     t0, t1 = interval(t0, t1)
     growth, result, details = _growth_jit(system, t0, t1, num_steps, integrator)
-    return throw_if_failed(growth, result, details, system.constraint_names)
+    return throw_if_failed(growth, result, details, names_of_all(system))
 
 
 @eqx.filter_jit

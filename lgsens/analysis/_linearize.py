@@ -24,6 +24,7 @@ from lgsens.dynamics import (
     finite,
     full_jacobian,
     is_redundant,
+    names_of_all,
     require_independent,
     require_linear,
 )
@@ -235,7 +236,7 @@ def linearize(
         raise ValueError("`rotation` is that of a motion; give its `state` as well, `initial_state(model)` say.")
     rotation = as_float(jnp.zeros(3) if rotation is None else rotation, (3,), "`rotation`")
     found, details = _linearize_jit(model, state, t0, rotation, inputs, tuple(outputs.items()))
-    return throw_if_failed(found, found.result, details, system.constraint_names) if throw else found
+    return throw_if_failed(found, found.result, details, names_of_all(system)) if throw else found
 
 
 @eqx.filter_jit

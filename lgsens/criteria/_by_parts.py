@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from lgsens.criteria._criterion_use import Use
 from lgsens.criteria._packed import Packed
-from lgsens.dynamics import RESULTS, AbstractSystem, State, is_redundant, softness
+from lgsens.dynamics import RESULTS, AbstractSystem, State, is_redundant, names_of_all, softness
 from lgsens.integrate import AbstractIntegrator, Steps
 from lgsens.sensitivity import AbstractSensitivity
 from lgsens.simulation import Trajectory, as_system, begin, cut, for_any_number, run
@@ -65,7 +65,7 @@ def reverse_by_parts(
     count = None if exact else task.num_steps
     value, rows, result, note = call(_values, task.criteria, names, found, times, system, details["jacobian"], p, count)
     gradient = call(_pulled_to_p, of_p, call(_pulled_to_scene, of_scene, rows), rows)
-    parts = Parts(value, gradient, result, details, system.constraint_names, note)
+    parts = Parts(value, gradient, result, details, names_of_all(system), note)
     return parts, dataclasses.replace(found, system=system)
 
 

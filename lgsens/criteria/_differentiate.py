@@ -20,7 +20,7 @@ from lgsens.criteria._criterion_use import Use, checked_for
 from lgsens.criteria._index_reduced_method import by_index_reduced
 from lgsens.criteria._reference_methods import STENCIL, FiniteDifferences, IndexReduced
 from lgsens.criteria._to_accuracy import differentiate_to
-from lgsens.dynamics import RESULTS, AbstractSystem, Faults, State
+from lgsens.dynamics import RESULTS, AbstractSystem, Faults, State, names_of_all
 from lgsens.integrate import AbstractIntegrator, EqualGrid, GeneralizedAlpha, UnevenGrid
 from lgsens.model import Model
 from lgsens.sensitivity import (
@@ -256,7 +256,7 @@ def _differentiate_jit(task: _Task, p, names: tuple[str, ...], method):
         found = _forwards(task, flat, method)
     result, note = unique(found.result, system, found.details["jacobian"], names, uses)
     gradient = tuple(unravel(row) for row in found.gradient)
-    return Parts(tuple(found.value), gradient, result, found.details, system.constraint_names, note)
+    return Parts(tuple(found.value), gradient, result, found.details, names_of_all(system), note)
 
 
 def _on_the_fly(task: _Task, p, constant: bool) -> _Found:

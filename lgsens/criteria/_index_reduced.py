@@ -39,7 +39,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from lgsens._validate import as_count, as_float, is_concrete, require
-from lgsens.dynamics import RESULTS, AbstractSystem, State, accelerations, breaks_of, initial_state
+from lgsens.dynamics import RESULTS, AbstractSystem, State, accelerations, breaks_of, initial_state, names_of_all
 from lgsens.simulation import SimulationError, throw_if_failed
 
 Pointwise = Callable[[Array, AbstractSystem, State, Array], Float[Array, " c"]]
@@ -186,7 +186,7 @@ def _run(rate, final, build, p, t0, t1, tolerances, max_steps, jumps):
     (value, violation), (varied_value, _) = with_variations(criteria, reached[-1], t1)
     run = IndexReducedRun(value, (varied_value / scale[:, None]).T, steps[-1], jnp.max(jnp.abs(violation), initial=0.0))
     details = {"violation": initial.violation, "jacobian": system.constraint_jacobian(initial.state.q, t0)}
-    return run, jnp.all(finished), initial.result, details, system.constraint_names
+    return run, jnp.all(finished), initial.result, details, names_of_all(system)
 
 
 def _no_integrals(rate, final, p, system, state, t) -> Float[Array, " c"]:

@@ -8,7 +8,7 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 
-from lgsens.dynamics import RESULTS, full_jacobian, initial_state, redundant_names
+from lgsens.dynamics import RESULTS, full_jacobian, initial_state, names_of_all, redundant_names
 from lgsens.integrate import singular_steps
 from lgsens.model import invalid_numbers, scene_of
 
@@ -221,7 +221,7 @@ def raise_if_failed(found: Any) -> Any:
         and stats is not None
     ):
         details = _of_steps(code, t, stats)
-    raise _exception(code, details, () if system is None else system.constraint_names, of_batch)
+    raise _exception(code, details, () if system is None else names_of_all(system), of_batch)
 
 
 def _of_steps(code: int, t, stats: Any) -> dict[str, Any]:
