@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lgsens._validate import as_float, require, suggestion
-from lgsens.dynamics import RESULTS, AbstractDrive, jumped
+from lgsens.dynamics import RESULTS, AbstractDrive, coming_to_half_a_turn, jumped
 from lgsens.model import AbstractJoint, AbstractSignal, Model, MultibodySystem
 
 
@@ -60,13 +60,12 @@ def unless_jumped(system: MultibodySystem, q: Any, first, result, starts: Sequen
     home, after = jax.lax.stop_gradient((system.branches(system.reference()[0]), jax.vmap(system.branches)(q)))
     before = np.arange(after.shape[0])  # among the reference and all of them
     before[[at for at in starts if at > 0]] = 1
-    found = jumped(jnp.concatenate([home[None], after])[before], after)
+    every = jnp.concatenate([home[None], after])
+    found = jumped(every[before], after)
     an_angle = jnp.any(found) & (result == RESULTS.successful)
     # where it comes to half a turn, at the rate of the position before, and there is no position then
-    every = jnp.concatenate([home[None], after])
-    last, earlier = every[first], every[jnp.maximum(first - 1, 0)]
-    coming = jnp.any((jnp.abs(last) <= jnp.pi) & (jnp.abs(2.0 * last - earlier) > jnp.pi))
-    lost = coming & (result == RESULTS.position_failed)
+    last = jnp.stack([jnp.maximum(first - 1, 0), first])
+    lost = coming_to_half_a_turn(*every[last][:, None])[0] & (result == RESULTS.position_failed)
     return jnp.where(an_angle, jnp.argmax(found), first), jnp.where(an_angle | lost, RESULTS.angle_jumped, result)
 
 

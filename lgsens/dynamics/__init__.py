@@ -55,6 +55,7 @@ from lgsens.dynamics._matrices import (
 from lgsens.dynamics._rank import (
     Rank as Rank,
     jacobians_on_the_way as jacobians_on_the_way,
+    of_unit_rows as of_unit_rows,
     rank_near_reference as rank_near_reference,
     redundant_names as redundant_names,
     repeated_rows as repeated_rows,
@@ -79,6 +80,7 @@ from lgsens.dynamics._system import (
 from lgsens.dynamics._unseen import (
     Faults as Faults,
     Unseen as Unseen,
+    coming_to_half_a_turn as coming_to_half_a_turn,
     jumped as jumped,
     unsteady_rate as unsteady_rate,
 )

@@ -173,7 +173,7 @@ class _Position(NamedTuple):
     matrix: Float[Array, "m k"]  # Â
     sure: Bool[Array, ""]  # whether no matrix between that before and Â is singular
     first: Float[Array, ""]  # the size of its first step
-    more: Float[Array, ""]  # that of what others add
+    strays: Bool[Array, ""]  # whether it led too far to be the next position
     size: Float[Array, ""]  # that of the step before the last
     singular: Bool[Array, ""]
 
@@ -219,10 +219,11 @@ def _newton(drive: AbstractDrive, q, before: Float[Array, "m k"], values, t, nea
     q, first, others, size, *_ = while_loop(unfinished, body, start)
     # Newton is quadratic: one step from √eps is at round-off.
     x, least, matrix, change = _last_step(*equations(q), scale, before)
-    sure = _positive(change, near & _small(size) & ~_strays(first, largest(others)))
+    strays = _strays(first, largest(others))
+    sure = _positive(change, near & _small(size) & ~strays)
     regular = least > _SINGULAR * jnp.sqrt(jnp.finfo(scale.dtype).eps)  # NaN is not
     q = system.group.retract(q, -x)
-    return _Position(q, matrix, sure, first, largest(others), size, _small(size) & ~regular)
+    return _Position(q, matrix, sure, first, strays, size, _small(size) & ~regular)
 
 
 def _small(size):
@@ -261,7 +262,7 @@ def _configurations(drive: AbstractDrive, values: Float[Array, "n d"], t: Float[
         values, t = jax.tree.map(lambda end, before: end - (1.0 - to) * (end - before), end, before)
         new = _newton(drive, way.q, way.matrix, values, t, near)
         short = new.first <= _SHORT * jnp.sqrt(jnp.finfo(values.dtype).eps)
-        follows = ~way.begun | (near & ~_strays(new.first, new.more) & (new.sure | short))
+        follows = ~way.begun | (near & ~new.strays & (new.sure | short))
         taken = follows & new.converged & ~new.singular
         arrived, singular = taken & (to == 1.0), new.singular & (to == 1.0)
         over = ~taken & (~near | (follows & singular))

@@ -89,10 +89,15 @@ def redundant_names(jacobian: Matrix, names: tuple[str, ...]) -> list[str]:
     return sorted({name for name, w in zip(names, weight) if w > np.sqrt(np.finfo(jacobian.dtype).eps)})
 
 
+def of_unit_rows(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The left singular vectors, all of them, and the singular values of B with unit rows."""
+    rows = jacobian / np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), np.finfo(jacobian.dtype).tiny)
+    return np.linalg.svd(rows)[:2]
+
+
 def left_null_space(jacobian: np.ndarray) -> tuple[np.ndarray, int]:
     """An orthonormal basis of the left null space of B with unit rows, and the rank of B."""
-    rows = jacobian / np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), np.finfo(jacobian.dtype).tiny)
-    left, singular, _ = np.linalg.svd(rows)
+    left, singular = of_unit_rows(jacobian)
     rank = int(np.sum(singular > np.sqrt(np.finfo(jacobian.dtype).eps)))
     return left[:, rank:], rank
 

@@ -43,6 +43,11 @@ def jumped(before: Float[Array, "n w"], after: Float[Array, "n w"]) -> Bool[Arra
     return jnp.any(jnp.abs(after - before) > jnp.pi, axis=1)
 
 
+def coming_to_half_a_turn(before: Float[Array, "n w"], at: Float[Array, "n w"]) -> Bool[Array, " n"]:
+    """Whether one of the `AbstractSystem.branches` comes to where it jumps, at the rate from one instant to another."""
+    return jnp.any((jnp.abs(at) <= jnp.pi) & (jnp.abs(2.0 * at - before) > jnp.pi), axis=1)
+
+
 class Unseen(NamedTuple):
     """What tells it, at some instants: `unsteady_rate` [rad/s], `AbstractSystem.branches` [rad], and what is `missing`
     of equations that were left out."""
@@ -53,9 +58,8 @@ class Unseen(NamedTuple):
 
     @classmethod
     def at(cls, system: AbstractSystem, state: State, t) -> "Unseen":
-        q, t = lax.stop_gradient((state.q, t))
-        branches = lax.stop_gradient(system.branches(q))
-        return cls(unsteady_rate(system, state.v, state.vdot), branches, missing(system, q, t))
+        branches = lax.stop_gradient(system.branches(state.q))
+        return cls(unsteady_rate(system, state.v, state.vdot), branches, missing(system, state.q, t))
 
     @classmethod
     def along(cls, system: AbstractSystem, states: State, t: Float[Array, " n+1"]) -> "Unseen":
@@ -77,8 +81,8 @@ class Faults(NamedTuple):
     def between(cls, t: Float[Array, " n+1"], unseen: Unseen) -> "Faults":
         h, angles = jnp.diff(t), unseen.branches
         before = jnp.concatenate([angles[:1], angles[:-2]])
-        ahead = jnp.any((jnp.abs(angles[:-1]) <= jnp.pi) & (jnp.abs(2.0 * angles[:-1] - before) > jnp.pi), axis=1)
-        return cls(h * unseen.rates[1:], jumped(angles[:-1], angles[1:]) & (h > 0.0), ahead, unseen.missing[1:])
+        ahead, jumps = coming_to_half_a_turn(before, angles[:-1]), jumped(angles[:-1], angles[1:])
+        return cls(h * unseen.rates[1:], jumps & (h > 0.0), ahead, unseen.missing[1:])
 
     @property
     def apart(self) -> Bool[Array, " n"]:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from lgsens._validate import is_concrete
-from lgsens.dynamics import jacobians_on_the_way, rank_near_reference, redundant_names, repeated_rows
+from lgsens.dynamics import jacobians_on_the_way, of_unit_rows, rank_near_reference, redundant_names, repeated_rows
 from lgsens.model._constraints import AbstractRows
 from lgsens.model._frames import ROTATION
 from lgsens.model._joints import AbstractJoint
@@ -94,11 +94,10 @@ def _warn_of_nearly_repeated(jacobian: np.ndarray, names: tuple[str, ...], most:
     """Where equations would repeat others but for a little, and are kept. (In single precision that is round-off.)"""
     if jacobian.dtype != np.float64:
         return
-    rows = jacobian / np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), np.finfo(jacobian.dtype).tiny)
-    left, singular, _ = np.linalg.svd(rows, full_matrices=False)
+    left, singular = of_unit_rows(jacobian)
     nearly = (singular > np.sqrt(np.finfo(jacobian.dtype).eps)) & (singular < most)
     if nearly.any():
-        weight = np.abs(left[:, nearly]).max(axis=1)
+        weight = np.abs(left[:, : len(singular)][:, nearly]).max(axis=1)
         joints = sorted({name for name, w in zip(names, weight) if w > 0.1})
         warnings.warn(
             f"Model: redundant='remove': equations of {joints} would repeat each other but for "
