@@ -1,5 +1,6 @@
 """The matrices of a system as its linear solver wants them, sparse or dense, and the equations with M and B."""
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -71,7 +72,7 @@ def times_tangent_operator(system: AbstractSystem, x, matrices: tuple[Matrix, ..
     """A T(x) for each of the matrices A."""
     sparse = _sparse(system)
     if sparse is not None:
-        operators = sparse.tangent_operators(x)
+        operators = sparse.rotation_operators(partial(system.group.tangent_mv, x))
         return tuple(matrix.times_rotations(operators) for matrix in matrices)
     turned = jax.vmap(lambda row: system.group.tangent_rmv(x, row))(jnp.concatenate(matrices))
     heights = [matrix.shape[0] for matrix in matrices]

@@ -1,6 +1,7 @@
 """The abstract constrained mechanical system on a Lie group, eqs. (15)–(17), and its state."""
 
 import abc
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from lgsens.dynamics._breaks import Breaking
 from lgsens.liegroups import AbstractLieGroup
-from lgsens.linear import AbstractLinearSolver, Elimination, Matrix, SparseMatrix
+from lgsens.linear import AbstractLinearSolver, Elimination, Graph, Matrix, SparseMatrix
 
 
 class State(eqx.Module):
@@ -219,13 +220,25 @@ class AbstractSparseSystem(AbstractSystem):
         """K_t, C_t and J; the columns of K_t and J by bodies."""
 
     @abc.abstractmethod
+    def sparse_rate_stiffness(self, q, v, t) -> SparseMatrix:
+        """V, shape (m, k): the derivative of c(q, v, t) by q is V u along q ũ. For systems without rows of velocity
+        level, as plans are."""
+
+    @abc.abstractmethod
+    def arranged(self, arrangement: Callable[[Graph], tuple[Graph, float]]) -> Elimination | None:
+        """The order of elimination of other unknowns on the same graph, made once for each `arrangement`, or None.
+
+        `arrangement` (static): which unknowns, and what to eliminate them otherwise takes [µs].
+        """
+
+    @abc.abstractmethod
     def body_blocks(self, matrix: Float[Array, "k k"]) -> Float[Array, "N 6 6"]:
         """The rows and columns of each body in a matrix; zero where the body does not have the coordinate."""
 
     @abc.abstractmethod
-    def tangent_operators(self, x) -> Float[Array, "N 3 3"]:
-        """T(x) on the rotations of each body, zero in the rows and columns of those that it does not have; T = I on
-        translations."""
+    def rotation_operators(self, function: Callable[[Any], Any]) -> Float[Array, "N 3 3"]:
+        """The matrices of a linear function of v that takes the rotations of each body to those of the same, as T(x)
+        does; zero in the rows and columns of rotations that a body does not have."""
 
 
 def finite(*trees: Any) -> Bool[Array, ""]:

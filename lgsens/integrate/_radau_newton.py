@@ -21,7 +21,8 @@ from jaxtyping import Array, Bool, Float, Int
 from lgsens._xla import in_any_lane, renewed_where, while_loop
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.integrate._linearized import Node
-from lgsens.integrate._radau_stages import A, C, RadauStages, StageFactors, advanced, left
+from lgsens.integrate._radau_sparse import stage_factors
+from lgsens.integrate._radau_stages import A, AbstractStageFactors, C, RadauStages, advanced, left
 from lgsens.integrate._scheme import Memory, Stats
 
 _SLOW = 0.1
@@ -32,13 +33,13 @@ _ROUGH = 0.25
 class KeptFactors(NamedTuple):
     """The matrix of an earlier iteration in factors."""
 
-    factors: StageFactors
+    factors: AbstractStageFactors
     stale: Bool[Array, ""]  # whether it contracted too slowly, or is none yet
 
 
 def no_memory(system: AbstractSystem, node: Node, state: State) -> Memory:
     """That of the beginning: the size of the last step, 0 before the first, and the factors."""
-    like = jax.eval_shape(lambda: StageFactors.of(system, node, state, state.inner))
+    like = jax.eval_shape(lambda: stage_factors(system, node, state, state.inner))
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)
     return Memory(jnp.zeros_like(node.h), KeptFactors(zeros, jnp.ones((), bool)))
 
@@ -59,10 +60,10 @@ def solved(
     scale = system.coordinate_scale()
     tolerance = max(scheme.tolerance, 64 * float(jnp.finfo(scale.dtype).eps))
 
-    def corrected(carry: tuple[_Iterate, StageFactors]) -> tuple[_Iterate, StageFactors]:
+    def corrected(carry: tuple[_Iterate, AbstractStageFactors]) -> tuple[_Iterate, AbstractStageFactors]:
         iterate, factors = carry
         due = in_any_lane(iterate.due & iterate.going)  # where one lane of a batch makes a matrix, all have the time to
-        factors = renewed_where(due, lambda: StageFactors.of(system, node, begun, iterate.found), factors)
+        factors = renewed_where(due, lambda: stage_factors(system, node, begun, iterate.found), factors)
         rest = left(system, node, begun, iterate.found)
         step = factors.solve(node.h, rest)
         size = jnp.max(jnp.abs(advanced(node.h, begun.v, step)[0]) / scale[None])

@@ -1,5 +1,6 @@
 """Linear algebra of a step: dense, and sparse along the graph of bodies and joints."""
 
+from lgsens.linear._block_factors import BlockFactors as BlockFactors, BlockMatrix as BlockMatrix
 from lgsens.linear._dense import LU as LU, Inverse as Inverse
 from lgsens.linear._elimination import Elimination as Elimination
 from lgsens.linear._factors import Factors as Factors, Matrix as Matrix, many_runs as many_runs

@@ -54,16 +54,19 @@ class BlockSparse(AbstractLinearSolver):
     mixed: bool = eqx.field(static=True, default=False, kw_only=True)
 
 
-def elimination(solver: AbstractLinearSolver | None, graph: Graph, by_joints: Graph) -> Elimination | None:
+def elimination(
+    solver: AbstractLinearSolver | None, graph: Graph, by_joints: Graph, otherwise: float | None = None
+) -> Elimination | None:
     """The plan of `BlockSparse`, or None for a dense LU; `solver` None: the cheaper one.
 
     graph: of the matrices of steps. by_joints: of those that are factorized once in a run, which have no forces.
+    otherwise: the time [µs] of what solves the equations without a plan; None: that of a dense LU.
     """
     size = sum(map(len, graph.nodes))
     if isinstance(solver, DenseLU) or (solver is None and size < tuned.SMALLEST_SPARSE):
         return None
     dense, best = Elimination([], size), _cheapest(graph)
-    if solver is None and _cost(dense) <= _cost(best):
+    if solver is None and (_cost(dense) if otherwise is None else otherwise) <= _cost(best):
         return None
     at_once = best if by_joints.neighbours == graph.neighbours else _cheapest(by_joints)
     steps, once = _with_loop(best, tuned.LOOP_COST), _with_loop(at_once, math.inf)

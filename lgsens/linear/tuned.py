@@ -102,3 +102,13 @@ SETTINGS_TOGETHER, MAPS = 8, 40_000
 # Entries from which on an array goes from one program to the next as it is (`criteria._packed`), smaller ones together.
 # A gradient of the quarter-car outside of `jit` takes 6.6 instead of 9.5 ms; other limits were not tried.
 PASSED_ALONE = 4096
+
+
+def nullspaces(k: int, m: int) -> float:
+    """The time [µs] of the three stages of Radau on the nullspaces of m rows of k columns (`integrate._radau_dense`).
+
+    Measured: quarter-car 650, chains of 8, 16, 32, 64 links 690, 1.9e3, 1.2e4, 8.9e4, beams of 4, 8, 16 elements 760,
+    2.3e3, 1.1e4; on blocks 2.1e3; 2.3e3, 5.5e3, 1.1e4, 2.1e4; 610, 1.1e3, 1.7e3.
+    """
+    free = k - m
+    return 250.0 + 0.12 * k**2 + 0.7 * (12 * k**2 * (m + 3 * free) + 144 * free**3) / FLOPS

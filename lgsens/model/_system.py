@@ -14,6 +14,7 @@ from lgsens._validate import suggestion
 from lgsens.dynamics import AbstractRedundantSystem, AbstractSparseSystem, Tangents, finite, least_norm
 from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew, turn
 from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, chosen
+from lgsens.model._blocks_of_bodies import body_blocks, rotation_operators
 from lgsens.model._breaking import breaking_of
 from lgsens.model._checks import are_bodies, far_from_rotation
 from lgsens.model._constraints import AbstractRows
@@ -22,6 +23,7 @@ from lgsens.model._given_joints import GivenJoints, JointsOf
 from lgsens.model._left_out import names_left_out, values_left_out
 from lgsens.model._loads import AbstractDynamicLoad, AbstractLoad, generalized_force
 from lgsens.model._merged_parts import Parts
+from lgsens.model._rate_stiffness import rate_stiffness
 from lgsens.model._sizes import compliance, coordinate_scale
 from lgsens.model._stack import (
     Stack,
@@ -79,6 +81,9 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     @property
     def elimination(self):
         return self.topology.elimination(self.linear_solver)
+
+    def arranged(self, arrangement):
+        return self.topology.elimination(self.linear_solver, arrangement)
 
     @property
     def group(self) -> Power | Poses:
@@ -142,6 +147,9 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
 
     breaking: ClassVar[Any] = property(breaking_of)
     repeated_names: ClassVar[Any] = property(names_left_out)
+    sparse_rate_stiffness: ClassVar[Any] = rate_stiffness
+    body_blocks: ClassVar[Any] = body_blocks
+    rotation_operators: ClassVar[Any] = rotation_operators
 
     def repeated_constraint(self, q, t):
         return values_left_out(self, q, t)
@@ -234,19 +242,6 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
     def _square(self, parts) -> SparseMatrix:
         k = self.group.dim
         return SparseMatrix(tuple(parts), (k, k), self.mass.dtype)
-
-    def body_blocks(self, matrix):
-        here = self.index
-        there = (here[:, :, None] >= 0) & (here[:, None, :] >= 0)
-        return jnp.where(there, matrix[here[:, :, None], here[:, None, :]], jnp.zeros((), matrix.dtype))
-
-    def tangent_operators(self, x):
-        # T is block diagonal: a unit vector for each of the three rotations, in all bodies at once, gives its columns.
-        axes = self.index.T[ROTATION]
-        units = np.zeros((len(axes), self.group.dim + 1))
-        np.put_along_axis(units, axes, 1.0, axis=1)  # −1, where a body does not have it, is the last place
-        columns = jax.vmap(partial(self.group.tangent_mv, x))(jnp.asarray(units[:, :-1], x.dtype))
-        return jnp.moveaxis(self.twists(columns)[..., ROTATION], 0, 2)
 
     @property
     def _gyroscopic(self) -> bool:

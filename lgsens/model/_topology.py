@@ -1,7 +1,7 @@
 """What a system's arrays look like whatever its numbers: who is coupled to whom, and where the entries go."""
 
 from functools import cached_property, lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,7 +50,7 @@ class Topology:
 
     def __init__(self, index: np.ndarray, constraints: tuple[Ends, ...], loads: tuple[Ends, ...]):
         self.index, self._constraints, self._loads = index, constraints, loads
-        self._plans: dict[AbstractLinearSolver | None, Elimination | None] = {}
+        self._plans: dict[Any, Elimination | None] = {}
         self.rows: list[np.ndarray] = []
         start = 0
         for ends in constraints:
@@ -60,7 +60,7 @@ class Topology:
         self.num_constraints = start
         self.num_velocity_rows = sum(int(np.sum(ends.kept)) for ends in constraints if ends.velocity)
         self.num_positions = sum(not ends.velocity for ends in constraints)  # stacks; they come first
-        self.mass = Pattern(index, index)
+        self.mass = Pattern(index, index, np.arange(len(index))[:, None])
         self.gyroscopic = Pattern(index[:, ROTATION], index[:, ROTATION])
         self.loads = [self._square(ends) for ends in loads]
         self.stiffness = [self._stiffness(ends) for ends in constraints]
@@ -132,11 +132,21 @@ class Topology:
         whole = frozenset(body for body, own in enumerate(self.index) if (own >= 0).all())
         return Graph(nodes, near, joints, whole), Graph(nodes, by_joints, joints, whole)
 
-    def elimination(self, solver: AbstractLinearSolver | None) -> Elimination | None:
-        """The plan of the linear solver, made once; None: a dense one. `solver` None: the cheaper one."""
-        if solver not in self._plans:  # rows of velocity level are not those of B T in S, as plans take them to be
-            self._plans[solver] = None if self.num_velocity_rows else elimination(solver, *self._graphs)
-        return self._plans[solver]
+    def elimination(self, solver: AbstractLinearSolver | None, arrangement: Any = None) -> Elimination | None:
+        """The plan of the linear solver, made once; None: a dense one. `solver` None: the cheaper one.
+
+        `arrangement`: of other unknowns (`AbstractSparseSystem.arranged`); None: coordinates and multipliers."""
+        if self.num_velocity_rows:  # they are not those of B T in S, as plans take them to be
+            return None
+        key = solver, arrangement
+        if key not in self._plans:
+            graph, by_joints = self._graphs
+            if arrangement is None:
+                self._plans[key] = elimination(solver, graph, by_joints)
+            else:
+                every, dense = arrangement(graph)
+                self._plans[key] = elimination(solver, every, every, dense)
+        return self._plans[key]
 
 
 def _join(near: list[set[int]], group: set[int]) -> None:

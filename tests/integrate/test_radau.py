@@ -1,6 +1,8 @@
 """Radau IIA against explicit schemes and numbers of high order, its order, and its derivatives."""
 
+import dataclasses
 import json
+from functools import partial
 from pathlib import Path
 
 import diffrax
@@ -9,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from differences import central
-from helpers import random_like, says, some_quick
+from helpers import everything, random_like, says, some_quick
 from jax.flatten_util import ravel_pytree
 from rolling_disc import scene as rolling_disc
 from scipy.spatial.transform import Rotation
@@ -18,7 +20,8 @@ import lgsens as lg
 from lgsens.dynamics import State
 from lgsens.examples import heavy_top, spinning_top
 from lgsens.integrate._linearized import Node
-from lgsens.integrate._radau_stages import RadauStages, StageFactors, left
+from lgsens.integrate._radau_sparse import stage_factors, stage_plan
+from lgsens.integrate._radau_stages import RadauStages, left
 
 RADAU = lg.RadauIIA()
 HEAVY = json.loads((Path(__file__).parents[1] / "data" / "heavy_top_bruls2012.json").read_text())
@@ -122,11 +125,52 @@ def test_criteria_are_of_its_order():
     assert fine.max() < 1e-6
 
 
-@pytest.mark.parametrize("scene", some_quick([lambda: spinning_top(0.7), rolling_disc]))
-def test_factors_are_those_of_the_equations(scene):
+def machine():
+    """A gear between two hinges that three bodies share, a driven rod, an actuator with a state, a planar body."""
+    body = lambda x, **more: lg.RigidBody(1.0, (0.02, 0.03, 0.04), position=(x, 0.0, 0.1), **more)
+    hinge = lambda a, b, x: lg.RevoluteJoint(a, b, at=(x, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+    joints = {
+        "first": hinge(None, "a", 0.0),
+        "second": hinge("a", "b", 0.5),
+        "ball": lg.SphericalJoint("b", "c", at=(1, 0, 0)),
+    }
+    joints["gear"] = lg.CoordinateCoupling(joints["first"], joints["second"], (0.3, 0.1))
+    joints["rod"] = lg.DistanceJoint(
+        "c", "d", at_a=(1.5, 0, 0), at_b=(2.0, 0, 0), length=lg.Harmonic(amplitude=0.1, frequency=3.0, offset=0.5)
+    )
+    forces = {
+        "gravity": lg.Gravity((0.0, 0.0, -9.81)),
+        "damper": lg.SpringDamper("a", "d", at_a=(0.2, 0, 0), at_b=(2, 0.1, 0), stiffness=1e3, damping=5.0),
+        "maxwell": lg.MaxwellElement("a", "c", at_a=(0.2, 0, 0), at_b=(1, 0.1, 0), stiffness=1e3, damping=5.0),
+    }
+    bodies = {"a": body(0.2), "b": body(0.7, angular_velocity=(0.1, 0.5, 0.2)), "c": body(1.2)}
+    return lg.Model(bodies | {"d": body(2.1, free="x z ry")}, joints, forces)
+
+
+def beam():
+    """Of steel, on a hinge."""
+    section = lg.BeamSection.tube(0.03, 0.003, young=2.1e11, poisson=0.3, density=7850.0)
+    beam = lg.Beam("arm", section, [[0, 0, 0], [1.0, 0, 0]], elements=3)
+    hinge = {"hinge": lg.RevoluteJoint(None, "arm.0", at=(0, 0, 0), axis=(0, 1, 0))}
+    return lg.Model(beam.bodies, hinge, beam.forces | {"gravity": lg.Gravity((0.0, 0.0, -9.81))})
+
+
+DENSE, SPARSE = lg.DenseLU(), lg.BlockSparse()
+LINEARIZED = [
+    (DENSE, lambda: spinning_top(0.7)),
+    (SPARSE, machine),
+    (SPARSE, everything),
+    (SPARSE, beam),
+    (DENSE, rolling_disc),
+]
+
+
+@pytest.mark.parametrize("solver, scene", some_quick(LINEARIZED, 2))
+def test_factors_are_those_of_the_equations(solver, scene):
     """Anywhere, with μ of the size of λ: F_z times the solution, and F_n, by forward-mode autodiff of the equations."""
     model, rng = scene(), np.random.default_rng(0)
-    system, state = model.system(), lg.initial_state(model)
+    system, state = dataclasses.replace(model.system(), linear_solver=solver), lg.initial_state(model)
+    assert (stage_plan(system) is None) == (solver is DENSE)
     positions = len(state.lam) - system.num_velocity_rows
     node = Node(*(jnp.asarray(x) for x in (0.3, 0.34, 0.04)))
     at = (state.v, state.vdot, state.lam, state.lam[:positions])
@@ -134,22 +178,49 @@ def test_factors_are_those_of_the_equations(scene):
 
     @jax.jit
     def solved(rows, w, v):
-        factors = StageFactors.of(system, node, state, found)
-        return factors.solve(node.h, rows), factors.by_start(node.h, w, v)
+        factors = stage_factors(system, node, state, found)
+        solve = partial(factors.exactly, node.h)
+        return solve(rows), factors.by_start(node.h, w, v), jax.linear_transpose(solve, rows)(weights)[0]
 
     def equations(found, w, v):
         begun = State(system.group.retract(state.q, w), state.v + v, state.vdot, state.lam, state.a)
         return left(system, node, begun, found)
 
-    rows, w, v = random_like(found, rng), *random_like((state.v, state.v), rng)
-    change, by_start = solved(rows, w, v)
+    rows, weights, w, v = *random_like((found, found), rng), *random_like((state.v, state.v), rng)
+    change, by_start, weighted = solved(rows, w, v)
     none = jnp.zeros_like(w)
     derivative = jax.jit(lambda *tangent: jax.jvp(equations, (found, none, none), tangent)[1])
     flat = lambda tree: ravel_pytree(tree)[0]
-    # 1e-16 of numbers of 1e4, which is what positions of 1 m and multipliers of 1e2 N make of rows of size 1, × 1e2
-    np.testing.assert_allclose(flat(derivative(change, none, none)), flat(rows), rtol=0, atol=1e-10)
     resting = jax.tree.map(jnp.zeros_like, found)
-    np.testing.assert_allclose(flat(derivative(resting, w, v)), flat(by_start), rtol=0, atol=1e-11)
+    # round-off of rows for unknowns of size 1, of 1e2 with μ to 1e9 of a beam, in sums of tens of terms
+    unit = float(jnp.finfo(float).eps * jnp.abs(flat(by_start)).max())
+    np.testing.assert_allclose(flat(derivative(change, none, none)), flat(rows), rtol=0, atol=64 * unit)
+    np.testing.assert_allclose(flat(derivative(resting, w, v)), flat(by_start), rtol=0, atol=64 * unit)
+    # the same factors: round-off of sums of 1e2 terms that cancel, × 1e2
+    np.testing.assert_allclose(flat(weights) @ flat(change), flat(weighted) @ flat(rows), rtol=1e-12)
+
+
+@pytest.mark.slow  # three programs
+def test_blocks_and_nullspaces_take_the_same_steps():
+    """A steel beam that falls: motion and derivatives by the direction of gravity, in both modes."""
+
+    def tip(gravity, solver, sensitivity):
+        model = beam()
+        model = lg.Model(
+            model.bodies, model.joints, model.forces | {"gravity": lg.Gravity(gravity)}, linear_solver=solver
+        )
+        run = lg.simulate(model, t1=0.05, num_steps=5, integrator=RADAU, sensitivity=sensitivity)
+        return run.body("arm.3").position[-1] @ jnp.array([1.0, 2.0, 3.0])
+
+    gravity, found = jnp.array([0.3, 0.2, -9.81]), []
+    for solver, kind in ((DENSE, "forward"), (SPARSE, "forward"), (SPARSE, "reverse")):
+        sensitivity = lg.DirectDifferentiation() if kind == "forward" else lg.AdjointVariable()
+        psi = partial(tip, solver=solver, sensitivity=sensitivity)
+        gradient = jax.jacfwd(psi) if kind == "forward" else jax.grad(psi)
+        found.append(jnp.append(jax.jit(gradient)(gravity), jax.jit(psi)(gravity)))
+    # Newton's tolerance 1e-12 of a step, and round-off of its stiffness (h² K/M = 1e6) × 1e-16 in derivatives
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-9)
+    np.testing.assert_allclose(found[2], found[1], rtol=1e-10)
 
 
 def test_what_it_cannot():
