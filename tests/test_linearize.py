@@ -547,6 +547,24 @@ def test_what_is_refused(car):
         lg.random_road(unstable, roughness=1e-6, speed=1.0)
 
 
+def test_far_from_the_origin():
+    """Two bolts of 1 g on 1e9 N/m: round-off of 1 km is 1e-13 m × 1e12 /s². Their frequencies as at the origin."""
+
+    def frequencies(far):
+        at = lambda x, y=0.0: jnp.array([far + x, y, 0.0])
+        bodies = {name: lg.RigidBody(1e-3, (1e-9,) * 3, position=at(x)) for name, x in (("a", 0.0), ("b", 0.1))}
+        rates = {"stiffness": [1e9] * 3, "rotational_stiffness": [1e3] * 3}
+        forces = {
+            "mount": lg.Bushing(None, "a", at=at(-0.1, 0.02), **rates),
+            "rubber": lg.Bushing("a", "b", at=at(0.05, 0.02), **rates),
+        }
+        model = lg.Model(bodies, {}, forces | {"gravity": lg.Gravity((0.0, 0.0, -9.81))})
+        return lg.linearize(model, lg.equilibrium(model)).frequencies
+
+    # 1e-16 × 1 km/0.1 m of the stiffness, × 1e2
+    np.testing.assert_allclose(frequencies(1e3), frequencies(0.0), rtol=1e-8)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("elements", [1, 4])
 def test_a_stiff_beam_is_steady_at_its_own_equilibrium(elements):

@@ -93,6 +93,6 @@ def accelerates_steadily(
     speed = jnp.max(jnp.abs(state.v / scale)[:moving])
     left = state.vdot if turning is None else state.vdot - turning @ state.v
     enough = eps**0.375  # 1e-6 in double precision: of 1/s² and of the square of the speed
-    round_off = 1e2 * eps * jnp.max(jnp.abs(matrix), initial=0.0)
+    round_off = 1e2 * eps * jnp.max(jnp.abs(matrix), initial=0.0) * system.distance(state.q)
     steady = jnp.max(jnp.abs(left) / scale) <= enough * (1.0 + speed**2) + round_off
     return steady & (speed <= enough) if turning is None else steady

@@ -69,6 +69,7 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
     scale = lax.stop_gradient(system.coordinate_scale())
     weight = mass_scale(system.mass_matrix())
     eps = float(jnp.finfo(dtype).eps)
+    round_off = 16.0 * eps * lax.stop_gradient(system.distance(q_ref))
     states = np.arange(k) >= k - system.num_states
     begun = system.settled(q_ref, zero, t) if system.num_states else zero
 
@@ -103,8 +104,9 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
 
     def balanced(z, left, stiffest):
         """To √eps of the largest joint force or moment, taken as mass scale × 1 m/s² at least; and to what stiff forces
-        make of round-off of a place, 16 eps of 1 rad or the length of the scene: EA eps of a beam is more."""
-        return jnp.max(jnp.abs(left)) <= jnp.sqrt(eps) * (1.0 + largest(z)) + 16.0 * eps * stiffest
+        make of round-off of a place, 16 eps of 1 rad or the length of the scene, or of the distance of its origin: EA
+        eps of a beam is more."""
+        return jnp.max(jnp.abs(left)) <= jnp.sqrt(eps) * (1.0 + largest(z)) + round_off * stiffest
 
     def shortest(slope, right, solve):
         """The shortest solution, by `solve` of scaled rows and columns: constraints by the root of the stiffest. Of a

@@ -110,6 +110,7 @@ _MESSAGES = {
         "with the same hardpoints."
     ),
     RESULTS.steps_exhausted: (
-        "Error control needs more steps than `num_steps` allows. Try more `num_steps` or a looser `tolerance`."
+        "Error control needs more steps than `num_steps` allows. Try more `num_steps` or a looser `tolerance`; "
+        "in single precision a tolerance below 1e-4 is below round-off."
     ),
 }

@@ -179,6 +179,10 @@ class AbstractSystem(eqx.Module):
         """How many of the coordinates, the last ones, have a state as their velocity."""
         return 0
 
+    def distance(self, q) -> Float[Array, ""]:
+        """How far q is from the origin in lengths of the scene, at least 1: what multiplies round-off of a place."""
+        return jnp.ones(())
+
     def settled(self, q, v, t) -> Float[Array, " k"]:
         """v with the initial values of the states."""
         return v

@@ -10,17 +10,20 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens._brief import brief
 from lgsens._validate import number_field, point_field, require_positive
+from lgsens.dynamics import told_breaks
 from lgsens.model._constraints import AbstractConstraint
 from lgsens.model._elements import body_fixed
 from lgsens.model._forces import AbstractConnection, AbstractForce, Attached, _distance, _frame
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._loads import AbstractDynamicLoad, AbstractLoad, LineForce, SpringDamperLoad
 from lgsens.model._signal_fields import prescribed_field
-from lgsens.model._signals import Prescribed, at_time, prepared
+from lgsens.model._signals import AbstractSignal, Prescribed, at_time, prepared
 from lgsens.model._stack import constraint_jacobian
 
 
@@ -46,6 +49,21 @@ class ActuatorLoad(AbstractDynamicLoad):
 
     def measure(self, a, b, va, vb, t, z) -> Float[Array, ""]:
         return z[0]
+
+    def size(self, length):
+        known = _values_of(self.command)
+        largest = jnp.max(jnp.abs(known if self.start is None else jnp.append(known, self.start)))
+        return lax.stop_gradient(jnp.where(largest > 0.0, largest, 1.0))[None]
+
+
+def _values_of(command: Prescribed) -> Float[Array, " n"]:
+    """A number, or what a signal is at some times of its first second, at its breaks and between them."""
+    if not isinstance(command, AbstractSignal):
+        return command[None]
+    breaks = jnp.ravel(told_breaks(command))
+    first = jnp.asarray(np.modf(np.arange(16) * (np.sqrt(5.0) - 1.0) / 2.0)[0], jnp.result_type(float))
+    times = jnp.concatenate([first, breaks, (breaks[1:] + breaks[:-1]) / 2.0])
+    return jax.vmap(command)(jnp.where(jnp.isfinite(times), times, 0.0))
 
 
 class ControlSignals(NamedTuple):

@@ -8,7 +8,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens.liegroups import Poses
+from lgsens.liegroups import Pose, Poses
 from lgsens.linear import added
 from lgsens.model._frames import BODY_DIM, ROTATION
 from lgsens.model._stack import at_ends, constraint_jacobian, state_coordinates
@@ -37,16 +37,31 @@ def compliance(system: System) -> Float[Array, " m"]:
     return (1.0 + angular * (1.0 / square - 1.0)) / mass
 
 
-def coordinate_scale(system: System) -> Float[Array, " k"]:
-    """The length of the scene for translations, 1 for rotations, what loads say for their states: that length is the
-    extent of the centres of mass, or the largest arm of an attachment."""
-    extents = [jnp.ptp(system.pose.position[: len(system.body_names)], axis=0)]
+def _length(system: System) -> Float[Array, ""]:
+    """Of the scene: the extent of the centres of mass, or the largest arm of an attachment; of one on the ground, where
+    that is less, the extent of it and the centres of mass, which knows no origin."""
+    centres = system.pose.position[: len(system.body_names)]
+    extents = [jnp.ptp(centres, axis=0)]
     for stack in (*system.constraints, *system.loads):
-        extents += [jnp.abs(arm).max(axis=0) for arm in stack.elements.fixed("point")]
+        for body, side in zip("ab", (stack.a, stack.b)):
+            for points in stack.elements.fixed("point", body):
+                arm = jnp.abs(points).max(axis=0)
+                own = jnp.ptp(jnp.concatenate([centres, points]), axis=0) if side is None else arm
+                extents.append(jnp.minimum(arm, own))
     # a body whose contact is at the origin has none of these, or round-off
     length, size = jnp.max(jnp.stack(extents)), jnp.sqrt(lax.stop_gradient(_gyration_square(system)))
-    scale = jnp.ones(BODY_DIM, length.dtype)
-    scale = scale.at[: ROTATION.start].set(jnp.where(length > 1e-4 * size, length, size))
+    return jnp.where(length > 1e-4 * size, length, size)
+
+
+def distance(system: System, q: Pose) -> Float[Array, ""]:
+    """The largest coordinate of a centre of mass in lengths of the scene, at least 1."""
+    return jnp.maximum(jnp.max(jnp.abs(system._placed(q).position[: len(system.body_names)])) / _length(system), 1.0)
+
+
+def coordinate_scale(system: System) -> Float[Array, " k"]:
+    """The length of the scene for translations, 1 for rotations, what loads say for their states."""
+    length = _length(system)
+    scale = jnp.ones(BODY_DIM, length.dtype).at[: ROTATION.start].set(length)
     if not isinstance(system.group, Poses):
         return jnp.tile(scale, len(system.body_names))
     every = scale[np.concatenate([np.asarray(own, int) for own in system.free])]

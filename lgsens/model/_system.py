@@ -24,7 +24,7 @@ from lgsens.model._left_out import names_left_out, values_left_out
 from lgsens.model._loads import AbstractDynamicLoad, AbstractLoad, generalized_force
 from lgsens.model._merged_parts import Parts
 from lgsens.model._rate_stiffness import rate_stiffness
-from lgsens.model._sizes import compliance, coordinate_scale
+from lgsens.model._sizes import compliance, coordinate_scale, distance
 from lgsens.model._stack import (
     Stack,
     at_ends,
@@ -203,6 +203,9 @@ class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
 
     def coordinate_scale(self):
         return coordinate_scale(self)
+
+    def distance(self, q):
+        return distance(self, q)
 
     def branches(self, q):
         stacks = (*self.constraints, *self.loads)

@@ -17,7 +17,7 @@ from lgsens.plotting._mechanism import draw, frame, view_of
 from lgsens.plotting._shapes import Shapes, corners, placed, shapes
 from lgsens.plotting._stress import ColourBeams, Stress, beam_stress, colour_bar, in_page
 from lgsens.plotting._style import ROAD, ROLES, figure
-from lgsens.simulation import Trajectory
+from lgsens.simulation import Saved, Trajectory
 
 SWEEP = 4.0  # seconds that a sweep through the positions of a kinematic analysis takes
 PER_SECOND = 30  # frames
@@ -87,7 +87,7 @@ def animate(
     poses = zip(found.position, found.orientation)
     everything = np.concatenate([corners(found.shapes, *pose) for pose in poses])  # of all frames
     view = view_of(everything) if view is None else view
-    if path.suffix == ".html":
+    if path.suffix.lower() == ".html":
         path.write_text(page(found, title, everything, view), encoding="utf-8")
         return path
     writer = _writer(path, found.clock)
@@ -113,13 +113,13 @@ def animate(
 
 def film(motion: Trajectory | Kinematics, speed: float, max_frames: int, colour_beams: ColourBeams) -> Film:
     """The frames of a motion."""
-    system = getattr(motion, "system", None)
-    scene = scene_of(system)
-    if not isinstance(motion, Trajectory | Kinematics) or scene is None:
-        raise ValueError(
-            f"`motion` must be a Trajectory or a Kinematics of a Model, got {type(motion).__name__} of "
-            f"{type(system).__name__}; what `simulate(…, save=…)` returns has no positions."
-        )
+    wanted = "`motion` must be a Trajectory or a Kinematics of a Model, got "
+    if not isinstance(motion, Trajectory | Kinematics):
+        remedy = "what `simulate(…, save=…)` returns has no positions" if isinstance(motion, Saved) else "simulate it"
+        raise ValueError(f"{wanted}{type(motion).__name__}; {remedy}.")
+    scene = scene_of(motion.system)
+    if scene is None:
+        raise ValueError(f"{wanted}that of a {type(motion.system).__name__}, which has no bodies.")
     if int(motion.result) != 0:
         raise ValueError("`motion` failed (its `result` is not 0), so it has no positions to draw from some frame on.")
     if isinstance(motion, Kinematics) and motion.values:
@@ -198,9 +198,9 @@ def _writer(path: Path, clock: np.ndarray) -> Any:
     from matplotlib.animation import FFMpegWriter, PillowWriter
 
     rate: Any = (len(clock) - 1) / clock[-1] if clock[-1] > 0 else 1.0
-    if path.suffix == ".gif":
+    if path.suffix.lower() == ".gif":
         return PillowWriter(fps=rate)
-    if path.suffix not in (".mp4", ".webm", ".mkv", ".mov"):
+    if path.suffix.lower() not in (".mp4", ".webm", ".mkv", ".mov"):
         raise ValueError(f"`path` must end in .html, .gif or .mp4, got {str(path)!r}.")
     if not FFMpegWriter.isAvailable():
         raise OSError(f"Writing {str(path)!r} needs ffmpeg on the path; install it, or write .html or .gif.")

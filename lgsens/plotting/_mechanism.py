@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lgsens.dynamics import finite
 from lgsens.model import Model, MultibodySystem
 from lgsens.plotting._shapes import Shapes, corners, placed, shapes, stretched
 from lgsens.plotting._stress import ColourBeams, beam_stress, colour_bar
@@ -45,7 +46,8 @@ def mechanism(
         colour_beams: "stress": elements of beams have the colour of their `SectionState.stress` [MPa], with its scale,
             where it is known and not 0 everywhere (of a `Model` at rest it is that of preloads); None: all one colour.
 
-    Raises `ValueError` for `models` of another type and another `colour_beams`, `ImportError` without matplotlib.
+    Raises `ValueError` for `models` of another type, motions that failed and another `colour_beams`,
+    `ImportError` without matplotlib.
     """
     scenes = models if isinstance(models, Mapping) else {"": models}
     for model in scenes.values():
@@ -54,6 +56,8 @@ def mechanism(
                 "`models` must be a Model, or what `simulate`, `kinematics` or `statics` return, or a dict of such by "
                 f"name, got {type(model).__name__}."
             )
+        if isinstance(model, AbstractRun) and not finite(jax.tree.map(lambda leaf: leaf[-1], model.states.q)):
+            raise ValueError("`models`: a motion failed (its `result` is not 0), so it ends without positions to draw.")
     fig = figure(8.0, 7.0, title)
     axes: Any = fig.add_subplot(projection="3d")
     points, held, labels = [], [], {}

@@ -150,6 +150,18 @@ def test_lag_is_that_of_the_closed_form():
     np.testing.assert_allclose(lg.initial_state(slider(3.0, 0.2)).v[-1], 3.0)  # in equilibrium with its command
 
 
+def test_outputs_are_measured_by_their_commands():
+    """What steps under error control take for a large change of the output, [N]."""
+    ramp = lg.Ramp(end=-7e3, start=0.0, duration=2.0, t_start=5.0)
+    size = lambda command, **more: float(slider(command, 0.2, **more).system().coordinate_scale()[-1])
+    assert size(-3.0) == 3.0
+    assert size(0.0) == 1.0  # nothing is known
+    assert size(3.0, initial=-40.0) == 40.0
+    assert size(ramp) == 7e3
+    for amplitude in (1e-3, 2e4):
+        np.testing.assert_allclose(size(lg.Harmonic(amplitude=amplitude, frequency=0.8)), amplitude, rtol=0.02)
+
+
 @pytest.mark.slow
 def test_relaxation_under_a_held_length_is_exponential():
     """Of a spring whose damper creeps, stretched and held: F = F_0 exp(−k t/c)."""

@@ -259,6 +259,13 @@ def test_scale_is_the_extent_of_the_scene():
         close(single.system().coordinate_scale(), expected[:6], 4)
     alone = lg.Model({"l": bodies["l"]}).system().coordinate_scale()  # nothing in it has an extent
     np.testing.assert_array_equal(alone, np.ones(6))
+    for far in (0.0, 1e3):  # what is fixed to the ground has the distance of the origin for an arm
+        at = jnp.array([far, 0.0, 0.0])
+        body = lg.RigidBody(1.0, (1, 1, 1), position=at)
+        spring = lg.SpringDamper(None, "l", at_a=at + jnp.array([0.0, 0.0, 2.0]), at_b=at, stiffness=1.0)
+        system = lg.Model({"l": body}, {}, {"spring": spring}).system()
+        close(system.coordinate_scale(), np.array([2.0, 2.0, 2.0, 1.0, 1.0, 1.0]), 4)
+        close(system.distance(system.pose), max(far / 2.0, 1.0), 4)
     # a leaning disc that touches the ground at the origin: no extent, but for round-off, and its radius of gyration
     lean, radius = 0.05, 0.3
     at = radius * np.array([0.0, -np.sin(lean), np.cos(lean)])

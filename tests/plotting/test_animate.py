@@ -3,6 +3,7 @@
 import itertools
 import re
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -234,3 +235,6 @@ def test_a_failed_motion_is_refused(linkage, tmp_path):
     object.__setattr__(failed, "result", jnp.asarray(lg.RESULTS.newton_failed))
     with pytest.raises(ValueError, match="`motion` failed"):
         plotting.animate(failed, tmp_path / "a.html")
+    lost = eqx.tree_at(lambda run: run.states.q.position, failed, replace_fn=lambda x: x.at[-1].set(jnp.nan))
+    with pytest.raises(ValueError, match="`models`: a motion failed"):
+        plotting.mechanism(lost)
