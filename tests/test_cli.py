@@ -171,7 +171,7 @@ def test_a_bad_hardpoint_file_is_named_with_its_key_or_line(text, message, tmp_p
     [
         (["--hardpoints", "absent.toml"], "'absent.toml' cannot be read"),
         (["--steps", "0"], "argument --steps: must be at least 1, got 0"),
-        (["--steps", "many"], "argument --steps: invalid"),
+        (["--steps", "many"], "argument --steps: must be a whole number"),
         (["--dt=-1e-3"], "argument --dt: must be positive"),
         (["--t1", "nan"], "argument --t1: must be positive"),
         (["--dt", "0.3"], "--t1 must be a whole number of steps --dt, got t1 = 2.0 s and dt = 0.3 s"),

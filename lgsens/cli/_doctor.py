@@ -27,5 +27,5 @@ def read(scene: str):
         return of.build(of.parameters), float(of.t1)
     known = scene in shipped() or Path(scene).is_file()
     if not known:
-        raise ValueError(f"{scene!r} is neither a file nor one of {sorted([*SCENES, *shipped(), DEFAULT])}")
+        raise ValueError(f"{scene!r} is neither a file nor one of {sorted({*SCENES, *shipped(), DEFAULT})}")
     return QuarterCar.load(scene).model(), 1.0

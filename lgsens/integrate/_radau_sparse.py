@@ -75,7 +75,7 @@ def _staged(graph: Graph) -> tuple[Graph, float]:
         of([*at.lam, *at.mu], [i - k for i in own]) if node in graph.joints else of([*at.u, *at.y], own)
         for node, own in enumerate(graph.nodes)
     ]
-    return graph._replace(nodes=nodes), 0.5 * tuned.nullspaces(k, m)  # else not worth a fifth more to compile
+    return graph._replace(nodes=nodes), 0.5 * tuned.nullspaces(k, m)  # else not worth up to a half more to compile
 
 
 def stage_plan(system: AbstractSystem) -> Elimination | None:
@@ -130,21 +130,20 @@ class SparseStageFactors(AbstractStageFactors):
         between = jax.vmap(lambda a, operator: a * mass.times_rotations(operator))(inverse, to[first] @ back[second])
         still = jax.vmap(lambda a: a * mass)(inverse)
         three = lambda factor: jax.vmap(lambda _: factor * mass)(jnp.arange(3))
-        times = lambda factor, matrix: jax.vmap(lambda one: factor * one)(matrix)
-        turned = jax.vmap(lambda one: one.T)(at.jacobian)
+        force = scale * at.jacobian.T
         parts = [
             (between, u[first], u[second]),
-            (times(h, at.turning), u, u),
-            (times(-h, at.push), u, u),
+            (h * at.turning, u, u),
+            (-h * at.push, u, u),
             (three(-1.0), u, y),
-            (times(-scale, turned), u, mu),
+            (-1.0 * force, u, mu),
             (still, y[first], y[second]),
-            (times(h**2, at.stiffness), y, u),
-            (times(h, at.damping), y, y),
-            (times(scale, turned), y, lam),
-            (times(scale, at.jacobian), lam, y),
-            (times(scale * h, at.turned), lam, u),
-            (times(scale, at.jacobian), mu, u),
+            (h**2 * at.stiffness, y, u),
+            (h * at.damping, y, y),
+            (force, y, lam),
+            (scale * at.jacobian, lam, y),
+            (scale * h * at.turned, lam, u),
+            (scale * at.jacobian, mu, u),
         ]
         factors = BlockFactors.of(BlockMatrix.of(plan, *_entries(parts)), LU)
         return cls(group, mass, at, m, scale, factors)
@@ -218,7 +217,7 @@ _EQUATIONS = LinearEquations(_product, _solution, _transposed)
 def _entries(parts):
     """The entries of matrices of several stages, flat, and their rows and columns; `parts`: also where these begin."""
     values, rows, columns = [], [], []
-    for matrix, row, column in parts:
+    for matrix, row, column in (part for part in parts if part[0].parts):
         _, r, c = jax.tree.map(lambda leaf: leaf[0], matrix).entries()
         values.append(jax.vmap(lambda one: one.entries()[0])(matrix).ravel())
         rows.append((row[:, None] + r[None]).ravel())

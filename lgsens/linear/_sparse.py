@@ -65,7 +65,7 @@ class SparseMatrix(eqx.Module):
 
     @property
     def T(self) -> "SparseMatrix":
-        turned = tuple(Blocks(jnp.swapaxes(p.values, 1, 2), p.pattern.transposed()) for p in self.parts)
+        turned = tuple(Blocks(jnp.swapaxes(p.values, -1, -2), p.pattern.transposed()) for p in self.parts)
         return SparseMatrix(turned, (self.shape[1], self.shape[0]), self.dtype)
 
     def __add__(self, other: "SparseMatrix") -> "SparseMatrix":

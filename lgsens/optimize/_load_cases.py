@@ -1,10 +1,11 @@
 """Several load cases as one problem."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from lgsens._validate import as_float
@@ -26,16 +27,20 @@ def load_cases(
 
     Arguments:
         fun: (x, case) ↦ (f_c, g_c) or f_c, as `minimize` wants them for one case.
-        cases: a pytree whose arrays have a leading axis over C cases, evaluated at once under `jax.vmap`; or a list of
-            C cases that are anything (scenes of other bodies, say), evaluated one after another.
+        cases: a pytree (a dict, a tuple) whose arrays have a leading axis over C cases, evaluated at once under
+            `jax.vmap`; or a list of C cases that are anything (scenes of other bodies, say), evaluated one after
+            another.
         weights: w [1/unit of f_c], shape (C,); None: 1/C each for the sum, 1 each for the worst case.
         sharpness: ρ of `soft_maximum` [–]; it exceeds the worst w_c f_c, which should be about 1, by ln C/ρ at most.
 
     The result is a new function: make it once, outside of `jit`. Raises `ValueError` for no cases, weights of another
     shape, and a sharpness that is not positive.
     """
-    listed = isinstance(cases, Sequence)
-    shapes = {(len(cases),)} if listed else {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(cases)}
+    listed = isinstance(cases, list)
+    leaves = jax.tree.leaves(cases)
+    if not listed and not all(isinstance(leaf, jax.Array | np.ndarray | float | int) for leaf in leaves):
+        raise ValueError(f"`cases` must be arrays with an axis over the cases, or a list of cases, got {cases!r}.")
+    shapes = {(len(cases),)} if listed else {jnp.shape(leaf)[:1] for leaf in leaves}
     if len(shapes) != 1 or shapes & {(), (0,)}:
         raise ValueError(
             f"`cases` must be a list, or arrays of one leading axis over the cases, got {shapes or 'none'}."

@@ -85,7 +85,7 @@ def multi_start(
     alone. Raises `ValueError` as `minimize` and `sweep`.
     """
     num_steps = as_count(num_steps, "num_steps")
-    if isinstance(starts, int):
+    if isinstance(starts, int | np.integer):
         count = as_count(starts, "starts")
         ends = jax.tree.leaves((lower, upper), is_leaf=lambda end: end is None)
         if not all(end is not None and np.all(np.isfinite(end)) for end in ends):

@@ -155,17 +155,31 @@ def beam():
     return lg.Model(beam.bodies, hinge, beam.forces | {"gravity": lg.Gravity((0.0, 0.0, -9.81))})
 
 
+def points():
+    """Two point masses on a rod, which nothing damps: C_t has no entries."""
+    bodies = {"a": lg.RigidBody(1.0, None), "b": lg.RigidBody(2.0, None, (1.0, 0.0, 0.0), velocity=(0.0, 1.0, 0.0))}
+    return lg.Model(bodies, {"rod": lg.DistanceJoint("a", "b", at_a=(0, 0, 0), at_b=(1.0, 0, 0))})
+
+
+def free_points():
+    """Two point masses on a spring: no joints."""
+    spring = lg.SpringDamper("a", "b", at_a=(0, 0, 0), at_b=(1.0, 0, 0), stiffness=10.0, free_length=0.5)
+    return lg.Model(points().bodies, {}, {"spring": spring})
+
+
 DENSE, SPARSE = lg.DenseLU(), lg.BlockSparse()
 LINEARIZED = [
-    (DENSE, lambda: spinning_top(0.7)),
+    (SPARSE, points),
+    (SPARSE, free_points),
     (SPARSE, machine),
+    (DENSE, lambda: spinning_top(0.7)),
     (SPARSE, everything),
     (SPARSE, beam),
     (DENSE, rolling_disc),
 ]
 
 
-@pytest.mark.parametrize("solver, scene", some_quick(LINEARIZED, 2))
+@pytest.mark.parametrize("solver, scene", some_quick(LINEARIZED, 3))
 def test_factors_are_those_of_the_equations(solver, scene):
     """Anywhere, with μ of the size of λ: F_z times the solution, and F_n, by forward-mode autodiff of the equations."""
     model, rng = scene(), np.random.default_rng(0)
@@ -198,6 +212,20 @@ def test_factors_are_those_of_the_equations(solver, scene):
     np.testing.assert_allclose(flat(derivative(resting, w, v)), flat(by_start), rtol=0, atol=64 * unit)
     # the same factors: round-off of sums of 1e2 terms that cancel, × 1e2
     np.testing.assert_allclose(flat(weights) @ flat(change), flat(weighted) @ flat(rows), rtol=1e-12)
+
+
+def test_a_start_that_stiff_damping_stops():
+    """J θ̈ + c θ̇ + k θ = 0 with c/J = 1e5 1/s: v̇ of the start would turn the body by 10 rad in a step of 10 ms."""
+    inertia, c, k, speed, t1 = 1e-4, 10.0, 1.0, 2.0, 0.1
+    rates = {"rotational_stiffness": (k,) * 3, "rotational_damping": (c,) * 3}
+    body = lg.RigidBody(1.0, (inertia,) * 3, angular_velocity=(0.0, speed, 0.0))
+    hold = {"pivot": lg.SphericalJoint(None, "b", at=jnp.zeros(3))}
+    model = lg.Model({"b": body}, hold, {"bushing": lg.Bushing(None, "b", at=jnp.zeros(3), **rates)})
+    run = lg.simulate(model, t1=t1, num_steps=10, integrator=RADAU)
+    fast, slow = np.roots([inertia, c, k])
+    angle = speed * (np.exp(slow * t1) - np.exp(fast * t1)) / (slow - fast)
+    # L-stable: of c h/J = 1e3 the first stages leave its inverse of what is fast
+    np.testing.assert_allclose(-run.body("b").orientation[-1, 2, 0], angle, rtol=1e-3)
 
 
 @pytest.mark.slow  # three programs

@@ -30,6 +30,14 @@ def test_arrays_and_lists_of_cases_agree():
     np.testing.assert_allclose(weighted, alone[0][0] + 2 * alone[2][0], rtol=1e-15)
 
 
+def test_a_tuple_is_a_tree_of_arrays():
+    amplitudes, rates = jnp.array([1.0, 2.0, 3.0]), jnp.array([1.0, 1.0, 10.0])
+    f, _ = load_cases(lambda x, case: x * case[0] * case[1], (amplitudes, rates))(2.0)
+    assert float(f) == 2.0 * (1.0 + 2.0 + 30.0) / 3.0
+    with pytest.raises(ValueError, match="must be arrays with an axis over the cases, or a list of cases"):
+        load_cases(one, (lambda x: x, lambda x: 2.0 * x))
+
+
 def test_a_list_may_hold_anything():
     cases = [lambda x: x[0], lambda x: jnp.sum(x) ** 2]
     f, g = load_cases(lambda x, case: case(x), cases)(jnp.asarray([1.0, 2.0]))
