@@ -9,8 +9,8 @@ which those of a hundred steps add up to one, or where increments fall no longer
 
 The guess continues w and λ of the last step's stages, three values at (c_j − 1) h_n, to the next ones; from w follow v,
 x ≈ h Σ a_ij v_j and ξ = T⁻¹(x) v. With constant ones instead the quarter-car takes an iteration more, a fifth of its
-time. w is no larger than moves a body by 0.3 rad, or lengths of the scene: where damping is stiff, v̇ of a start out of
-balance would turn it many times.
+time. Where that w would move a body by more than 0.3 rad, or lengths of the scene, it is 0: v̇ of a start out of balance
+that stiff damping stops would turn it many times.
 """
 
 from typing import Any, NamedTuple
@@ -102,6 +102,6 @@ def _continued(system: AbstractSystem, node: Node, begun: State, past) -> RadauS
     vdot, lam = ahead(begun.inner.v, begun.vdot), ahead(begun.inner.lam, begun.lam)
     a = h * jnp.asarray(A, h.dtype)
     way = jnp.max(jnp.abs(a @ a @ vdot) / system.coordinate_scale()[None], initial=0.0)
-    vdot = vdot * jnp.minimum(1.0, _FAR / jnp.maximum(way, _FAR))
+    vdot = jnp.where(way <= _FAR, vdot, 0.0)
     v = begun.v[None] + a @ vdot
     return RadauStages(jax.vmap(system.group.tangent_inv_mv)(a @ v, v), vdot, lam, jnp.zeros_like(begun.inner.mu))
