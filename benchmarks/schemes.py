@@ -29,8 +29,8 @@ SCENES = ("heavy_top", "stiff_pair", "flexible_arm")
 LEVELS = (1e-2, 1e-3, 1e-4, 1e-6, 1e-8)
 T1 = 0.5
 # equal steps, by scene
-ALPHA = {"heavy_top": (100, 300, 1000, 3000), "stiff_pair": (50, 200, 1000), "flexible_arm": (100, 400, 1600)}
-RICHARDSON = {"heavy_top": (100, 300, 1000), "stiff_pair": (50, 200), "flexible_arm": (100, 400)}
+ALPHA = {"heavy_top": (100, 300, 1000, 3000), "stiff_pair": (50, 200, 1000), "flexible_arm": (400, 1600, 6400)}
+RICHARDSON = {"heavy_top": (100, 300, 1000), "stiff_pair": (50, 200), "flexible_arm": (400, 1600)}
 RADAU = {"heavy_top": (30, 50, 80, 150, 300), "stiff_pair": (10, 25, 60, 150), "flexible_arm": (25, 50, 100, 200)}
 EXPLICIT = {"heavy_top": (40, 80, 160), "stiff_pair": (1500, 3000), "flexible_arm": ()}
 # under error control

@@ -31,7 +31,7 @@ class DenseLU(AbstractLinearSolver):
             precision to 1e-9. No gain on a CPU so far, which is why it is not the default: of 94 unknowns, factors with
             one solution take 1.2 times as long, every further solution 3 times; iterations of modified Newton 0.6 times
             (`benchmarks/precision.py`). A matrix that cannot be refined (a condition above 1e6) fails the step.
-            Without effect where everything is in single precision.
+            Without effect in `RadauIIA`, and where everything is in single precision.
 
     Raises `ValueError` where `mixed` is not True or False.
     """
