@@ -104,8 +104,8 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
 
     def balanced(z, left, stiffest):
         """To √eps of the largest joint force or moment, taken as mass scale × 1 m/s² at least; and to what stiff forces
-        make of round-off of a place, 16 eps of 1 rad or the length of the scene, or of the distance of its origin: EA
-        eps of a beam is more."""
+        make of round-off of a place, 16 eps of 1 rad or the length of the scene, or of its distance from the origin:
+        EA eps of a beam is more."""
         return jnp.max(jnp.abs(left)) <= jnp.sqrt(eps) * (1.0 + largest(z)) + round_off * stiffest
 
     def shortest(slope, right, solve):

@@ -37,7 +37,6 @@ from lgsens.integrate._radau_stages import (
     RadauStages,
     StageMatrices,
     advanced,
-    along,
     of_stages,
 )
 from lgsens.liegroups import AbstractLieGroup
@@ -116,8 +115,9 @@ class DenseStageFactors(AbstractStageFactors):
 def _matrices(system: AbstractSystem, q, x, v, found: RadauStages, t) -> StageMatrices:
     """At one stage."""
     group, mass = system.group, system.mass_matrix()
+    along = jnp.concatenate([found.mu, jnp.zeros_like(found.lam[len(found.mu) :])])  # as λ of all rows
     at = lambda lam: system.tangents(q, v, found.v, lam, t)
-    (stiffness, damping, jacobian), (push, *_) = jax.jvp(at, (found.lam,), (along(found),))
+    (stiffness, damping, jacobian), (push, *_) = jax.jvp(at, (found.lam,), (along,))
     turned = by_configuration(system, lambda q: constraint_velocity(system, q, v, t), q)
     turn = lambda u: mass @ group.tangent_mv(x + group.tangent_inv_mv(x, u), found.x)
     turning = jax.jacfwd(turn)(jnp.zeros_like(x))

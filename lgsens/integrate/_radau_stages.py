@@ -84,11 +84,6 @@ class StageMatrices(NamedTuple):
     push: Matrix  # D(Bᵀμ), (3, k, k)
 
 
-def along(found: RadauStages):
-    """μ of a stage as multipliers of all its rows, those of velocity level too."""
-    return jnp.concatenate([found.mu, jnp.zeros_like(found.lam[len(found.mu) :])])
-
-
 class AbstractStageFactors(eqx.Module):
     """The linearized equations of the stages, and their matrix in factors.
 

@@ -53,7 +53,8 @@ class Blocks(eqx.Module):
 class SparseMatrix(eqx.Module):
     """A matrix as a sum of blocks, with `+`, `@` from both sides and `*` by numbers.
 
-    `@` takes vectors, and from the right matrices of columns. Entries may lie in several blocks; they add up.
+    `@` takes vectors, and from the right matrices of columns. Entries may lie in several blocks; they add up. `T`, `+`
+    and `*` are those of a stack of matrices, too, whose blocks have an axis more.
     """
 
     parts: tuple[Blocks, ...]

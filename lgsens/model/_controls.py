@@ -63,7 +63,8 @@ def _values_of(command: Prescribed) -> Float[Array, " n"]:
     breaks = jnp.ravel(told_breaks(command))
     first = jnp.asarray(np.modf(np.arange(16) * (np.sqrt(5.0) - 1.0) / 2.0)[0], jnp.result_type(float))
     times = jnp.concatenate([first, breaks, (breaks[1:] + breaks[:-1]) / 2.0])
-    return jax.vmap(command)(jnp.where(jnp.isfinite(times), times, 0.0))
+    values = jax.vmap(command)(jnp.where(jnp.isfinite(times), times, 0.0))
+    return jnp.where(jnp.isfinite(values), values, 0.0)
 
 
 class ControlSignals(NamedTuple):

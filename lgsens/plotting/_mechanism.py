@@ -56,8 +56,6 @@ def mechanism(
                 "`models` must be a Model, or what `simulate`, `kinematics` or `statics` return, or a dict of such by "
                 f"name, got {type(model).__name__}."
             )
-        if isinstance(model, AbstractRun) and not finite(jax.tree.map(lambda leaf: leaf[-1], model.states.q)):
-            raise ValueError("`models`: a motion failed (its `result` is not 0), so it ends without positions to draw.")
     fig = figure(8.0, 7.0, title)
     axes: Any = fig.add_subplot(projection="3d")
     points, held, labels = [], [], {}
@@ -91,7 +89,9 @@ def _last(model: Model | AbstractRun) -> tuple[MultibodySystem, Any, Any, Any, A
     what a motion ends with."""
     if isinstance(model, AbstractRun):
         system, states, t = model.of_bodies()
-        return system, *jax.tree.map(lambda leaf: leaf[-1:], (states.q, states.v, states.lam, t))
+        if not finite(last := jax.tree.map(lambda leaf: leaf[-1:], (states.q, states.v, states.lam, t))):
+            raise ValueError("`models`: a motion failed (its `result` is not 0), so it ends without positions to draw.")
+        return system, *last
     system = model.system()
     zeros = lambda count: jnp.zeros(count, system.mass.dtype)
     rest = system.pose, jnp.zeros_like(system.velocity), zeros(system.topology.num_constraints), zeros(())
