@@ -162,16 +162,15 @@ def points():
 
 
 def free_points():
-    """Two point masses on a spring: no joints."""
-    spring = lg.SpringDamper("a", "b", at_a=(0, 0, 0), at_b=(1.0, 0, 0), stiffness=10.0, free_length=0.5)
-    return lg.Model(points().bodies, {}, {"spring": spring})
+    """Two point masses that fall: no joints, no stiffness, no damping."""
+    return lg.Model(points().bodies, {}, {"gravity": lg.Gravity((0.0, 0.0, -9.81))})
 
 
 DENSE, SPARSE = lg.DenseLU(), lg.BlockSparse()
 LINEARIZED = [
-    (SPARSE, points),
     (SPARSE, free_points),
     (SPARSE, machine),
+    (SPARSE, points),
     (DENSE, lambda: spinning_top(0.7)),
     (SPARSE, everything),
     (SPARSE, beam),
@@ -179,7 +178,7 @@ LINEARIZED = [
 ]
 
 
-@pytest.mark.parametrize("solver, scene", some_quick(LINEARIZED, 3))
+@pytest.mark.parametrize("solver, scene", some_quick(LINEARIZED, 2))
 def test_factors_are_those_of_the_equations(solver, scene):
     """Anywhere, with μ of the size of λ: F_z times the solution, and F_n, by forward-mode autodiff of the equations."""
     model, rng = scene(), np.random.default_rng(0)
