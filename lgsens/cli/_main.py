@@ -8,7 +8,7 @@ import math
 import os
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -72,21 +72,22 @@ class _Parser(argparse.ArgumentParser):
         self.add_argument("--quiet", action="store_true", help=nothing)
 
 
-def _positive(text: str) -> float:
+def _read(kind: Callable[[str], Any], text: str, what: str) -> Any:
     try:
-        value = float(text)
+        return kind(text)
     except ValueError as error:
-        raise argparse.ArgumentTypeError(f"must be a number, got {text!r}") from error
+        raise argparse.ArgumentTypeError(f"must be {what}, got {text!r}") from error
+
+
+def _positive(text: str) -> float:
+    value = _read(float, text, "a number")
     if not (value > 0 and math.isfinite(value)):
         raise argparse.ArgumentTypeError(f"must be positive, got {text}")
     return value
 
 
 def _count(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"must be a whole number, got {text!r}") from error
+    value = _read(int, text, "a whole number")
     if value < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, got {text}")
     return value

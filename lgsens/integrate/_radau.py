@@ -221,7 +221,9 @@ class RadauIIA(AbstractScheme):
 
     def numbers(self, system):
         k, m, plan = system.group.dim, len(system.constraint_names), stage_plan(system)
-        stages = plan.numbers if plan is not None else 3 * (5 * k**2 + m * (k + m) + k * (k - m)) + 36 * (k - m) ** 2
+        stages = (
+            plan.numbers if plan is not None else 3 * (5 * k**2 + m * (2 * k + m) + k * (k - m)) + 36 * (k - m) ** 2
+        )
         return stages + (k + m) * (2 * k + m)
 
 

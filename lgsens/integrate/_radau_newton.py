@@ -78,7 +78,7 @@ def solved(
         return jax.tree.map(lambda new, old: jnp.where(iterate.going, new, old), new, iterate), factors
 
     infinite = jnp.full_like(node.h, jnp.inf)
-    guess, none = _continued(system, node, begun, memory.past), jnp.zeros((), jnp.int32)
+    guess, none = _continued(system, node, begun, memory.past, scale), jnp.zeros((), jnp.int32)
     iterate = _Iterate(guess, infinite, infinite, none, memory.matrix.stale, running)
     start = iterate, memory.matrix.factors
     iterate, factors = while_loop(lambda carry: in_any_lane(carry[0].going), corrected, start)
@@ -92,8 +92,8 @@ def solved(
     return iterate.found, Memory(node.h, KeptFactors(factors, iterate.due)), stats
 
 
-def _continued(system: AbstractSystem, node: Node, begun: State, past) -> RadauStages:
-    """The first guess; `past`: the size of the last step, 0: there was none."""
+def _continued(system: AbstractSystem, node: Node, begun: State, past, scale) -> RadauStages:
+    """The first guess; `past`: the size of the last step, 0: there was none. `scale`: of the coordinates."""
     known, h = past > 0.0, node.h
     to = 1.0 + jnp.where(known, h / jnp.where(known, past, 1.0), 0.0) * jnp.asarray(C, h.dtype)
     others = [[C[i] for i in range(3) if i != j] for j in range(3)]
@@ -101,7 +101,7 @@ def _continued(system: AbstractSystem, node: Node, begun: State, past) -> RadauS
     ahead = lambda stages, last: jnp.where(known, weights @ stages, last[None])
     vdot, lam = ahead(begun.inner.v, begun.vdot), ahead(begun.inner.lam, begun.lam)
     a = h * jnp.asarray(A, h.dtype)
-    way = jnp.max(jnp.abs(a @ a @ vdot) / system.coordinate_scale()[None], initial=0.0)
+    way = jnp.max(jnp.abs(a @ a @ vdot) / scale[None], initial=0.0)
     vdot = jnp.where(way <= _FAR, vdot, 0.0)
     v = begun.v[None] + a @ vdot
     return RadauStages(jax.vmap(system.group.tangent_inv_mv)(a @ v, v), vdot, lam, jnp.zeros_like(begun.inner.mu))

@@ -128,16 +128,15 @@ class SparseStageFactors(AbstractStageFactors):
         # of two stages, the second the faster
         first, second = np.repeat(np.arange(3), 3), np.tile(np.arange(3), 3)
         between = jax.vmap(lambda a, operator: a * mass.times_rotations(operator))(inverse, to[first] @ back[second])
-        still = jax.vmap(lambda a: a * mass)(inverse)
-        three = lambda factor: jax.vmap(lambda _: factor * mass)(jnp.arange(3))
+        still = jax.vmap(lambda a: a * mass)
         force = scale * at.jacobian.T
         parts = [
             (between, u[first], u[second]),
             (h * at.turning, u, u),
             (-h * at.push, u, u),
-            (three(-1.0), u, y),
+            (still(-np.ones(3)), u, y),
             (-1.0 * force, u, mu),
-            (still, y[first], y[second]),
+            (still(inverse), y[first], y[second]),
             (h**2 * at.stiffness, y, u),
             (h * at.damping, y, y),
             (force, y, lam),

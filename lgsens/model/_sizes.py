@@ -46,8 +46,9 @@ def _length(system: System) -> Float[Array, ""]:
         for body, side in zip("ab", (stack.a, stack.b)):
             for points in stack.elements.fixed("point", body):
                 arm = jnp.abs(points).max(axis=0)
-                own = jnp.ptp(jnp.concatenate([centres, points]), axis=0) if side is None else arm
-                extents.append(jnp.minimum(arm, own))
+                if side is None:
+                    arm = jnp.minimum(arm, jnp.ptp(jnp.concatenate([centres, points]), axis=0))
+                extents.append(arm)
     # a body whose contact is at the origin has none of these, or round-off
     length, size = jnp.max(jnp.stack(extents)), jnp.sqrt(lax.stop_gradient(_gyration_square(system)))
     return jnp.where(length > 1e-4 * size, length, size)
