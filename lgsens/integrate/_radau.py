@@ -46,13 +46,13 @@ Leimkuhler, J. Comput. Appl. Math. 12 (1985) 77; the estimate by the linearized 
 """
 
 import dataclasses
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from lgsens._validate import as_count, require_setting
 from lgsens.dynamics import (
@@ -68,7 +68,6 @@ from lgsens.dynamics import (
     require_linear,
 )
 from lgsens.integrate._grid import Start
-from lgsens.integrate._level_step import by_configuration
 from lgsens.integrate._linearized import AbstractLinearizedStep, Node, Variation
 from lgsens.integrate._loops import earlier, later
 from lgsens.integrate._radau_newton import no_memory, solved
@@ -224,7 +223,7 @@ class RadauIIA(AbstractScheme):
         stages = (
             plan.numbers if plan is not None else 3 * (5 * k**2 + m * (2 * k + m) + k * (k - m)) + 36 * (k - m) ** 2
         )
-        return stages + (k + m) * (2 * k + m)
+        return stages + m * (k + m) + 16 * k
 
 
 class RadauLinearizedStep(AbstractLinearizedStep):
@@ -232,19 +231,19 @@ class RadauLinearizedStep(AbstractLinearizedStep):
 
     stages: AbstractStageFactors
     factors: tuple[Array, Array, Array]  # J, and the factors of [[M, Jᵀ], [J, 0]], at the end
-    by_q: Float[Array, "e k"]  # E_q
-    by_v: Float[Array, "e k"]  # E_v
+    end: Any  # q⁺
+    motion: Any  # (q', v') ↦ E_q w + E_v v'
 
     @classmethod
     def of(cls, shared: Shared, node: Node, previous: State, state: State) -> "RadauLinearizedStep":
         system, q, v, t = shared.system, state.q, state.v, node.t
         kkt = ConstrainedInertia.of(shared.inertia, system, q, t)
-        motion = lambda q, v: jnp.concatenate(equations_of_motion(system, q, v, state.vdot, state.lam, t))
+        motion = lambda q, v: equations_of_motion(system, q, v, state.vdot, state.lam, t)
         return cls(
             stages=stage_factors(system, node, previous, state.inner),
             factors=(kkt.jacobian, kkt.factor, kkt.scale),
-            by_q=by_configuration(system, lambda q: motion(q, v), q),
-            by_v=jax.jacfwd(lambda v: motion(q, v))(v),
+            end=q,
+            motion=jax.linearize(motion, q, v)[1],
         )
 
     def forward(self, shared, node, previous, loads, row):
@@ -252,7 +251,7 @@ class RadauLinearizedStep(AbstractLinearizedStep):
         known = jax.tree.map(jnp.subtract, row.inner, self.stages.by_start(node.h, previous.w, previous.v))
         inner = self.stages.exactly(node.h, known)
         w, v = map(jnp.add, self.stages.end(node.h, previous.w, previous.v, inner), (row.w, row.v))
-        missing = jnp.concatenate([row.vdot, row.lam]) - self.by_q @ w - self.by_v @ v
+        force, rate = self.motion(shared.system.group.to_ambient(self.end, w), v)
         kkt = ConstrainedInertia(shared.inertia, *self.factors)
-        vdot, lam = kkt.solve(missing[: len(w)], missing[len(w) :])
+        vdot, lam = kkt.solve(row.vdot - force, row.lam - rate)
         return Variation(w, v, vdot, lam, vdot + row.a, inner)
