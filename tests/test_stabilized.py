@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from differences import central
-from helpers import EPS, says, some_quick
+from helpers import EPS, everything, says, some_quick
 
 import lgsens as lg
 from lgsens.dynamics import State, accelerations, constraint_velocity
@@ -125,6 +125,73 @@ def test_iteration_matrix():
     np.testing.assert_allclose(conditions[1:], conditions[-1], rtol=0.2)
 
 
+def driven(x, solver=None):
+    """Two links on a hinge, a driven rod to a body in the plane, springs and dampers: blocks that are not alike."""
+    body = lambda place, **more: lg.RigidBody(1.0, (0.02, 0.03, 0.04), position=(place, 0.0, 0.1), **more)
+    bodies = {"a": body(0.2, angular_velocity=(0, 1, 0)), "b": body(0.7), "c": body(2.1, free="x z ry")}
+    length = lg.Harmonic(amplitude=0.1, frequency=3.0, offset=1.0 * x[0])
+    joints = {
+        "hinge": lg.RevoluteJoint(None, "a", at=(0, 0, 0), axis=(0, 1, 0)),
+        "ball": lg.SphericalJoint("a", "b", at=jnp.stack([0.5 * x[0], 0.0 * x[0], 0.0 * x[0]])),
+        "rod": lg.DistanceJoint("b", "c", at_a=(1.0, 0, 0), at_b=(2.0, 0, 0), length=length),
+    }
+    forces = {
+        "gravity": lg.Gravity((0.0, 0.0, -9.81)),
+        "spring": lg.SpringDamper("a", "c", at_a=(0.2, 0, 0), at_b=(2, 0.1, 0), stiffness=1e3 * x[1], damping=5.0),
+        "foot": lg.SpringDamper(None, "c", at_a=(2, 0, -1), at_b=(2, 0, 0), stiffness=1e5, damping=20.0),
+    }
+    return lg.Model(bodies, joints, forces, linear_solver=solver)
+
+
+@pytest.mark.parametrize("scene", some_quick([lambda: driven(jnp.ones(2)), everything]))
+def test_blocks_are_those_of_the_iteration_matrix(scene):
+    """The derivative of the defect, in both directions, where steps are long beside the stiffness, and short."""
+    system = dataclasses.replace(scene().system(), linear_solver=lg.BlockSparse())
+    state, rng = lg.initial_state(scene()), np.random.default_rng(1)
+    k, m = len(state.v), len(state.lam)
+    x = jnp.asarray(rng.normal(size=k + 2 * m)) + jnp.concatenate([state.a, state.lam, 0.0 * state.lam])
+
+    @jax.jit
+    def products(h):
+        shared = STABILIZED.shared(system)
+        step = shared.step(state, Node(0.3 + 0.0 * h, 0.3 + h, h))
+        defect = lambda x: jnp.concatenate(step.defect(step.motion(x[:k], x[k:]), x[k:]))
+        factors, _ = step.factors(step.motion(x[:k], x[k:]), x[k:])
+        matrix = jax.jacfwd(defect)(x)
+        columns = jax.vmap(lambda x: jnp.concatenate(factors.solve(x[:k], x[k:])), 1, 1)
+        rows = jax.vmap(lambda x: jnp.concatenate(factors.solve(x[:k], x[k:], transposed=True)))
+        return columns(matrix), rows(matrix)
+
+    assert STABILIZED.shared(system).plan is not None
+    for h in (0.05, 1e-3, 1e-5):
+        for product in products(jnp.asarray(h)):
+            np.testing.assert_allclose(product, np.eye(k + 2 * m), atol=1e-8)  # round-off × condition, 1e6 at 0.05 s
+
+
+def end_of_driven(x, solver, sensitivity):
+    settings = {"integrator": STABILIZED, "sensitivity": sensitivity}
+    found = lg.simulate(driven(x, solver), t1=0.1 * x[2], num_steps=10, **settings)
+    q, last = found.states.q, found.states
+    end = jnp.concatenate([jnp.ravel(leaf[-1]) for leaf in (q.position, q.orientation, last.v, 1e-2 * last.lam)])
+    return jnp.asarray(np.random.default_rng(0).normal(size=end.shape)) @ end
+
+
+@pytest.mark.slow  # five programs
+def test_blocks_give_what_arrays_give():
+    """Values and derivatives, by a driven length, a place, a stiffness and the step, forward and reverse."""
+    x, forward, reverse = jnp.ones(3), lg.DirectDifferentiation(), lg.AdjointVariable()
+    of = lambda solver, method, mode: jax.jit(mode(lambda x: end_of_driven(x, solver, method)))(x)
+    value, gradient = of(lg.BlockSparse(), reverse, jax.value_and_grad)
+    dense, by_dense = of(lg.DenseLU(), reverse, jax.value_and_grad)
+    # multipliers carry round-off/(βh²) = 1e-11, and what follows of them is of their size
+    np.testing.assert_allclose(value, dense, rtol=1e-9)
+    np.testing.assert_allclose(gradient, by_dense, rtol=1e-8)
+    np.testing.assert_allclose(gradient, of(lg.BlockSparse(), forward, jax.jacfwd), rtol=1e-9)
+    both = jax.jit(lambda x: end_of_driven(x, lg.BlockSparse(), forward))
+    slopes = [central(lambda s, e=e: both(x + s * e), 1e-3) for e in jnp.eye(3)]
+    np.testing.assert_allclose(gradient, slopes, rtol=1e-6)  # sixth order; round-off of multipliers over δ
+
+
 def top(x, sensitivity=lg.DirectDifferentiation()):
     """Four criteria of position, velocity and multipliers; of angle, mass, inertia, length and final time."""
     model = spinning_top(x[0], mass=15.0 * x[1], inertia=jnp.array([0.2, 0.4, 0.2]) * x[2], length=x[3])
@@ -213,16 +280,6 @@ def test_saved_outputs_and_differentiate():
 
 def height(instant):
     return instant.body("top").velocity[2]
-
-
-@pytest.mark.slow
-def test_sparse_models_are_solved_densely():
-    """A model with a sparse solver gives what one with a dense one gives."""
-    model = four_bar()
-    sparse = dataclasses.replace(model, linear_solver=lg.BlockSparse())
-    runs = [lg.simulate(m, t1=0.05, num_steps=20, integrator=STABILIZED).states for m in (model, sparse)]
-    for a, b in zip(*map(jax.tree.leaves, runs)):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-8 * max(float(jnp.abs(a).max()), 1.0))  # round-off over βh²
 
 
 def test_what_is_refused():

@@ -157,7 +157,8 @@ class GeneralizedAlpha(AbstractGeneralizedAlpha):
             Brüls & Cardona, Numerische Mathematik 129, 2015, doi:10.1007/s00211-014-0633-1), and after each change of
             the size.
         stabilized: satisfy B v = 0 in every step besides Φ = 0 (stabilized index 2, after Gear, Gupta & Leimkuhler),
-            at the price of m more unknowns in a step; see `_level_step.py`. Dense. False: index 3, where B v is O(h²).
+            at the price of m more unknowns in a step; see `_level_step.py`. Larger scenes are solved in blocks, unless
+            forces depend on multipliers. False: index 3, where B v is O(h²).
 
     All static and hashable. Raises `ValueError` for ρ∞ outside [0, 1), a tolerance that is not positive, fewer than 1
     iteration, a negative `factor_every`, or a `stabilized` that is not a bool. Source: Sonneville & Brüls (2014), §4;

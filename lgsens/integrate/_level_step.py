@@ -30,7 +30,7 @@ and does not degenerate as h → 0 either: its limit [[c M, Jᵀ, 0], [J, 0, ·]
 positions. Without stabilized rows there is no ν, without nonholonomic ones no A.
 
 The multipliers of the scheme, `State.lam` within the integrator and the sensitivities, are [λ; ν], its rows those of S₂
-below the first. All matrices are dense.
+below the first. Matrices are dense, or in blocks (`_level_sparse.py`).
 """
 
 from functools import partial
@@ -44,8 +44,9 @@ from jaxtyping import Array, Float
 
 from lgsens.dynamics import AbstractSystem, State, constraint_velocity, mass_scale, multiplier_jacobian
 from lgsens.integrate._alpha import AbstractAlpha, AbstractStep, advance
+from lgsens.integrate._level_sparse import SparseLevelFactors
 from lgsens.integrate._linearized import Node
-from lgsens.linear import LU, Factors
+from lgsens.linear import LU, Factors, Matrix
 
 
 class Counts(NamedTuple):
@@ -83,11 +84,11 @@ class Counts(NamedTuple):
 class LevelTangents(NamedTuple):
     """The derivatives of r, Φ and c at one state."""
 
-    stiffness: Float[Array, "k k"]  # K_t
-    damping: Float[Array, "k k"]  # C_t
-    jacobian: Float[Array, "m k"]  # J
-    upper: Float[Array, "k m"]  # ∂r/∂λ: Jᵀ, unless forces depend on λ
-    rate_stiffness: Float[Array, "c k"]  # V
+    stiffness: Matrix  # K_t, (k, k)
+    damping: Matrix  # C_t, (k, k)
+    jacobian: Matrix  # J, (m, k)
+    upper: Matrix  # ∂r/∂λ, (k, m): Jᵀ, unless forces depend on λ
+    rate_stiffness: Matrix  # V, (c, k)
 
 
 def by_configuration(system: AbstractSystem, function, q) -> Float[Array, "r k"]:
@@ -121,11 +122,11 @@ class LevelStep(AbstractStep):
     shared: Any  # Levels
     previous: State
     node: Node
-    normal: Float[Array, "k b"]  # N
+    before: Matrix  # B_n, (b, k)
 
     def correction(self, lam):
         """N ν."""
-        return self.normal @ lam[self.shared.counts.multipliers :]
+        return self.shared.correction(self.before, lam)
 
     def change(self, du, dlam):
         return jnp.maximum(jnp.abs(du), jnp.abs(self.correction(dlam)))
@@ -144,6 +145,9 @@ class LevelStep(AbstractStep):
     def tangents(self, q, v, vdot, lam, t) -> LevelTangents:
         system, counts = self.shared.system, self.shared.counts
         lam = lam[: counts.multipliers]
+        if self.shared.plan is not None:
+            k_t, c_t, jacobian = system.sparse_tangents(q, v, vdot, lam, t)
+            return LevelTangents(k_t, c_t, jacobian, jacobian.T, system.sparse_rate_stiffness(q, v, t))
         k_t, c_t, jacobian = system.tangents(q, v, vdot, lam, t)
         upper = multiplier_jacobian(system, jacobian, q, v, lam, t)
         by_place = by_configuration(system, lambda q: counts.rate(system, q, v, t), q)
@@ -153,9 +157,13 @@ class LevelStep(AbstractStep):
         at_state = self.tangents(motion.q, motion.v, motion.vdot, lam, self.node.t)
         return self.factorized(at_state, motion.x, kind), self.shared.margin_at(at_state.jacobian)
 
-    def factorized(self, at_state: LevelTangents, x, kind: Any = LU) -> LevelFactors:
+    def factorized(self, at_state: LevelTangents, x, kind: Any = LU) -> LevelFactors | SparseLevelFactors:
         """The factors of S₂."""
         scheme, mass, counts, h = self.shared.scheme, self.shared.mass, self.shared.counts, self.node.h
+        if self.shared.plan is not None:
+            steps = scheme.inertia_factor, scheme.gamma * h, scheme.beta * h**2
+            known = self.shared.system, self.shared.plan, mass, self.before
+            return SparseLevelFactors.of(*known, at_state, x, steps, kind)
         k_t, c_t, jacobian, border, rate_stiffness = at_state
         k, p, b, m = mass.shape[0], counts.positions, counts.both, counts.multipliers
         scale = mass_scale(mass)
@@ -163,7 +171,7 @@ class LevelStep(AbstractStep):
         # of x: r, the rates of both, Φ, the rates of velocities only
         moved = jnp.concatenate([position * k_t, gain * rate_stiffness[:b], jacobian[:p], gain * rate_stiffness[b:]])
         by_x = jax.vmap(partial(self.shared.system.group.tangent_rmv, x))(moved)
-        by_nu = scale * (by_x @ self.normal)
+        by_nu = scale * (by_x @ (self.shared.inverse_mass @ self.before.T))
         by_v = jnp.concatenate([scheme.inertia_factor * mass + (scheme.gamma * h) * c_t, jacobian[:b]])
         inside = jnp.concatenate([by_v + by_x[: k + b], by_nu[: k + b]], axis=1)
         rows = jnp.concatenate([jnp.ones(k, scale.dtype), jnp.broadcast_to(scale, b)])[:, None]

@@ -28,18 +28,21 @@ The columns of step n receive besides, with μ_y = βh² M⁻¹ Tᵀ μ.w,
     c_n.w += Gᵀ μ_y,      p̄ += −c_pᵀ μ_c + g_pᵀ μ_y.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import AbstractSystem, State, full_jacobian, require_independent
+from lgsens.dynamics import State, full_jacobian, require_independent
 from lgsens.integrate._alpha import AbstractAlpha, AbstractEquations, increment
+from lgsens.integrate._level_sparse import SparseLevelFactors, level_plan
 from lgsens.integrate._level_step import Counts, LevelFactors, LevelStep, LevelTangents, by_configuration
 from lgsens.integrate._linearized import AbstractLinearizedStep, Variation
 from lgsens.integrate._singular import margin_by_mass
+from lgsens.linear import Elimination, Matrix
 
 
 class LevelLoads(NamedTuple):
@@ -58,9 +61,9 @@ class LevelLinearizedStep(AbstractLinearizedStep):
 
     x: Float[Array, " k"]
     tangents: LevelTangents
-    normal: Float[Array, "k b"]  # N
-    curvature: Float[Array, "k k"]  # G
-    factors: LevelFactors
+    before: Matrix  # B_n, (b, k)
+    curvature: Matrix  # G, (k, k)
+    factors: LevelFactors | SparseLevelFactors
 
     def margin(self, scale):
         """Not known: that of these factors says nothing."""
@@ -69,6 +72,8 @@ class LevelLinearizedStep(AbstractLinearizedStep):
     def _jacobians(self, counts: Counts):
         """B and C."""
         jacobian = self.tangents.jacobian
+        if not counts.velocities:
+            return jacobian, jacobian
         return jacobian[: counts.positions], jacobian[counts.positions - counts.both :]
 
     def forward(self, shared, node, previous, loads, row):
@@ -86,7 +91,7 @@ class LevelLinearizedStep(AbstractLinearizedStep):
         )
         u, lam = self.factors.solve(row.a - loads.residual - (shared.mass @ vdot + c_t @ v + k_t @ w), row.lam - left)
         return Variation(
-            w=w + group.tangent_mv(x, position * (u + self.normal @ lam[counts.multipliers :])),
+            w=w + group.tangent_mv(x, position * (u + shared.correction(self.before, lam))),
             v=v + velocity * u,
             vdot=vdot + scheme.inertia_factor * u,
             lam=lam,
@@ -103,7 +108,7 @@ class LevelLinearizedStep(AbstractLinearizedStep):
         turned = position * group.tangent_rmv(x, c.w)
         mu_a, mu_lam = self.factors.solve(
             c.a + turned + velocity * c.v + scheme.inertia_factor * c.vdot,
-            jnp.concatenate([c.lam[:m], c.lam[m:] + turned @ self.normal]),
+            jnp.concatenate([c.lam[:m], c.lam[m:] + self.before @ (shared.inverse_mass @ turned)]),
             transposed=True,
         )
         phi, rate = counts.apart(mu_lam)
@@ -131,32 +136,52 @@ class Levels(AbstractEquations):
 
     scheme: AbstractAlpha
     counts: Counts = eqx.field(static=True)
-    system: AbstractSystem
-    mass: Float[Array, "k k"]
-    inverse_mass: Float[Array, "k k"]
+    plan: Elimination | None = eqx.field(static=True)  # None: all matrices are dense
+    system: Any
+    mass: Matrix  # (k, k)
+    inverse_mass: Matrix  # (k, k)
     scale: Float[Array, " k"]
 
     @classmethod
-    def of(cls, scheme, system):
+    def of(cls, scheme, system: Any):
         require_independent(system, "A step with constraints of velocity level (`stabilized`, nonholonomic)")
-        mass, counts = system.mass_matrix(), Counts.of(scheme, system)
+        plan = level_plan(scheme, system)
+        mass: Any = system.mass_matrix() if plan is None else system.sparse_mass_matrix()
         return cls(
             scheme=scheme,
-            counts=counts,
+            counts=Counts.of(scheme, system),
+            plan=plan,
             system=system,
             mass=mass,
-            inverse_mass=jnp.linalg.inv(mass),
+            inverse_mass=jnp.linalg.inv(mass) if plan is None else mass.inverse(),
             scale=system.coordinate_scale(),
         )
 
     @staticmethod
     def numbers(scheme, system):
-        counts = Counts.of(scheme, system)
-        return (system.group.dim + counts.multipliers + counts.both) ** 2
+        counts, plan = Counts.of(scheme, system), level_plan(scheme, system)
+        return plan.numbers if plan is not None else (system.group.dim + counts.multipliers + counts.both) ** 2
 
-    def _correction(self, system: AbstractSystem, q, nu, t):
-        """Bᵀν."""
-        return nu @ system.constraint_jacobian(q, t) if self.counts.both else jnp.zeros_like(self.scale)
+    def correction(self, before: Matrix, lam):
+        """N ν, with B_n."""
+        if not self.counts.both:
+            return jnp.zeros_like(self.scale)
+        return self.inverse_mass @ (lam[self.counts.multipliers :] @ before)
+
+    def _before(self, system: Any, q, t) -> Matrix:
+        """B, without rows unless they are stabilized."""
+        if not self.counts.both:
+            return jnp.zeros_like(self.scale, shape=(0, len(self.scale)))
+        jacobian = system.constraint_jacobian if self.plan is None else system.sparse_constraint_jacobian
+        return jacobian(q, t)
+
+    def _curvature(self, previous: State, nu, t) -> Matrix:
+        """G."""
+        q, system = previous.q, self.system
+        if self.plan is None:
+            return by_configuration(system, lambda q: nu @ self._before(system, q, t), q)
+        stiffness = lambda lam: system.sparse_tangents(q, previous.v, previous.vdot, lam, t)[0]
+        return jax.jvp(stiffness, (nu,), (nu,))[1]  # linear in λ, with Bᵀλ
 
     def loads(self, previous, state):
         scheme, counts, before = self.scheme, self.counts, previous.q
@@ -164,12 +189,13 @@ class Levels(AbstractEquations):
 
         def function(system, node):
             h = node.h
-            y = lax.stop_gradient(self.inverse_mass @ self._correction(system, before, nu, node.begin))
+            force = nu @ self._before(system, before, node.begin)
+            y = lax.stop_gradient(self.inverse_mass @ force)
             return LevelLoads(
                 residual=system.residual(state.q, state.v, state.vdot, lam, node.t),
                 violation=system.constraint(state.q, node.t),
                 rate=counts.rate(system, state.q, state.v, node.t),
-                correction=self._correction(system, before, nu, node.begin) - system.mass_matrix() @ y,
+                correction=force - (system.mass_matrix() if self.plan is None else system.sparse_mass_matrix()) @ y,
                 x=increment(scheme, previous, state.a + y, h),
                 v=h * ((1.0 - scheme.gamma) * previous.a + scheme.gamma * state.a),
             )
@@ -177,23 +203,17 @@ class Levels(AbstractEquations):
         return function
 
     def step(self, previous, node):
-        return LevelStep(self, previous, node, self._normal(previous, node))
-
-    def _normal(self, previous: State, node):
-        if not self.counts.both:
-            return jnp.zeros((self.scale.shape[0], 0), self.scale.dtype)
-        return self.inverse_mass @ self.system.constraint_jacobian(previous.q, node.begin).T
+        return LevelStep(self, previous, node, self._before(self.system, previous.q, node.begin))
 
     def linearized(self, node, previous, state):
-        system, h, nu = self.system, node.h, state.lam[self.counts.multipliers :]
         equations = self.step(previous, node)
-        x = increment(self.scheme, previous, state.a + equations.correction(state.lam), h)
+        x = increment(self.scheme, previous, state.a + equations.correction(state.lam), node.h)
         at_state = equations.tangents(state.q, state.v, state.vdot, state.lam, node.t)
         return LevelLinearizedStep(
             x=x,
             tangents=at_state,
-            normal=equations.normal,
-            curvature=by_configuration(system, lambda q: self._correction(system, q, nu, node.begin), previous.q),
+            before=equations.before,
+            curvature=self._curvature(previous, state.lam[self.counts.multipliers :], node.begin),
             factors=equations.factorized(at_state, x),
         )
 
@@ -201,4 +221,8 @@ class Levels(AbstractEquations):
         return margin_by_mass(self.system, self.mass, jacobian, self.scale)
 
     def margin(self, state, t):
-        return self.margin_at(full_jacobian(self.system, state.q, t))
+        system = self.system
+        jacobian = (
+            full_jacobian(system, state.q, t) if self.plan is None else system.sparse_constraint_jacobian(state.q, t)
+        )
+        return self.margin_at(jacobian)

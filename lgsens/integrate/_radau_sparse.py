@@ -67,15 +67,9 @@ class _Places:
 
 def _staged(graph: Graph) -> tuple[Graph, float]:
     """The graph with these unknowns, and how long elimination on nullspaces takes."""
-    k = sum(len(own) for node, own in enumerate(graph.nodes) if node not in graph.joints)
-    m = sum(map(len, graph.nodes)) - k
-    at = _Places(k, m)
-    of = lambda starts, own: [int(start) + i for start in starts for i in own]
-    nodes = [
-        of([*at.lam, *at.mu], [i - k for i in own]) if node in graph.joints else of([*at.u, *at.y], own)
-        for node, own in enumerate(graph.nodes)
-    ]
-    return graph._replace(nodes=nodes), 0.5 * tuned.nullspaces(k, m)  # else not worth up to a half more to compile
+    at = _Places(*graph.sizes)
+    staged = graph.with_unknowns([*at.u.tolist(), *at.y.tolist()], [*at.lam.tolist(), *at.mu.tolist()])
+    return staged, 0.5 * tuned.nullspaces(*graph.sizes)  # else not worth up to a half more to compile
 
 
 def stage_plan(system: AbstractSystem) -> Elimination | None:

@@ -54,6 +54,23 @@ class Graph(NamedTuple):
     joints: Mapping[int, Joint]
     whole: frozenset[int]
 
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """How many coordinates the bodies have, and how many rows the joints."""
+        joints = sum(len(self.nodes[node]) for node in self.joints)
+        return sum(map(len, self.nodes)) - joints, joints
+
+    def with_unknowns(self, of_bodies: Sequence[int], of_joints: Sequence[int]) -> "Graph":
+        """The same graph with several unknowns for each, in each node in this order: where those of the coordinates
+        begin, and those of the rows."""
+        k, _ = self.sizes
+
+        def unknowns(node: int, own: Sequence[int]) -> list[int]:
+            begins, before = (of_joints, k) if node in self.joints else (of_bodies, 0)
+            return [begin + i - before for begin in begins for i in own]
+
+        return self._replace(nodes=[unknowns(node, own) for node, own in enumerate(self.nodes)])
+
 
 class GraphPart(NamedTuple):
     """Bodies that are gone, and what is known of the joints between them that are gone."""

@@ -31,7 +31,7 @@ class DenseLU(AbstractLinearSolver):
             precision to 1e-9. No gain on a CPU so far, which is why it is not the default: of 94 unknowns, factors with
             one solution take 1.2 times as long, every further solution 3 times; iterations of modified Newton 0.6 times
             (`benchmarks/precision.py`). A matrix that cannot be refined (a condition above 1e6) fails the step.
-            Without effect in `RadauIIA`, and where everything is in single precision.
+            Without effect in `RadauIIA`, in stabilized steps, and where everything is in single precision.
 
     Raises `ValueError` where `mixed` is not True or False.
     """
@@ -97,8 +97,7 @@ def _with_loop(plan: Elimination, limit: float) -> Elimination:
 
 def _cost(plan: Elimination) -> float:
     """The estimated time [µs] of one factorization and one solve."""
-    n = len(plan.rest)
-    total = tuned.DENSE_SQUARE * n**2 + tuned.DENSE_CUBE * n**3
+    total = tuned.dense(len(plan.rest))
     for own, boundary in plan.levels:
         count, p, q = len(own), own.shape[1], boundary.shape[1]
         flops = 4 * p**3 + 4 * p**2 * q + 2 * p * q**2

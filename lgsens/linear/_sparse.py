@@ -105,6 +105,22 @@ class SparseMatrix(eqx.Module):
         values, rows, columns = zip(*found)
         return jnp.concatenate(values), np.concatenate(rows), np.concatenate(columns)
 
+    def within(self, shape: tuple[int, int], row: int = 0, column: int = 0) -> "SparseMatrix":
+        """The matrix as a part of a larger one of zeros, from a row and a column on."""
+        moved = lambda places, by: np.where(places < 0, places, places + by)
+        patterns = [Pattern(moved(p.pattern.rows, row), moved(p.pattern.columns, column)) for p in self.parts]
+        return SparseMatrix(tuple(Blocks(p.values, own) for p, own in zip(self.parts, patterns)), shape, self.dtype)
+
+    def inverse(self) -> "SparseMatrix":
+        """Of a matrix of square blocks on its diagonal, each of other rows, as that of masses by bodies is."""
+        parts = []
+        for part in self.parts:
+            there = part.pattern.rows >= 0
+            unit = jnp.eye(there.shape[1], dtype=self.dtype)[None]
+            whole = jnp.where(there[:, :, None] & there[:, None, :], part.values, unit)
+            parts.append(Blocks(jnp.linalg.inv(whole), part.pattern))
+        return self._with(parts)
+
     def trace(self) -> Float[Array, ""]:
         values, rows, columns = self.entries()
         return jnp.sum(values[np.flatnonzero(rows == columns)])

@@ -104,6 +104,11 @@ SETTINGS_TOGETHER, MAPS = 8, 40_000
 PASSED_ALONE = 4096
 
 
+def dense(n: int) -> float:
+    """The time [µs] of a dense LU of n unknowns and a solution."""
+    return DENSE_SQUARE * n**2 + DENSE_CUBE * n**3
+
+
 def nullspaces(k: int, m: int) -> float:
     """The time [µs] of the three stages of Radau on the nullspaces of m rows of k columns (`integrate._radau_dense`).
 
