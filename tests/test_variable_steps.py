@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from differences import central
 from driven_pendulum import P, make
-from helpers import says
+from helpers import says, some_quick
 
 import lgsens as lg
 from lgsens.examples import PROBLEMS, spinning_top
@@ -114,7 +114,8 @@ def test_derivatives_on_a_given_grid():
         np.testing.assert_allclose(jnp.sum(forward[i] * direction), central(shifted, 1e-3), rtol=1e-7)
 
 
-def test_fixed_fractions_are_constants():
+@pytest.mark.parametrize("mode", some_quick(["reverse", "forward"]))
+def test_fixed_fractions_are_constants(mode):
     """Nothing but the derivative by them is left out: an uneven grid, whose ratios are not 1 in two steps of twelve."""
     sizes = jnp.array([1.0] * 5 + [2.0] * 4 + [0.5] * 3)
 
@@ -124,14 +125,15 @@ def test_fixed_fractions_are_constants():
         return observed(run)
 
     point = jnp.array(P), jnp.asarray(0.7), sizes
-    forward, reverse = lg.DirectDifferentiation(), lg.AdjointVariable()
-    every = jax.jit(jax.grad(partial(psi, fixed=False, sensitivity=reverse), argnums=(0, 1, 2)))(*point)
-    for derivative, method in ((jax.grad, reverse), (jax.jacfwd, forward)):
-        of = partial(psi, fixed=True, sensitivity=method)
-        found = jax.jit(derivative(of, argnums=(0, 1, 2)))(*point)
-        for one, other in zip(found[:2], every[:2], strict=True):
-            np.testing.assert_allclose(one, other, rtol=1e-10)  # other order of round-off
-        assert not found[2].any() and every[2].any()
+    methods = {"reverse": (jax.grad, lg.AdjointVariable()), "forward": (jax.jacfwd, lg.DirectDifferentiation())}
+    derivative, method = methods[mode]
+    every, found = (
+        jax.jit(derivative(partial(psi, fixed=fixed, sensitivity=method), argnums=(0, 1, 2)))(*point)
+        for fixed in (False, True)
+    )
+    for one, other in zip(found[:2], every[:2], strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10)  # other order of round-off
+    assert not found[2].any() and every[2].any()
 
 
 @pytest.mark.slow

@@ -126,6 +126,7 @@ def early(p):
     return jnp.trapezoid(jnp.exp(-((t / 0.15) ** 2)) * (V / w * jnp.sin(w * t)) ** 2, t)
 
 
+@pytest.mark.slow  # two programs; `test_steps_for` has what places them
 def test_steps_placed_for_a_criterion():
     """Of one that looks at the begin only: as many steps leave less than half of the errors."""
     value, gradient = jax.value_and_grad(early)(jax.tree.map(jnp.asarray, P))

@@ -194,7 +194,8 @@ def test_integrals_of_extrapolated_runs_have_it_too():
     assert errors[1] < 1e-5 and errors[0] > 10.0 * errors[1], errors  # 16, less h³ of ρ∞ = 0.9
 
 
-@pytest.mark.parametrize("accuracy", [pytest.param(1e-4, marks=pytest.mark.slow), 1e-7])
+@pytest.mark.slow  # `test_to_accuracy` has one in the quick run
+@pytest.mark.parametrize("accuracy", [1e-4, 1e-7])
 def test_an_accuracy_is_reached_by_them(accuracy):
     run = lg.simulate(on(BUMP), t1=T1, accuracy=accuracy)
     assert run.reached.integrator == lg.AlignedSteps() and "aligned steps" in str(run.reached)
