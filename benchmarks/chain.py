@@ -1,13 +1,14 @@
 """How a step, its gradient, compilation and memory grow with the length of a chain.
 
-    python benchmarks/chain.py [--links 8 64 512] [--solvers auto dense] [--out benchmarks/results]
+    python benchmarks/chain.py [--links 8 64 512] [--solvers auto dense] [--schemes index3 stabilized radau]
+        [--out benchmarks/results]
 
-The spatial chain of hinged links, 6 N coordinates and 5 N constraints, h = 1 ms, its end no faster than 8 m/s. Time per
-step is the difference of runs of 20 and 100 steps over the 80 between them, so that the initial state does not count:
-medians of at least `--repeats` rounds of all four programs after one that compiles. "gradient" is that of Ψ, the
-integral of the square of the last link's height, by all numbers of the assembled system, in reverse mode. "auto" is the
-linear solver that the model chooses. The slope is that of log time over log N between two lengths. Writes chain.json
-and prints a table.
+The spatial chain of hinged links, 6 N coordinates and 5 N constraints, h = 1 ms, its end no faster than 8 m/s, by
+generalized-α, index 3 and stabilized index 2, and by Radau IIA. Time per step is the difference of runs of 20 and 100
+steps over the 80 between them, so that the initial state does not count: medians of at least `--repeats` rounds of all
+four programs after one that compiles. "gradient" is that of Ψ, the integral of the square of the last link's height, by
+all numbers of the assembled system, in reverse mode. "auto" is the linear solver that the model chooses; levels are
+those of index 3. The slope is that of log time over log N between two lengths. Writes chain.json and prints a table.
 """
 
 import dataclasses
@@ -20,20 +21,24 @@ import time
 
 from benchmark import SINGLE_THREAD, circumstances, environment, interleaved, options, write
 
+SCHEMES = ("index3", "stabilized", "radau")
 STEPS = (20, 100)
 H = 1e-3
 
 
-def measure(links: int, solver: str, repeats: int) -> dict:
+def measure(links: int, solver: str, scheme: str, repeats: int) -> dict:
     import equinox as eqx
     import jax
 
     import lgsens as lg
     from lgsens.examples import spatial_chain
 
+    integrator = dict(
+        zip(SCHEMES, (lg.GeneralizedAlpha(), lg.GeneralizedAlpha(stabilized=True), lg.RadauIIA()), strict=True)
+    )[scheme]
     started = time.perf_counter()
     system = spatial_chain(links, spin=min(3.0, 24.0 / links)).system()
-    found: dict = {"links": links, "solver": solver, "build_s": time.perf_counter() - started}
+    found: dict = {"links": links, "solver": solver, "scheme": scheme, "build_s": time.perf_counter() - started}
     if solver == "dense":
         system = dataclasses.replace(system, linear_solver=lg.DenseLU())
     plan = system.elimination
@@ -44,7 +49,7 @@ def measure(links: int, solver: str, repeats: int) -> dict:
     for steps in STEPS:
 
         def psi(system, steps=steps):
-            trajectory = lg.simulate(system, t1=steps * H, num_steps=steps, throw=False)
+            trajectory = lg.simulate(system, t1=steps * H, num_steps=steps, integrator=integrator, throw=False)
             height = trajectory.body(f"link{links - 1}").position[:, 2]
             return lg.time_integral(trajectory.t, height**2)
 
@@ -69,15 +74,16 @@ def measure(links: int, solver: str, repeats: int) -> dict:
 
 def slopes(rows: list[dict]) -> list[dict]:
     found = []
-    for solver in sorted({row["solver"] for row in rows}):
-        own = sorted((row for row in rows if row["solver"] == solver), key=lambda row: row["links"])
+    of = lambda row: (row["solver"], row["scheme"])
+    for solver, scheme in dict.fromkeys(map(of, rows)):
+        own = sorted((row for row in rows if of(row) == (solver, scheme)), key=lambda row: row["links"])
         for short, long in itertools.pairwise(own):
             ratio = math.log(long["links"] / short["links"])
             slope = {
                 name: math.log(long[f"{name}_us_per_step"] / short[f"{name}_us_per_step"]) / ratio
                 for name in ("simulate", "gradient")
             }
-            found.append({"solver": solver, "from": short["links"], "to": long["links"]} | slope)
+            found.append({"solver": solver, "scheme": scheme, "from": short["links"], "to": long["links"]} | slope)
     return found
 
 
@@ -85,15 +91,15 @@ def table(document: dict) -> str:
     lines = [
         f"{circumstances(document['environment'])} Processor time in brackets.",
         "",
-        "| links | solver | simulate [µs/step] | with gradient [µs/step] | compile: simulate, gradient [s] "
+        "| links | solver | scheme | simulate [µs/step] | with gradient [µs/step] | compile: simulate, gradient [s] "
         "| temporary memory of the gradient [MB] | levels | dense rest |",
-        "|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in document["rows"]:
         looped = row.get("looped", 0)
         levels = f"{len(row['levels']) - looped}" + (f" and a loop of {looped}" if looped else "")
         lines.append(
-            f"| {row['links']} | {row['solver']} "
+            f"| {row['links']} | {row['solver']} | {row['scheme']} "
             f"| {row['simulate_us_per_step']:.0f} ({row['simulate_cpu_us_per_step']:.0f}) "
             f"| {row['gradient_us_per_step']:.0f} ({row['gradient_cpu_us_per_step']:.0f}) "
             f"| {row['simulate_compile_s']:.1f}, {row['gradient_compile_s']:.1f} | {row['gradient_temporary_mb']:.1f} "
@@ -101,8 +107,8 @@ def table(document: dict) -> str:
         )
     for one in document["slopes"]:
         lines.append(
-            f"\n{one['solver']}: slope from {one['from']} to {one['to']} links: simulate {one['simulate']:.2f}, "
-            f"with gradient {one['gradient']:.2f}."
+            f"\n{one['solver']}, {one['scheme']}: slope from {one['from']} to {one['to']} links: "
+            f"simulate {one['simulate']:.2f}, with gradient {one['gradient']:.2f}."
         )
     return "\n".join(lines)
 
@@ -111,6 +117,7 @@ def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--links", nargs="+", type=int, default=[8, 64, 512])
     parser.add_argument("--solvers", nargs="+", choices=("auto", "dense"), default=["auto"])
+    parser.add_argument("--schemes", nargs="+", choices=SCHEMES, default=list(SCHEMES))
     arguments = parser.parse_args()
     path = arguments.out / "chain.json"
     os.environ.update(SINGLE_THREAD)  # before jax and numpy are imported
@@ -118,10 +125,9 @@ def main() -> None:
 
     jax.config.update("jax_enable_x64", True)
     found, rows = environment(SINGLE_THREAD), []
-    for solver in arguments.solvers:
-        for links in arguments.links:
-            rows.append(measure(links, solver, arguments.repeats))
-            print(rows[-1], flush=True)
+    for solver, scheme, links in itertools.product(arguments.solvers, arguments.schemes, arguments.links):
+        rows.append(measure(links, solver, scheme, arguments.repeats))
+        print(rows[-1], flush=True)
     write(path, {"environment": found, "rows": rows, "slopes": slopes(rows)})
     print(table(json.loads(path.read_text(encoding="utf-8"))))
 

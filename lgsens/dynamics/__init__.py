@@ -44,6 +44,7 @@ from lgsens.dynamics._matrices import (
     constraint_jacobian as constraint_jacobian,
     factor_size as factor_size,
     factorized as factorized,
+    in_blocks as in_blocks,
     kkt_solve as kkt_solve,
     mass_matrix as mass_matrix,
     mass_scale as mass_scale,

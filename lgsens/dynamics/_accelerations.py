@@ -30,7 +30,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics._constraints import constraint_acceleration, fixed_velocity_rate, full_jacobian
-from lgsens.dynamics._matrices import kkt_product, require_linear
+from lgsens.dynamics._matrices import ConstrainedMass, kkt_product, require_linear
 from lgsens.dynamics._redundant import SOFTNESS, refined, softness
 from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem
 from lgsens.linear import LinearEquations, linear_solve
@@ -110,15 +110,17 @@ def equations_of_motion(system: AbstractSystem, q, v, vdot, lam, t):
     return system.residual(q, v, vdot, lam, t), constraint_acceleration(system, q, v, vdot, t)
 
 
-def _solved(inertia: Inertia, system: AbstractSystem, q, v, t):
-    kkt = ConstrainedInertia.of(inertia, system, q, t)
+def _solved(inertia: Inertia | None, system: AbstractSystem, q, v, t):
+    blocks = inertia is None
+    kkt = ConstrainedMass.in_steps(system, q, t) if blocks else ConstrainedInertia.of(inertia, system, q, t)
     force = system.residual(q, v, jnp.zeros_like(v), jnp.zeros(kkt.jacobian.shape[0], v.dtype), t)
     return kkt.solve(-force, -fixed_velocity_rate(system, q, v, t)), kkt
 
 
 @jax.custom_jvp
-def factorized_accelerations(inertia: Inertia, system: AbstractSystem, q: Any, v, t):
-    """v̇, shape (k,), and λ, shape (m,), of the motion through (q, v) at t; `inertia` is that of the system."""
+def factorized_accelerations(inertia: Inertia | None, system: AbstractSystem, q: Any, v, t):
+    """v̇, shape (k,), and λ, shape (m,), of the motion through (q, v) at t; `inertia` is that of the system, None: A is
+    factorized in blocks."""
     return _solved(inertia, system, q, v, t)[0]
 
 

@@ -15,26 +15,26 @@ from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem, Tangen
 from lgsens.linear import LU, Factors, Inverse, LinearEquations, Matrix, SparseMatrix, linear_solve, tuned
 
 
-def _sparse(system: AbstractSystem) -> AbstractSparseSystem | None:
+def in_blocks(system: AbstractSystem) -> AbstractSparseSystem | None:
     """The system, if its linear solver is sparse."""
     return system if isinstance(system, AbstractSparseSystem) and system.elimination is not None else None
 
 
 def mass_matrix(system: AbstractSystem) -> Matrix:
     """M."""
-    sparse = _sparse(system)
+    sparse = in_blocks(system)
     return system.mass_matrix() if sparse is None else sparse.sparse_mass_matrix()
 
 
 def constraint_jacobian(system: AbstractSystem, q, t) -> Matrix:
     """J = [B; A]."""
-    sparse = _sparse(system)
+    sparse = in_blocks(system)
     return full_jacobian(system, q, t) if sparse is None else sparse.sparse_constraint_jacobian(q, t)
 
 
 def tangents(system: AbstractSystem, q, v, vdot, lam, t) -> Tangents:
     """K_t, C_t and J."""
-    sparse = _sparse(system)
+    sparse = in_blocks(system)
     return (system.tangents if sparse is None else sparse.sparse_tangents)(q, v, vdot, lam, t)
 
 
@@ -70,7 +70,7 @@ def mass_scale(mass: Matrix) -> Float[Array, ""]:
 
 def times_tangent_operator(system: AbstractSystem, x, matrices: tuple[Matrix, ...]) -> tuple[Matrix, ...]:
     """A T(x) for each of the matrices A."""
-    sparse = _sparse(system)
+    sparse = in_blocks(system)
     if sparse is not None:
         operators = sparse.rotation_operators(partial(system.group.tangent_mv, x))
         return tuple(matrix.times_rotations(operators) for matrix in matrices)
@@ -137,7 +137,7 @@ class ConstrainedMass(eqx.Module):
         """`factors`: those at q, if they are known: to compile them is most of what this costs."""
         mass, jacobian = mass_matrix(system), constraint_jacobian(system, q, t)
         soft = softness(system)
-        if factors is not None or (_sparse(system) is None and soft is None):
+        if factors is not None or (in_blocks(system) is None and soft is None):
             return cls(mass, jacobian, factors, soft is not None)
         fixed, border = for_once(*lax.stop_gradient((mass, jacobian)))
         # what blocks leave is small, and a product with its inverse compiles sooner than two loops for each solution

@@ -23,7 +23,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import AbstractSparseSystem, AbstractSystem, mass_scale, times_tangent_operator
+from lgsens.dynamics import AbstractSystem, in_blocks, mass_scale, times_tangent_operator
 from lgsens.integrate._alpha import AbstractAlpha
 from lgsens.linear import Elimination, Factors, Graph, SparseMatrix, tuned
 
@@ -37,11 +37,8 @@ def _with_corrections(graph: Graph) -> tuple[Graph, float]:
 def level_plan(scheme: AbstractAlpha, system: AbstractSystem) -> Elimination | None:
     """The plan of block elimination; None: all matrices are dense. Rows of velocities only have none, nor have forces
     that depend on λ, whose tangents are not those of the joints alone."""
-    blocks = scheme.stabilized and isinstance(system, AbstractSparseSystem) and system.elimination is not None
-    if not blocks or system.reads_multipliers:
-        return None
-    assert isinstance(system, AbstractSparseSystem)
-    return system.arranged(_with_corrections)
+    sparse = in_blocks(system) if scheme.stabilized and not system.reads_multipliers else None
+    return None if sparse is None else sparse.arranged(_with_corrections)
 
 
 class SparseLevelFactors(eqx.Module):

@@ -52,13 +52,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from lgsens._validate import as_count, require_setting
 from lgsens.dynamics import (
     RESULTS,
     AbstractSystem,
     ConstrainedInertia,
+    ConstrainedMass,
     Inertia,
     State,
     equations_of_motion,
@@ -83,7 +83,7 @@ class Shared(NamedTuple):
     """What all steps share."""
 
     system: AbstractSystem
-    inertia: Inertia
+    inertia: Inertia | None  # None: the equations at the end of a step are solved in blocks, too
 
 
 class RadauIIA(AbstractScheme):
@@ -134,7 +134,7 @@ class RadauIIA(AbstractScheme):
     def resumed(self, system, given, t0):
         """Accelerations are those of (q, v): a state of another scheme has them with its own error."""
         q, v = given.state.q, given.state.v
-        vdot, lam = factorized_accelerations(Inertia.of(system), system, q, v, t0)
+        vdot, lam = factorized_accelerations(self.shared(system).inertia, system, q, v, t0)
         return Start(self.complete(system, State(q, v, vdot, lam, vdot)))
 
     def complete(self, system, state):
@@ -171,7 +171,7 @@ class RadauIIA(AbstractScheme):
     # The step, its equations and its error.
 
     def shared(self, system):
-        return Shared(system, Inertia.of(system))
+        return Shared(system, Inertia.of(system) if stage_plan(system) is None else None)
 
     def memory(self, shared, state, node, *, uneven, exact=False):
         return no_memory(shared.system, node, state)
@@ -230,18 +230,22 @@ class RadauLinearizedStep(AbstractLinearizedStep):
     """The equations above."""
 
     stages: AbstractStageFactors
-    factors: tuple[Array, Array, Array]  # J, and the factors of [[M, Jᵀ], [J, 0]], at the end
+    factors: Any  # of [[M, Jᵀ], [J, 0]], at the end, with J
     end: Any  # q⁺
     motion: Any  # (q', v') ↦ E_q w + E_v v'
 
     @classmethod
     def of(cls, shared: Shared, node: Node, previous: State, state: State) -> "RadauLinearizedStep":
         system, q, v, t = shared.system, state.q, state.v, node.t
-        kkt = ConstrainedInertia.of(shared.inertia, system, q, t)
+        if shared.inertia is None:
+            factors: Any = ConstrainedMass.in_steps(system, q, t)
+        else:
+            kkt = ConstrainedInertia.of(shared.inertia, system, q, t)
+            factors = kkt.jacobian, kkt.factor, kkt.scale
         motion = lambda q, v: equations_of_motion(system, q, v, state.vdot, state.lam, t)
         return cls(
             stages=stage_factors(system, node, previous, state.inner),
-            factors=(kkt.jacobian, kkt.factor, kkt.scale),
+            factors=factors,
             end=q,
             motion=jax.linearize(motion, q, v)[1],
         )
@@ -252,6 +256,7 @@ class RadauLinearizedStep(AbstractLinearizedStep):
         inner = self.stages.exactly(node.h, known)
         w, v = map(jnp.add, self.stages.end(node.h, previous.w, previous.v, inner), (row.w, row.v))
         force, rate = self.motion(shared.system.group.to_ambient(self.end, w), v)
-        kkt = ConstrainedInertia(shared.inertia, *self.factors)
+        blocks = shared.inertia is None
+        kkt = self.factors if blocks else ConstrainedInertia(shared.inertia, *self.factors)
         vdot, lam = kkt.solve(row.vdot - force, row.lam - rate)
         return Variation(w, v, vdot, lam, vdot + row.a, inner)

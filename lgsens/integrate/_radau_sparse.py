@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import AbstractSparseSystem, AbstractSystem, State, mass_scale
+from lgsens.dynamics import AbstractSystem, State, in_blocks, mass_scale
 from lgsens.integrate._linearized import Node
 from lgsens.integrate._radau_dense import DenseStageFactors
 from lgsens.integrate._radau_stages import (
@@ -74,7 +74,8 @@ def _staged(graph: Graph) -> tuple[Graph, float]:
 
 def stage_plan(system: AbstractSystem) -> Elimination | None:
     """The plan of block elimination; None: on nullspaces."""
-    return system.arranged(_staged) if isinstance(system, AbstractSparseSystem) else None
+    sparse = in_blocks(system)
+    return None if sparse is None else sparse.arranged(_staged)
 
 
 def stage_factors(system: AbstractSystem, node: Node, previous: State, found: RadauStages) -> AbstractStageFactors:
