@@ -114,6 +114,7 @@ def test_a_dead_centre_itself_is_passed_straight_on():
         np.testing.assert_allclose(found.body("rocker").position[:, :2], expected, atol=1e-10)  # Newton, near flat ones
 
 
+@pytest.mark.slow
 def test_an_optimum_is_that_of_one_way_to_assemble_it():
     """The largest swing of a rocker, to which designs lead that come close to a dead centre."""
     pivot = np.array([1.3, 0.0])

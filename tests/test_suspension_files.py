@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from helpers import says, some_quick
+from helpers import says
 from scipy.interpolate import PchipInterpolator
 from suspension_closures import Closure, changed, corner_of, motion_ratio
 
@@ -46,7 +46,8 @@ def differences(function, step):
     return (a - 8 * b + 8 * c - d) / (12 * step)
 
 
-@pytest.mark.parametrize("name", some_quick(SCENES[:4]))
+@pytest.mark.slow  # `test_suspension_curves` has those of one in the quick run
+@pytest.mark.parametrize("name", SCENES[:4])
 def test_curves_agree_with_the_closure(name, load):
     """Positions by SciPy's root of hand-written distances, motion ratios by its differences and by virtual work."""
     scene = document(name)

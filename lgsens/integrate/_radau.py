@@ -62,6 +62,7 @@ from lgsens.dynamics import (
     Inertia,
     State,
     equations_of_motion,
+    factor_size,
     factorized_accelerations,
     finite,
     require_independent,
@@ -220,10 +221,9 @@ class RadauIIA(AbstractScheme):
 
     def numbers(self, system):
         k, m, plan = system.group.dim, len(system.constraint_names), stage_plan(system)
-        stages = (
-            plan.numbers if plan is not None else 3 * (5 * k**2 + m * (2 * k + m) + k * (k - m)) + 36 * (k - m) ** 2
-        )
-        return stages + m * (k + m) + 16 * k
+        if plan is not None:
+            return plan.numbers + factor_size(system) + 16 * k
+        return 3 * (5 * k**2 + m * (2 * k + m) + k * (k - m)) + 36 * (k - m) ** 2 + m * (k + m) + 16 * k
 
 
 class RadauLinearizedStep(AbstractLinearizedStep):

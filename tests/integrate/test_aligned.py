@@ -266,9 +266,10 @@ def of_road(p, integrator, num_steps=60, **settings):
 
 @pytest.mark.parametrize(
     "integrator",
-    [lg.AlignedSteps(), pytest.param(lg.Richardson(lg.AlignedSteps()), marks=pytest.mark.slow)],
+    [lg.AlignedSteps(), lg.Richardson(lg.AlignedSteps())],
     ids=["one", "two"],
 )
+@pytest.mark.slow  # `test_moving_steps` has derivatives by the times of breaks in the quick run
 def test_derivatives_are_those_on_the_grid(integrator):
     p = jnp.array([0.1, START])
     run = end(integrator, 60)[1]
