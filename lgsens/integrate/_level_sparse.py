@@ -48,25 +48,28 @@ class SparseLevelFactors(eqx.Module):
     scale: Float[Array, ""]  # σ
 
     @classmethod
-    def of(cls, system: Any, plan: Elimination, mass, before, at_state, x, steps, kind: Any) -> "SparseLevelFactors":
-        """`before`: B_n; `at_state`: `LevelTangents`; `steps`: c, γh and βh²."""
-        inertia, velocity, position = steps
+    def of(cls, step: Any, at_state: Any, x, kind: Any) -> "SparseLevelFactors":
+        """Of a `LevelStep`, from its `LevelTangents`."""
+        shared, h = step.shared, step.node.h
+        scheme, mass = shared.scheme, shared.mass
+        velocity, position = scheme.gamma * h, scheme.beta * h**2
         k_t, c_t, jacobian, upper, rate_stiffness = at_state
-        k_t, by_place, turned = times_tangent_operator(system, x, (k_t, jacobian, rate_stiffness))
+        k_t, by_place, turned = times_tangent_operator(shared.system, x, (k_t, jacobian, rate_stiffness))
         scale, (m, k) = mass_scale(mass), jacobian.shape
         inside, turned = (2 * k + m,) * 2, (position / velocity) * turned
         at = lambda matrix, row, column: matrix.within(inside, row, column)
         border: Any = lambda matrix, column=0: matrix.within((m, inside[1]), 0, column)
         dynamic: SparseMatrix = (
-            at(inertia * mass + velocity * c_t + position * k_t, 0, 0)
+            at(scheme.inertia_factor * mass + velocity * c_t + position * k_t, 0, 0)
             + at(position * k_t, 0, k)
             + at(mass, k, k)
-            + at(-scale * before.T, k, 2 * k)
+            + at(-scale * step.before.T, k, 2 * k)
             + at(scale * by_place, 2 * k, 0)
             + at(scale * by_place, 2 * k, k)
         )
         lower = border(jacobian) + border(turned) + border(turned, k)
-        return cls(Factors.of(dynamic, upper.within((inside[0], m)), lower, scale, plan=plan, kind=kind), scale)
+        upper = upper.within((inside[0], m))
+        return cls(Factors.of(dynamic, upper, lower, scale, plan=shared.plan, kind=kind), scale)
 
     def solve(self, force, rows, *, transposed: bool = False):
         """S₂⁻¹ or S₂⁻ᵀ of `force` (k,) and `rows`: of the rows (Φ, B v + Φ_t) or of the columns (λ, ν)."""

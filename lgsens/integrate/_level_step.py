@@ -159,11 +159,9 @@ class LevelStep(AbstractStep):
 
     def factorized(self, at_state: LevelTangents, x, kind: Any = LU) -> LevelFactors | SparseLevelFactors:
         """The factors of S₂."""
-        scheme, mass, counts, h = self.shared.scheme, self.shared.mass, self.shared.counts, self.node.h
         if self.shared.plan is not None:
-            steps = scheme.inertia_factor, scheme.gamma * h, scheme.beta * h**2
-            known = self.shared.system, self.shared.plan, mass, self.before
-            return SparseLevelFactors.of(*known, at_state, x, steps, kind)
+            return SparseLevelFactors.of(self, at_state, x, kind)
+        scheme, mass, counts, h = self.shared.scheme, self.shared.mass, self.shared.counts, self.node.h
         k_t, c_t, jacobian, border, rate_stiffness = at_state
         k, p, b, m = mass.shape[0], counts.positions, counts.both, counts.multipliers
         scale = mass_scale(mass)
