@@ -3,6 +3,7 @@
 from lgsens.dynamics._accelerations import (
     ConstrainedInertia as ConstrainedInertia,
     Inertia as Inertia,
+    constrained as constrained,
     equations_of_motion as equations_of_motion,
     factorized_accelerations as factorized_accelerations,
 )

@@ -110,9 +110,13 @@ def equations_of_motion(system: AbstractSystem, q, v, vdot, lam, t):
     return system.residual(q, v, vdot, lam, t), constraint_acceleration(system, q, v, vdot, t)
 
 
+def constrained(inertia: Inertia | None, system: AbstractSystem, q, t) -> ConstrainedInertia | ConstrainedMass:
+    """A at one configuration, factorized; `inertia` None: in blocks."""
+    return ConstrainedMass.in_steps(system, q, t) if inertia is None else ConstrainedInertia.of(inertia, system, q, t)
+
+
 def _solved(inertia: Inertia | None, system: AbstractSystem, q, v, t):
-    blocks = inertia is None
-    kkt = ConstrainedMass.in_steps(system, q, t) if blocks else ConstrainedInertia.of(inertia, system, q, t)
+    kkt = constrained(inertia, system, q, t)
     force = system.residual(q, v, jnp.zeros_like(v), jnp.zeros(kkt.jacobian.shape[0], v.dtype), t)
     return kkt.solve(-force, -fixed_velocity_rate(system, q, v, t)), kkt
 

@@ -58,9 +58,9 @@ from lgsens.dynamics import (
     RESULTS,
     AbstractSystem,
     ConstrainedInertia,
-    ConstrainedMass,
     Inertia,
     State,
+    constrained,
     equations_of_motion,
     factor_size,
     factorized_accelerations,
@@ -237,15 +237,11 @@ class RadauLinearizedStep(AbstractLinearizedStep):
     @classmethod
     def of(cls, shared: Shared, node: Node, previous: State, state: State) -> "RadauLinearizedStep":
         system, q, v, t = shared.system, state.q, state.v, node.t
-        if shared.inertia is None:
-            factors: Any = ConstrainedMass.in_steps(system, q, t)
-        else:
-            kkt = ConstrainedInertia.of(shared.inertia, system, q, t)
-            factors = kkt.jacobian, kkt.factor, kkt.scale
+        kkt: Any = constrained(shared.inertia, system, q, t)
         motion = lambda q, v: equations_of_motion(system, q, v, state.vdot, state.lam, t)
         return cls(
             stages=stage_factors(system, node, previous, state.inner),
-            factors=factors,
+            factors=kkt if shared.inertia is None else (kkt.jacobian, kkt.factor, kkt.scale),
             end=q,
             motion=jax.linearize(motion, q, v)[1],
         )

@@ -168,9 +168,9 @@ def free_points():
 
 DENSE, SPARSE = lg.DenseLU(), lg.BlockSparse()
 LINEARIZED = [
-    (SPARSE, points),
     (SPARSE, free_points),
     (SPARSE, machine),
+    (SPARSE, points),
     (DENSE, lambda: spinning_top(0.7)),
     (SPARSE, everything),
     (SPARSE, beam),
