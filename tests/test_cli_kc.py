@@ -37,6 +37,7 @@ def test_the_report_is_complete(written):
     assert rate == pytest.approx(np.mean(sweep["wheel_rate"][2]), rel=1e-12)
 
 
+@pytest.mark.slow  # another report
 def test_ideal_joints_give_the_curves_of_kinematics(written):
     """Of the corner on the left, at the travels of its wheel centre."""
     sweep = {name: np.array(values) for name, values in written[2]["sweeps"]["parallel"].items() if name != "shares"}

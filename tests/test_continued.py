@@ -22,7 +22,6 @@ SCHEMES = {
     "stabilized": {"num_steps": 160, "integrator": lg.GeneralizedAlpha(stabilized=True)},
     "Radau IIA": {"num_steps": 40, "integrator": lg.RadauIIA()},
 }
-QUICK = ("shorter",)
 
 
 def pendulum(length=0.5):
@@ -56,15 +55,15 @@ def off(run):
     return np.abs(force(run) - wanted).max() / np.abs(reference).max()
 
 
-@pytest.mark.parametrize(
-    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in SCHEMES]
-)
+@pytest.mark.slow  # four programs; derivatives, below, go through them
+@pytest.mark.parametrize("name", SCHEMES)
 def test_forces_are_those_of_the_motion_from_the_first_step_on(name):
     """In longer steps with the error of these: four times that of the run before."""
     found = off(lg.simulate(pendulum(), t0=HALF, t1=END, state0=half().continued(), **SCHEMES[name]))
     assert found < off(half()) * (5.0 if name == "longer" else 1.5)
 
 
+@pytest.mark.slow  # derivatives, below, go through what is handed on
 def test_a_state_alone_does_not_know_its_step():
     """Which is what `continued` is for: 16 times the size of the new steps, 256 times their offset of the velocity."""
     run = lg.simulate(pendulum(), t0=HALF, t1=END, state0=half().state(-1), **SCHEMES["shorter"])

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import some_quick
 
 import lgsens as lg
 
@@ -74,10 +75,11 @@ def random_designs(count):
     return dict(zip("BCD", begin + scale * numbers))
 
 
-def test_no_other_way_to_assemble_it_is_taken():
+@pytest.mark.parametrize("count", some_quick([150, 600]))
+def test_no_other_way_to_assemble_it_is_taken(count):
     """Of 600 designs a dozen would be, in steps of half a radian, by Newton's iteration from one position to the
     next."""
-    check(random_designs(600), planar=True)
+    check(random_designs(count), planar=True)
 
 
 def test_nor_where_two_loops_could_change_over_at_once():
@@ -132,6 +134,7 @@ def test_an_optimum_is_that_of_one_way_to_assemble_it():
     assert expected > 1.3
 
 
+@pytest.mark.slow  # that of a rocker stays in the quick run
 def test_a_coupling_that_comes_to_half_a_turn_is_named():
     """φ_c = 0.3 φ_a + 0.05 φ_a², of angles that poses tell within half a turn: behind that of φ_a is no position."""
     wheel = lambda x: lg.RigidBody(1.0, (0.01, 0.01, 0.02), position=(x, 0.0, 0.0))

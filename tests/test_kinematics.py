@@ -196,6 +196,7 @@ def test_a_cylinder_lifts_a_bar():
     close(found.multiplier("cylinder")[:, 0], -3.0 * 9.81 * 2 * lengths, ULPS)
 
 
+@pytest.mark.slow  # what it lifts is in the quick run
 def test_forces_of_a_cylinder_are_those_of_its_length():
     """Its force from the moments about the hinge, at lengths of 1.4 times the reference; with the hinge it carries the
     weight."""

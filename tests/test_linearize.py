@@ -547,6 +547,7 @@ def test_what_is_refused(car):
         lg.random_road(unstable, roughness=1e-6, speed=1.0)
 
 
+@pytest.mark.slow  # `test_kinematics` and `test_equilibrium` have such places in the quick run
 def test_far_from_the_origin():
     """Two bolts of 1 g on 1e9 N/m: round-off of 1 km is 1e-13 m × 1e12 /s². Their frequencies as at the origin."""
 

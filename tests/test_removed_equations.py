@@ -267,6 +267,7 @@ def bennett(angle=0.7, twists=(0.6, 1.1), tilt=0.0, motor=True, **options):
     return lg.Model(bodies, joints, {"spring": spring}, **options)
 
 
+@pytest.mark.slow  # motions are in the quick run
 def test_kinematics_meet_what_is_left_out_or_have_failed():
     """Newton's iteration from one position to the next, 0.9 rad away, leads to a configuration at which the removed
     equations do not hold; a tilt of the last hinge, to others at which they do not."""

@@ -227,7 +227,8 @@ def test_a_beam_that_is_bent_by_three_radians_at_once(thickness):
     np.testing.assert_allclose(found.body("beam.8").position[1], end, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("points", some_quick([2, 4]))
+@pytest.mark.slow  # an assembled column of rods
+@pytest.mark.parametrize("points", [2, 4])
 def test_a_column_does_not_jump_to_a_branch_that_is_unstable(points):
     """At three times Euler's load, with 2 % of E I aside; against the elastica of a cantilever."""
     length, bending = 1.0, 4.0

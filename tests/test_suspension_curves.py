@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import close, some_quick
+from helpers import close
 from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
@@ -137,7 +137,8 @@ def test_rates_agree_with_differences_of_the_closure(curves):
         np.testing.assert_allclose(curves.roll_centre_height[i], y * rate[3] / rate[4], rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("modes", some_quick([[jax.jacrev], [jax.jacfwd, jax.jacrev]]))
+@pytest.mark.slow  # `test_kinematics` has gradients of a closed solution in the quick run
+@pytest.mark.parametrize("modes", [[jax.jacrev], [jax.jacfwd, jax.jacrev]])
 def test_gradients_agree_with_differences_of_the_closure(car, modes):
     """Each of the 15 coordinates of the hardpoints on the chassis, both modes."""
     travel = jnp.asarray(TRAVEL[[2, 11]])

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import on_a_cpu, says
+from helpers import on_a_cpu, says, some_quick
 from sweep_job import BATCH, COUNT, designs, psi
 
 import lgsens as lg
@@ -203,7 +203,7 @@ def test_trajectories_say_whether_they_succeeded():
     assert found.values.states.v.shape == (4, 4, 2)
 
 
-@pytest.mark.parametrize("save", [None, lambda s: s.body("top").position[2]], ids=["trajectory", "saved"])
+@pytest.mark.parametrize("save", some_quick([None, lambda s: s.body("top").position[2]]), ids=["trajectory", "saved"])
 def test_what_was_not_looked_at_in_a_run_is_no_failure(save):
     """Modified Newton makes no matrix in most steps, and knows no margin there."""
     run = lambda angle: lg.simulate(spinning_top(angle), t1=0.02, num_steps=10, save=save)

@@ -90,7 +90,7 @@ WRONG_CONSTRAINTS = {
 }
 
 
-@pytest.mark.parametrize("mistake", some_quick(WRONG_CONSTRAINTS, 2))
+@pytest.mark.parametrize("mistake", some_quick(WRONG_CONSTRAINTS))
 def test_wrong_rule_of_a_constraint(mistake):
     kind, methods, names, note = WRONG_CONSTRAINTS[mistake]
     report = check_joint(wrong(kind, **methods)(**{f: jnp.asarray(x) for f, x in NUMBERS[kind].items()}))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from differences import central
 from driven_pendulum import P, make
-from helpers import says, some_quick
+from helpers import says
 
 import lgsens as lg
 from lgsens.examples import PROBLEMS, spinning_top
@@ -114,7 +114,8 @@ def test_derivatives_on_a_given_grid():
         np.testing.assert_allclose(jnp.sum(forward[i] * direction), central(shifted, 1e-3), rtol=1e-7)
 
 
-@pytest.mark.parametrize("mode", some_quick(["reverse", "forward"]))
+@pytest.mark.slow  # two derivatives
+@pytest.mark.parametrize("mode", ["reverse", "forward"])
 def test_fixed_fractions_are_constants(mode):
     """Nothing but the derivative by them is left out: an uneven grid, whose ratios are not 1 in two steps of twelve."""
     sizes = jnp.array([1.0] * 5 + [2.0] * 4 + [0.5] * 3)

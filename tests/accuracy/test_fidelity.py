@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import some_quick
 from oscillator import CRITERION, T1, V
 
 import lgsens as lg
@@ -84,7 +83,8 @@ def test_what_does_not_matter_is_told_and_left_out_first(found):
     assert "the rich scene: Ψ" in str(found) and len(str(found).splitlines()) == 6
 
 
-@pytest.mark.parametrize("lean", some_quick([2.0, 0.5]))
+@pytest.mark.slow  # two more programs
+@pytest.mark.parametrize("lean", [2.0, 0.5])
 def test_the_fastest_in_fact_may_be_the_rich_scene(found, monkeypatch, lean):
     """Both are run; times are given, as a test knows none."""
     seconds = lambda programs, rounds: {options: (lean if options else 1.0, 0.0) for options in programs}

@@ -173,6 +173,7 @@ def test_curves_over_anything_but_time_have_none():
         assert breaks_of(scene).size == 0
 
 
+@pytest.mark.slow  # four programs
 def test_extrapolation_has_its_order_at_edges():
     """Errors of h⁴, where equal steps have the kinks inside of them."""
     of = lambda kind, n: abs(float(end(lg.Richardson(kind), n)[0]) - END)
@@ -188,6 +189,7 @@ def test_the_finer_run_is_in_the_halves_of_the_steps_of_the_other():
     np.testing.assert_allclose(given, value, rtol=1e-12)
 
 
+@pytest.mark.slow  # `test_richardson` has those of equal steps
 def test_integrals_of_extrapolated_runs_have_it_too():
     criterion = lg.Criterion(integrand=lambda s, p: s.body("mass").acceleration[2] ** 2)  # has a kink at each edge
     errors = [abs(float(criterion(end(lg.Richardson(lg.AlignedSteps()), n)[1]) / SQUARES - 1.0)) for n in (100, 200)]

@@ -66,6 +66,7 @@ def test_a_ramp_may_begin_at_t0():
     assert off[~within].max() < 1.5e-2  # first order: 0.2
 
 
+@pytest.mark.slow  # equal and aligned steps are in the quick run
 def test_error_control_sees_it():
     off, _ = errors("ramp", "adaptive", 400)
     assert off.max() < 3e-3  # tolerance^(2/3) = 1e-4, times what s⁗ T² is of s̈, 30; first order: 0.1
@@ -141,9 +142,8 @@ GIVEN = lg.GivenSteps(1.0 + 0.3 * np.sin(np.arange(24.0)))
 GRIDS = SCHEMES | {"given": GIVEN, "extrapolated": EXTRAPOLATED}
 
 
-@pytest.mark.parametrize(
-    "name", ["equal", *(pytest.param(name, marks=pytest.mark.slow) for name in GRIDS if name != "equal")]
-)
+@pytest.mark.slow  # `test_moving_steps` has derivatives by such times in the quick run
+@pytest.mark.parametrize("name", GRIDS)
 def test_derivatives_through_it_are_exact(name):
     """Where breaks lie inside of steps by times of ramp and run, too; where steps end at them, by what moves none."""
     integrator, n = GRIDS[name], 400 if name == "adaptive" else 24

@@ -228,6 +228,7 @@ def pushed(signal) -> lg.Model:
     return lg.Model({"mass": lg.RigidBody(2.0, None, free="z")}, {}, {"push": push})
 
 
+@pytest.mark.slow  # steps that move are in the quick run
 def test_none_move_where_there_are_too_few_for_all_pieces():
     """Equal steps end at breaks by chance only; derivatives are those of what is computed."""
     signal = lambda at: lg.Sampled(jnp.linspace(0.0, 0.9, 11) + at, jnp.zeros(11))
@@ -243,6 +244,7 @@ def of_peak(at, integrator):
     return lg.Criterion(integrand=lambda s, p: s.body("mass").acceleration[2] ** 2)(run)
 
 
+@pytest.mark.slow  # three programs
 def test_pieces_of_equal_steps_are_two_in_the_rule_of_fourth_order():
     """∫ a² dt of a force that rises to 5 N and falls to −1 N, linearly: of quadratic pieces, without an error."""
     exact = lambda at: (25.0 * at + (1.0 - at) * (25.0 - 5.0 + 1.0)) / 3.0 / 2.0**2

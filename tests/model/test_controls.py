@@ -270,6 +270,7 @@ def test_summary_and_bad_input():
         lg.kinematics(driven, {"turn": [0.0]})
 
 
+@pytest.mark.slow  # others of controls are in the quick run
 def test_along_a_rod_forces_and_errors_are_those_of_its_length():
     """A mass of 1 kg a metre from the foot of a rod, pushed by 2 N for a second to a distance of 2 m; and what holds it
     half a metre farther: the force is K e, e the difference of lengths, wherever it is."""

@@ -104,6 +104,7 @@ def test_equilibrium_winds_it_up(moment):
     np.testing.assert_allclose(run.states_of("spring")["angle"], angle, rtol=1e-12)
 
 
+@pytest.mark.slow  # positions that do not tell it are in the quick run
 def test_a_spring_that_passes_half_a_turn_has_failed():
     """ω₀ sin(ωt)/ω comes to π at 0.3 s of 1: later on the spring would push where it pulled."""
     rate, start = np.sqrt(STIFFNESS / INERTIA), 13.0

@@ -45,6 +45,7 @@ def all_states():
     return jax.jit(jax.value_and_grad(lambda p: psi(p, DIRECT())))(PARAMETERS)
 
 
+@pytest.mark.slow  # segments are those of the long run, below
 @pytest.mark.parametrize(
     "method",
     [pytest.param(DIRECT(checkpoints="sqrt"), marks=pytest.mark.slow), ADJOINT(checkpoints=2)],

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import random_like, some_quick
+from helpers import random_like
 
 import lgsens as lg
 from lgsens.dynamics import initial_state
@@ -31,9 +31,8 @@ def problem(scheme):
     return scheme.complete(system, initial_state(system, t0).state), parameters
 
 
-@pytest.mark.parametrize(
-    "scheme", some_quick([lg.GeneralizedAlpha(0.9), lg.GeneralizedAlpha(0.9, stabilized=True), lg.RadauIIA()])
-)
+@pytest.mark.slow  # four sweeps; certificates in the quick run are made of them
+@pytest.mark.parametrize("scheme", [lg.GeneralizedAlpha(0.9), lg.GeneralizedAlpha(0.9, stabilized=True), lg.RadauIIA()])
 def test_both_modes_are_those_of_the_trajectory(scheme):
     """Against JAX's derivatives of `DirectDifferentiation`, which linearize in blocks."""
     state0, parameters = problem(scheme)

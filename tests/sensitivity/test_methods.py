@@ -221,6 +221,7 @@ def off_by_times(num_steps):
     return np.abs(of(lg.ContinuousDirect()) - exact).max(axis=0) / np.abs(exact).max(axis=0)
 
 
+@pytest.mark.slow  # two derivatives of the top
 def test_continuous_direct_by_the_times_of_steps():
     """A state moves with its time, and the top's bracket ad(v) is not zero."""
     assert np.all(off_by_times(200) < 3e-4)  # some (ωh)²/12 with h = 2.5 ms and the spin of 10 to 20 rad/s, 2e-4
