@@ -1,5 +1,6 @@
 """The index-reduced equations as an integrator: order, derivatives, drift, error control, failures, bad input."""
 
+import dataclasses
 import functools
 import json
 from pathlib import Path
@@ -10,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import EPS, close, equations, everything, random_point, says
+from helpers import EPS, close, equations, everything, random_point, says, some_quick
 from jaxtyping import Array, Float
 
 import lgsens as lg
@@ -25,16 +26,17 @@ def load(name):
     return json.loads((Path(__file__).parent / "data" / f"{name}.json").read_text())
 
 
-def test_hand_derived_rule_on_every_joint_and_force():
+@pytest.mark.parametrize("blocks", some_quick([False, True]))
+def test_hand_derived_rule_on_every_joint_and_force(blocks):
     """Value, derivative and transpose against JAX's derivative of the plain solve, in every number, q, v and t.
 
     Condition of the solve: 1e4 or so, by the random bodies; both methods have its round-off.
     """
-    system = everything().system()
+    system = dataclasses.replace(everything().system(), linear_solver=lg.BlockSparse())
     rng = np.random.default_rng(3)
     q, v, _, _, t = random_point(system, rng)
     z = (system, q, v, t)
-    by_hand = lambda *z: factorized_accelerations(Inertia.of(z[0]), *z)
+    by_hand = lambda *z: factorized_accelerations(None if blocks else Inertia.of(z[0]), *z)
     random_like = lambda tree: jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), tree)
     dz = random_like(z)
     # tangents in the tangent space, as all that a simulation meets

@@ -1,11 +1,14 @@
 """Constrained dynamics on any Lie group (paper, §3)."""
 
 from lgsens.dynamics._accelerations import (
-    ConstrainedInertia as ConstrainedInertia,
     Inertia as Inertia,
     constrained as constrained,
     equations_of_motion as equations_of_motion,
     factorized_accelerations as factorized_accelerations,
+    own_parts as own_parts,
+    shared_inertia as shared_inertia,
+    solves_in_blocks as solves_in_blocks,
+    with_shared as with_shared,
 )
 from lgsens.dynamics._breaks import (
     AbstractTimeFunction as AbstractTimeFunction,
@@ -46,6 +49,7 @@ from lgsens.dynamics._matrices import (
     factor_size as factor_size,
     factorized as factorized,
     in_blocks as in_blocks,
+    kkt_product as kkt_product,
     kkt_solve as kkt_solve,
     mass_matrix as mass_matrix,
     mass_scale as mass_scale,

@@ -17,7 +17,8 @@ M is constant. With N = M⁻¹, made once outside the time loop, and the Cholesk
 
 m³/3 instead of 2 (k + m)³/3 operations: an eighteenth on the quarter-car (k = 48, m = 45). S is scaled to a unit
 diagonal, since the rows of J have different units. Where constraints may be redundant, ε is added to it, and the
-solution refined (`_redundant`).
+solution refined (`_redundant`). On long chains blocks of A on the graph of bodies and joints take less time than S,
+which a chain fills (`solves_in_blocks`): a third in steps and gradients of one of 64 links.
 """
 
 from typing import Any
@@ -30,10 +31,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics._constraints import constraint_acceleration, fixed_velocity_rate, full_jacobian
-from lgsens.dynamics._matrices import ConstrainedMass, kkt_product, require_linear
+from lgsens.dynamics._matrices import ConstrainedMass, in_blocks, kkt_product, require_linear
 from lgsens.dynamics._redundant import SOFTNESS, refined, softness
 from lgsens.dynamics._system import AbstractSparseSystem, AbstractSystem
-from lgsens.linear import LinearEquations, linear_solve
+from lgsens.linear import Graph, LinearEquations, linear_solve, tuned
 
 
 class Inertia(eqx.Module):
@@ -46,7 +47,6 @@ class Inertia(eqx.Module):
 
     @classmethod
     def of(cls, system: AbstractSystem) -> "Inertia":
-        require_linear(system, "Integration of the index-reduced equations")
         mass = system.mass_matrix()
         # N serves to solve only, and needs no derivative: that of the solution comes from M.
         fixed = lax.stop_gradient(mass)
@@ -110,9 +110,39 @@ def equations_of_motion(system: AbstractSystem, q, v, vdot, lam, t):
     return system.residual(q, v, vdot, lam, t), constraint_acceleration(system, q, v, vdot, t)
 
 
+def _of_complement(graph: Graph) -> tuple[Graph, float]:
+    """The unknowns of A, and half of how long S takes: else not worth up to a half more to compile."""
+    return graph, 0.5 * tuned.complement(*graph.sizes)
+
+
+def solves_in_blocks(system: AbstractSystem) -> bool:
+    """Whether blocks of A are estimated to take half the time of S."""
+    sparse = in_blocks(system)
+    return sparse is not None and sparse.arranged(_of_complement) is not None
+
+
+def shared_inertia(system: AbstractSystem) -> Inertia | None:
+    """What all factorizations of a run share; None: they are in blocks.
+
+    Raises `ValueError` where forces depend on multipliers.
+    """
+    require_linear(system, "Integration of the index-reduced equations")
+    return None if solves_in_blocks(system) else Inertia.of(system)
+
+
 def constrained(inertia: Inertia | None, system: AbstractSystem, q, t) -> ConstrainedInertia | ConstrainedMass:
     """A at one configuration, factorized; `inertia` None: in blocks."""
     return ConstrainedMass.in_steps(system, q, t) if inertia is None else ConstrainedInertia.of(inertia, system, q, t)
+
+
+def own_parts(kkt: ConstrainedInertia | ConstrainedMass) -> Any:
+    """What A does not share with those at other configurations."""
+    return kkt if isinstance(kkt, ConstrainedMass) else (kkt.jacobian, kkt.factor, kkt.scale)
+
+
+def with_shared(inertia: Inertia | None, own: Any) -> ConstrainedInertia | ConstrainedMass:
+    """A, of its parts."""
+    return own if inertia is None else ConstrainedInertia(inertia, *own)
 
 
 def _solved(inertia: Inertia | None, system: AbstractSystem, q, v, t):

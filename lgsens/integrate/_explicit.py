@@ -48,12 +48,15 @@ from lgsens._validate import as_count, require_setting
 from lgsens._xla import scan
 from lgsens.dynamics import (
     RESULTS,
-    ConstrainedInertia,
-    Inertia,
     State,
+    constrained,
     constraint_velocity,
     equations_of_motion,
+    factor_size,
     factorized_accelerations,
+    own_parts,
+    shared_inertia,
+    solves_in_blocks,
 )
 from lgsens.integrate._explicit_step import ExplicitLinearizedStep, Inner, corrections, ended
 from lgsens.integrate._grid import Start
@@ -185,7 +188,7 @@ class IndexReducedODE(AbstractScheme):
     def resumed(self, system, given, t0):
         """Accelerations are those of (q, v): a state of another scheme has them with its own error."""
         q, v = given.state.q, given.state.v
-        vdot, lam = factorized_accelerations(Inertia.of(system), system, q, v, t0)
+        vdot, lam = factorized_accelerations(shared_inertia(system), system, q, v, t0)
         return Start(self.complete(system, State(q, v, vdot, lam, vdot)))
 
     def complete(self, system, state):
@@ -224,7 +227,7 @@ class IndexReducedODE(AbstractScheme):
     # The step, and its equations.
 
     def shared(self, system):
-        return Inertia.of(system)
+        return shared_inertia(system)
 
     def take(self, system, shared, before, begun, memory, node, running):
         group, h = system.group, node.h
@@ -281,7 +284,8 @@ class IndexReducedODE(AbstractScheme):
 
     def numbers(self, system):
         k, m = system.group.dim, len(system.constraint_names)
-        return (len(self.coefficients.b) + 1) * (m * (k + m) + 16 * k)
+        factors = factor_size(system) if solves_in_blocks(system) else m * (k + m)
+        return (len(self.coefficients.b) + 1) * (factors + 16 * k)
 
     def linearized(self, system, shared, node, previous, state):
         group, found = system.group, state.inner
@@ -292,10 +296,6 @@ class IndexReducedODE(AbstractScheme):
         def motion(t, q, v, vdot, lam):
             return jax.linearize(lambda q, v: equations_of_motion(system, q, v, vdot, lam, t), q, v)[1]
 
-        def factors(t, q):
-            kkt = ConstrainedInertia.of(shared, system, q, t)
-            return kkt.jacobian, kkt.factor, kkt.scale
-
         def kinematics(x, v):
             function = lambda q, x, v: (group.retract(q, x), group.tangent_inv_mv(x, v))
             return jax.linearize(function, previous.q, x, v)[1]
@@ -305,7 +305,9 @@ class IndexReducedODE(AbstractScheme):
             group=group,
             begun=previous.q,
             end=state.q,
-            factors=jax.vmap(factors)(with_last(times, node.t), with_last(points[0], q)),
+            factors=jax.vmap(lambda t, q: own_parts(constrained(shared, system, q, t)))(
+                with_last(times, node.t), with_last(points[0], q)
+            ),
             motion=jax.vmap(motion)(times, *points),
             kinematics=jax.vmap(kinematics)(found.x, found.v),
             to_end=jax.linearize(group.retract, previous.q, x)[1],

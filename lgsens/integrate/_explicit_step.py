@@ -11,12 +11,15 @@ from jaxtyping import Array, Float
 from lgsens._xla import scan
 from lgsens.dynamics import (
     AbstractSystem,
-    ConstrainedInertia,
     Inertia,
     State,
+    constrained,
+    constraint_jacobian,
     constraint_velocity,
     factorized_accelerations,
-    full_jacobian,
+    kkt_product,
+    mass_matrix,
+    with_shared,
 )
 from lgsens.integrate._linearized import AbstractLinearizedStep, Variation
 from lgsens.liegroups import AbstractLieGroup
@@ -41,11 +44,11 @@ def drift(system: AbstractSystem, q, t) -> Float[Array, " m"]:
     return jnp.concatenate([violation, jnp.zeros(system.num_velocity_rows, violation.dtype)])
 
 
-def ended(inertia: Inertia, system: AbstractSystem, q, u, t):
+def ended(inertia: Inertia | None, system: AbstractSystem, q, u, t):
     """The state at the end of a step, y, μ, d and ν that lead there from q* and u, and max |Φ| before."""
     found, projected = (jnp.zeros_like(u), u[:0]) * 2, q
     if system.constraint_names:
-        kkt = ConstrainedInertia.of(inertia, system, q, t)
+        kkt = constrained(inertia, system, q, t)
         position = kkt.solve(found[0], -drift(system, q, t))
         projected = system.group.retract(q, position[0])
         found = *position, *kkt.solve(found[0], -constraint_velocity(system, projected, u, t))
@@ -57,9 +60,8 @@ def ended(inertia: Inertia, system: AbstractSystem, q, u, t):
 
 def corrections(system: AbstractSystem, q, t, found: Inner, projected, u):
     """P and R, each in two rows. (With M and B at hand; their products as derivatives of r and c compile longer.)"""
-    mass, jacobian = system.mass_matrix(), full_jacobian(system, q, t)
-    product = lambda x, mu: (mass @ x + mu @ jacobian, jacobian @ x)
-    (force, rate), (impulse, jump) = product(found.y, found.mu), product(found.d, found.nu)
+    matrices = mass_matrix(system), constraint_jacobian(system, q, t)
+    (force, rate), (impulse, jump) = (kkt_product(*matrices, *of) for of in ((found.y, found.mu), (found.d, found.nu)))
     velocity = constraint_velocity(system, projected, u, t)
     return (force, rate + drift(system, q, t)), (impulse, jump + velocity)
 
@@ -87,7 +89,7 @@ class ExplicitLinearizedStep(AbstractLinearizedStep):
         at = lambda tree, which: jax.tree.map(lambda leaf: leaf[which], tree)
 
         def solve(factors, rows, change):
-            return ConstrainedInertia(shared, *factors).solve(*map(jnp.subtract, rows, change))
+            return with_shared(shared, factors).solve(*map(jnp.subtract, rows, change))
 
         def stage(slopes, inputs):
             i, weights, (x, v, *rows), factors, motion, kinematics = inputs

@@ -57,7 +57,6 @@ from lgsens._validate import as_count, require_setting
 from lgsens.dynamics import (
     RESULTS,
     AbstractSystem,
-    ConstrainedInertia,
     Inertia,
     State,
     constrained,
@@ -65,8 +64,10 @@ from lgsens.dynamics import (
     factor_size,
     factorized_accelerations,
     finite,
+    own_parts,
     require_independent,
     require_linear,
+    with_shared,
 )
 from lgsens.integrate._grid import Start
 from lgsens.integrate._linearized import AbstractLinearizedStep, Node, Variation
@@ -237,11 +238,10 @@ class RadauLinearizedStep(AbstractLinearizedStep):
     @classmethod
     def of(cls, shared: Shared, node: Node, previous: State, state: State) -> "RadauLinearizedStep":
         system, q, v, t = shared.system, state.q, state.v, node.t
-        kkt: Any = constrained(shared.inertia, system, q, t)
         motion = lambda q, v: equations_of_motion(system, q, v, state.vdot, state.lam, t)
         return cls(
             stages=stage_factors(system, node, previous, state.inner),
-            factors=kkt if shared.inertia is None else (kkt.jacobian, kkt.factor, kkt.scale),
+            factors=own_parts(constrained(shared.inertia, system, q, t)),
             end=q,
             motion=jax.linearize(motion, q, v)[1],
         )
@@ -252,7 +252,6 @@ class RadauLinearizedStep(AbstractLinearizedStep):
         inner = self.stages.exactly(node.h, known)
         w, v = map(jnp.add, self.stages.end(node.h, previous.w, previous.v, inner), (row.w, row.v))
         force, rate = self.motion(shared.system.group.to_ambient(self.end, w), v)
-        blocks = shared.inertia is None
-        kkt = self.factors if blocks else ConstrainedInertia(shared.inertia, *self.factors)
+        kkt = with_shared(shared.inertia, self.factors)
         vdot, lam = kkt.solve(row.vdot - force, row.lam - rate)
         return Variation(w, v, vdot, lam, vdot + row.a, inner)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens._xla import scan
-from lgsens.dynamics import AbstractSystem, Inertia, State, factorized_accelerations
+from lgsens.dynamics import AbstractSystem, Inertia, State, factorized_accelerations, shared_inertia
 from lgsens.integrate import EqualGrid, IndexReducedODE, PieceEnds, Stats, ended, with_first
 
 
@@ -27,7 +27,7 @@ class _Local(NamedTuple):
 class _Problem(eqx.Module):
     """What all steps share."""
 
-    inertia: Inertia
+    inertia: Inertia | None
     system: AbstractSystem
 
     def rate(self, q, local: _Local, t) -> _Local:
@@ -70,7 +70,7 @@ def integrate_ode(settings: IndexReducedODE, system: AbstractSystem, grid: Equal
 
     An interval that fails ends the simulation: its end and all after it are NaN, and `Stats` says so.
     """
-    problem, t0, h = _Problem(Inertia.of(system), system), grid.t0, grid.h
+    problem, t0, h = _Problem(shared_inertia(system), system), grid.t0, grid.h
 
     def interval(problem: _Problem, begin: State, n, running):
         local, finished, steps = _adaptive(settings, problem, begin.q, begin.v, t0 + n * h, h, running)
