@@ -60,3 +60,20 @@ def motion(orientation, omega, times):
     start = np.concatenate([np.zeros(3), np.ravel(orientation), omega])
     y = solve_ivp(rate, (times[0], times[-1]), start, method="DOP853", t_eval=times, rtol=1e-12, atol=1e-13).y.T
     return y[:, :3], y[:, 3:12].reshape(-1, 3, 3), y[:, 12:]
+
+
+def turned(tilt):
+    """The orientation of `scene`."""
+    c, s = np.cos(tilt), np.sin(tilt)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+def flow(y):
+    """Rates of the tilt and of ω in axes that head where the disc does, x forward, z up."""
+    tilt, omega = y[0], y[1:]
+    orientation = turned(tilt)
+    axle = orientation[:, 1]
+    change, level = np.cross(omega, axle), axle * (1.0 - N)
+    heading = N @ np.cross(level, change) / (level @ level)
+    _, turning, _ = accelerations(orientation, omega)
+    return np.concatenate([[N @ change / np.cos(tilt)], turning - heading * np.cross(N, omega)])

@@ -91,3 +91,45 @@ def test_the_scheme_that_may_be_unstable_warns():
     with pytest.warns(UserWarning, match="several bodies may be unstable.*stabilized=True"):
         simulated(lg.GeneralizedAlpha())
     simulated(lg.GeneralizedAlpha(stabilized=True))  # warnings are errors here
+
+
+@pytest.mark.slow
+def test_small_motions_are_those_of_the_benchmark():
+    """Its eigenvalues, and their derivatives by the speed; else λ = 0: place, heading and wheels, and the speed."""
+
+    @jax.jit
+    def found(speed):
+        model = bicycle(speed, 0.0 * speed)
+        return lg.linearize(model, lg.initial_state(model), throw=False).eigenvalues[6:]
+
+    def expected(speed):
+        unit, zero = np.eye(2), np.zeros((2, 2))
+        stiffness, damping = np.linalg.solve(M, G * K0 + speed**2 * K2), np.linalg.solve(M, speed * C1)
+        values = np.linalg.eigvals(np.block([[zero, unit], [-stiffness, -damping]]))
+        return values[np.lexsort((-values.imag, np.abs(values).round(6)))]
+
+    for speed in (5.0, 7.0):
+        np.testing.assert_allclose(found(speed), expected(speed), rtol=1e-9)  # matrices of 14 digits
+    change = (expected(5.0 + 1e-4) - expected(5.0 - 1e-4)) / 2e-4
+    np.testing.assert_allclose(jax.jacfwd(found)(5.0), change, rtol=1e-6)  # those beside pairs of zeros: √ε, `repeated`
+
+
+@pytest.mark.slow
+def test_what_is_steered_leans():
+    """To a driver at the head, with rates and accelerations of it, as the first row of the benchmark says."""
+    speed, frequencies = 5.0, np.array([0.1, 0.5, 1.0, 3.0])
+    model = bicycle(speed, 0.0)
+    upwards = np.array([-np.sin(TILT), 0.0, np.cos(TILT)])
+    driver = lg.RotationDriver("frame", "fork", axis=-upwards)
+    model = lg.Model(model.bodies, model.joints | {"steering": driver}, model.forces)
+    lean = lambda s: jnp.arctan2(s.body("frame").orientation[2, 1], s.body("frame").orientation[2, 2])
+    moment = lambda s: s.joint("steering").axial_moment
+    small = lg.linearize(
+        model, lg.initial_state(model), inputs=["steering"], outputs={"lean": lean, "moment": moment}
+    ).frequency_response(frequencies)
+    s = 2j * np.pi * frequencies[:, None, None]
+    dynamic = M * s**2 + speed * C1 * s + G * K0 + speed**2 * K2
+    leans = -dynamic[:, 0, 1] / dynamic[:, 0, 0]
+    np.testing.assert_allclose(small[:, 0, 0], leans, rtol=1e-9)
+    steers = dynamic[:, 1, 0] * leans + dynamic[:, 1, 1]
+    np.testing.assert_allclose(small[:, 1, 0], steers, rtol=1e-9)

@@ -10,6 +10,7 @@ import pytest
 import rolling_disc
 from helpers import some_quick
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 import lgsens as lg
 from lgsens.dynamics import constraint_velocity
@@ -217,3 +218,83 @@ def test_two_bodies_on_a_link_of_given_length():
     difference = [(compiled(p + h * e, 10) - compiled(p - h * e, 10)) / (2 * h) for e in np.eye(3)]
     # h² of third derivatives, w³ times the tension
     np.testing.assert_allclose(forward, np.stack(difference, axis=1), rtol=1e-4, atol=1e-5 * np.abs(forward).max())
+
+
+# Small motions.
+
+A, C = rolling_disc.MOMENTS[:2]
+WEIGHT = rolling_disc.MASS * 9.81 * rolling_disc.RADIUS
+WITH_CONTACT = rolling_disc.MASS * rolling_disc.RADIUS**2  # of moments about the contact
+
+
+def others(values, expected):
+    """The eigenvalues without `expected`, which are among them to 1e-9: 1e-16 × condition, √ε of those of zeros."""
+    left = list(np.asarray(values))
+    for value in expected:
+        left.remove(min(left, key=lambda other: abs(other - value)))
+    found = np.setdiff1d(np.asarray(values), left)
+    np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(expected), atol=1e-9 * np.abs(values).max())
+    return np.array(left)
+
+
+def test_small_motions_of_a_disc_that_rolls_straight():
+    """(A + m ρ²) λ² = m g ρ − C (C + m ρ²) Ω²/A: it falls where it is slow (Neimark & Fufaev, ch. 2). Else λ = 0, of
+    places, of headings with their rates, and of the speed."""
+
+    @jax.jit
+    @jax.vmap
+    def found(spin):
+        model = rolling_disc.scene(0.0 * spin, spin * jnp.array([0.0, 1.0, 0.0]))
+        start = lg.initial_state(model)
+        return start.v[4], lg.linearize(model, start, throw=False).eigenvalues
+
+    spins, values = found(jnp.array([6.0, 30.0]))
+    squares = (WEIGHT - C * (C + WITH_CONTACT) * np.asarray(spins) ** 2 / A) / (A + WITH_CONTACT)
+    assert squares[0] > 0.0 > squares[1]
+    for square, own in zip(squares, values):
+        root = np.sqrt(complex(square))
+        left = others(own, [root, -root])
+        assert left.shape == (6,) and np.abs(left).max() < 1e-6  # √ε of a pair that shares a vector
+
+
+def test_small_motions_about_an_equilibrium_of_a_disc():
+    """On a spring to the axle that rolls with m + C/ρ², and upright as on a pin."""
+    spring = lg.SpringDamper(
+        *(None, "disc"), at_a=(-1.0, 0, 0.3), at_b=(0, 0, 0.3), stiffness=200.0, damping=3.0, free_length=1.0
+    )
+    model = rolling_disc.scene(jnp.asarray(0.0), jnp.zeros(3))
+    model = lg.Model(model.bodies, model.joints, model.forces | {"spring": spring})
+    rolls = np.roots([rolling_disc.MASS + C / rolling_disc.RADIUS**2, 3.0, 200.0])
+    falls = np.sqrt(WEIGHT / (A + WITH_CONTACT))
+    assert not others(lg.linearize(model).eigenvalues, [*rolls, falls, -falls]).any()
+
+
+@pytest.mark.slow
+def test_small_motions_of_a_disc_that_rolls_in_a_circle():
+    """Beside its equations without multipliers in four coordinates, of which a steady motion has two parameters."""
+    tilt, rate = 0.3, 1.5
+
+    def steady(spin):  # both turn about the vertical
+        omega = rate * rolling_disc.N + spin * rolling_disc.turned(tilt)[:, 1]
+        return rolling_disc.flow(np.array([tilt, *omega]))
+
+    spin = brentq(lambda spin: steady(spin)[1], -40.0, -1.0, xtol=1e-14)
+    at = np.array([tilt, *(rate * rolling_disc.N + spin * rolling_disc.turned(tilt)[:, 1])])
+    assert np.abs(rolling_disc.flow(at)).max() < 1e-12
+    step = 1e-4  # differences of fourth order: 1e-16 of derivatives, EPS/step = 2e-12
+    columns = []
+    for unit in np.eye(4):
+        some = [rolling_disc.flow(at + k * step * unit) for k in (-2, -1, 1, 2)]
+        columns.append((np.array([1.0, -8.0, 8.0, -1.0]) / 12.0 / step) @ some)
+    by_hand = np.linalg.eigvals(np.stack(columns, axis=1))
+    pair = by_hand[np.abs(by_hand) > 1e-3]
+    assert pair.shape == (2,)
+    model = rolling_disc.scene(jnp.asarray(tilt), rolling_disc.turned(tilt).T @ at[1:])
+    start = lg.initial_state(model)
+    velocity = -np.cross(at[1:], rolling_disc.contact(rolling_disc.turned(tilt), at[1:])[0])
+    start = eqx.tree_at(lambda state: state.v, start, jnp.concatenate([velocity, rolling_disc.turned(tilt).T @ at[1:]]))
+    found = lg.linearize(model, start, rotation=(0.0, 0.0, rate))
+    left = others(found.eigenvalues, [*pair, 1j * rate, -1j * rate])  # a place in axes that turn
+    assert np.abs(left).max() < 1e-6
+    with pytest.raises(ValueError, match="not steady"):
+        lg.linearize(model, start)

@@ -12,7 +12,7 @@ from lgsens._brief import brief, listed, roster, shown
 from lgsens._validate import as_count, as_float
 from lgsens.analysis._eigen import eigen, near, scaled
 from lgsens.analysis._inputs import check_inputs, with_inputs
-from lgsens.analysis._second_order import StateSpace, null_space, state_space
+from lgsens.analysis._second_order import Bases, StateSpace, state_space
 from lgsens.analysis._steady import accelerates_steadily, later, turning_axes
 from lgsens.dynamics import (
     RESULTS,
@@ -54,8 +54,9 @@ class Linearization(eqx.Module):
 
         ẏ = A y + B u,     δf = C y + D u + D_1 u̇ + D_2 ü
 
-    x are coordinates of the displacement, w = `basis` x with kinetic energy |ẋ|²/2, ν = ẋ but for a multiple of u, the
-    states of elements last.
+    x are coordinates of the displacement, w = `basis` x with kinetic energy |ẋ|²/2, ν = ẋ, each but for a multiple of
+    u, the states of elements last. Where wheels roll (`Rolling`), ν are fewer: coordinates of the velocities that these
+    allow. What nothing depends on, where a bicycle is, where it heads and how its wheels are turned, is λ = 0.
 
     Attributes:
         A, B, C, D: the matrices, shapes (n, n), (n, p), (o, n), (o, p).
@@ -192,8 +193,7 @@ def linearize(
         M_r ẍ + C_r ẋ + K_r x + F_0 u + F_1 u̇ = 0,     w = Z x + S u,  J Z = 0,  Zᵀ M Z = I
 
     Arguments:
-        model: the scene, or an `AbstractSystem`. Without redundant equations (`Model(redundant="remove")`), and
-            without joints that constrain velocities.
+        model: the scene, or an `AbstractSystem`. Without redundant equations (`Model(redundant="remove")`).
         state: q and v of a steady motion, `initial_state(model)` say; v̇ and λ are those of the motion through it. None:
             the `equilibrium` near the reference configuration.
         inputs: names of joints and forces with a signal or a prescribed number: the displacement or angle of a driver,
@@ -208,9 +208,9 @@ def linearize(
 
     Returns a `Linearization`, differentiable by every number of the model: matrices, eigenvalues, mode shapes,
     frequency responses. The matrices depend on Z, which is a smooth function of the numbers. Eigenvalues are computed
-    on a CPU only. Raises `ValueError` for names of inputs or outputs that do not fit, constraints that are redundant or
-    of velocities, a mechanism without freedom, and a motion that is not steady; `SimulationError` where no
-    equilibrium is found; inside `jit` the numbers are NaN. Sources: `_second_order`, `_steady`.
+    on a CPU only. Raises `ValueError` for names of inputs or outputs that do not fit, redundant constraints, a
+    mechanism without freedom, and a motion that is not steady; `SimulationError` where no equilibrium is found; inside
+    `jit` the numbers are NaN. Sources: `_second_order`, `_steady`.
     """
     system, t0 = as_system(model), as_float(t0, (), "`t0`")
     check_inputs(model, inputs)
@@ -219,11 +219,6 @@ def linearize(
         if not callable(function):
             raise ValueError(f"`outputs[{name!r}]` must be a function of an instant, got {function!r}.")
     require_independent(system, "`linearize`")
-    if system.num_velocity_rows:
-        rolling = sorted(set(system.constraint_names[-system.num_velocity_rows :]))
-        raise ValueError(
-            f"`model`: {rolling} constrain velocities only, which `linearize` cannot treat; leave them out."
-        )
     if system.group.dim - system.num_states <= len(system.constraint_names):
         raise ValueError(
             f"`model`: its joints have {len(system.constraint_names)} equations for "
@@ -250,22 +245,23 @@ def _linearize_jit(model, given: State | None, t0, rotation, names: tuple[str, .
         instant = Instant(t=t0, state=state, system=system)
         return jnp.stack([*(_scalar(name, f(instant), t0) for name, f in outputs), t0])[:-1]
 
-    at = lambda state, turning, basis: state_space(built, measured, len(names), state, t0, turning, basis)
+    at = lambda state, turning, bases: state_space(built, measured, len(names), state, t0, turning, bases)
     details: dict[str, Any] = {}
     if given is None:
         initial = equilibrium(system, t0)
         state, result, details = initial.state, initial.result, {"violation": initial.violation}
-        basis = null_space(system, full_jacobian(system, state.q, t0))
-        space = at(state, None, basis)
+        bases = Bases.of(system, state.q, t0)
+        space = at(state, None, bases)
         steady = accelerates_steadily(system, state, None, space.A)
     else:
         turning = turning_axes(system, given, rotation)
         q, v, turn = later(system, given, rotation, turning)
         twice = lambda now, then: jax.tree.map(lambda *leaves: jnp.stack(leaves), now, then)
-        (q, v), basis = twice((given.q, given.v), (q, v)), null_space(system, full_jacobian(system, given.q, t0))
+        (q, v), bases = twice((given.q, given.v), (q, v)), Bases.of(system, given.q, t0)
         vdot, lam = jax.vmap(lambda q, v: accelerations(system, q, v, t0))(q, v)
         states = State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
-        spaces = jax.vmap(lambda state, basis: at(state, turning, basis))(states, twice(basis, turn @ basis))
+        turned = jax.tree.map(lambda basis: turn @ basis, bases)
+        spaces = jax.vmap(lambda state, bases: at(state, turning, bases))(states, twice(bases, turned))
         (state, space), (_, again) = (jax.tree.map(lambda leaf, i=i: leaf[i], (states, spaces)) for i in (0, 1))
         result = jnp.where(system.is_valid() & finite(state), RESULTS.successful, RESULTS.invalid_numbers)
         steady = accelerates_steadily(system, state, turning, space.A) & _alike(space, again)
@@ -276,12 +272,11 @@ def _linearize_jit(model, given: State | None, t0, rotation, names: tuple[str, .
     usable = result == RESULTS.successful
     # LAPACK does not like NaN, and a failure is said all the same.
     values, vectors = eigen(jnp.where(usable, space.A, jnp.eye(space.A.shape[0], dtype=space.A.dtype)))
-    basis = basis[:, : basis.shape[1] - system.num_states]
     found = Linearization(
         *space,
-        basis=basis,
+        basis=bases.position,
         eigenvalues=values,
-        vectors=scaled(vectors, vectors[: basis.shape[1]]),
+        vectors=scaled(vectors, vectors[: bases.position.shape[1]]),
         repeated=jnp.sum(near(values), axis=1) > 1,
         state=state,
         t=t0,

@@ -27,15 +27,25 @@ J w + Φ_u u = 0 holds at all times with constant J, so w = Z x + S u as before,
 
 States z of elements are velocities of coordinates that nothing depends on: of these x is left out, ẋ = δz.
 
-First order. With ν = ẋ + F_1 u no derivative of an input drives the state y = [x; ν],
+Rolling. Let J = [B; A] with rows of velocities A v + b = 0 besides. Places keep w = Z x + S u, with B alone; rates do
+not fill Z. From δ(A v + b) = A (ẇ + N w) + D_q(A v + b) w = 0, and B ẇ = −Φ_u u̇,
 
-    ẏ = [0, I; −K_r, −C_r] y + [−F_1; C_r F_1 − F_0] u = A y + B u,
+    ẇ = Y ν + P,     J Y = 0,   Yᵀ M Y = I,     J P = −[Φ_u u̇; (A N + D_q(A v + b)) w],   Yᵀ M P = 0,
+
+and ẋ = Zᵀ M ẇ. ẅ = Y ν̇ + Ṗ, in which Ṗ has ẋ, u̇ and ü, and Yᵀ (a) has neither δλ nor Ṗ. Without rows of velocities
+Y = Z, P = S u̇, ẋ = ν, and this is what stands above.
+
+First order. ẏ of y = [x; ν] is A y + B_0 u + B_1 u̇. That of y − B_1 u, which is called [x; ν], has no derivative of an
+input,
+
+    ẏ = A y + (B_0 + A B_1) u,     without rolling A = [0, I; −K_r, −C_r],   B_1 = [0; −F_1],   B_0 = [0; −F_0],
 
 and an output δf(q, v, v̇, λ, u) is C y + D u + D_1 u̇ + D_2 ü, as δv̇ has S ü in it: what a driver prescribes has an
 acceleration. δλ solves Jᵀδλ = −(what is left of (a)).
 
 Source: Negrut & Ortiz, J. Comput. Nonlinear Dynam. 1 (2006) 230 (linearization of constrained equations); Géradin &
-Rixen, Mechanical Vibrations, §2 and §8 (gyroscopic systems).
+Rixen, Mechanical Vibrations, §2 and §8 (gyroscopic systems); Neimark & Fufaev, Dynamics of Nonholonomic Systems (1972),
+ch. 6 (small motions of what rolls).
 """
 
 from collections.abc import Callable
@@ -47,7 +57,7 @@ import jax.scipy.linalg as jsl
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import AbstractSystem, State, kkt_solve
+from lgsens.dynamics import AbstractSystem, State, full_jacobian, kkt_solve
 
 Built = Callable[[Float[Array, "p 3"]], AbstractSystem]  # the system, given u, u̇ and ü of its p inputs
 Outputs = Callable[[AbstractSystem, State], Float[Array, " o"]]
@@ -62,6 +72,20 @@ class StateSpace(NamedTuple):
     D: Float[Array, "o p"]
     D1: Float[Array, "o p"]
     D2: Float[Array, "o p"]
+
+
+class Bases(NamedTuple):
+    """Of displacements, and of velocities, states of elements last."""
+
+    position: Float[Array, "k f"]  # Z
+    velocity: Float[Array, "k g"]  # Y
+
+    @classmethod
+    def of(cls, system: AbstractSystem, q, t) -> "Bases":
+        jacobian, rows = full_jacobian(system, q, t), system.num_velocity_rows
+        velocity = null_space(system, jacobian)
+        places = null_space(system, jacobian[: jacobian.shape[0] - rows]) if rows else velocity
+        return cls(places[:, : places.shape[1] - system.num_states], velocity)
 
 
 def null_space(system: AbstractSystem, jacobian: Float[Array, "m k"]) -> Float[Array, "k f"]:
@@ -87,60 +111,65 @@ def null_space(system: AbstractSystem, jacobian: Float[Array, "m k"]) -> Float[A
 
 
 def state_space(
-    built: Built, outputs: Outputs, num_inputs: int, state: State, t, turning: Float[Array, "k k"] | None, basis
+    built: Built, outputs: Outputs, num_inputs: int, state: State, t, turning: Float[Array, "k k"] | None, bases: Bases
 ) -> StateSpace:
-    """The matrices at one state; `turning`: Γ, None at rest; `basis`: Z there."""
+    """The matrices at one state; `turning`: Γ, None at rest; `bases`: those there."""
     none = jnp.zeros((num_inputs, 3), state.v.dtype)
-    system = built(none)
-    k, n, p = state.v.shape[0], basis.shape[1], num_inputs
+    system, p = built(none), num_inputs
+    k, f, g = *bases.position.shape, bases.velocity.shape[1]
+    cuts = f, f + g, f + g + p, f + g + 2 * p  # of columns of x, ν, u, u̇, ü
     mass = system.mass_matrix()
     stiffness, damping, jacobian = system.tangents(state.q, state.v, state.vdot, state.lam, t)
     forces = jax.jacfwd(lambda u: built(u).residual(state.q, state.v, state.vdot, state.lam, t))(none)
     gaps = jax.jacfwd(lambda u: built(u).constraint(state.q, t))(none)[..., 0]
-    place, _ = kkt_solve(mass, jacobian, jnp.zeros((k, p), none.dtype), -gaps)  # S
+    holonomic = jacobian[: gaps.shape[0]]
+    place, _ = kkt_solve(mass, holonomic, jnp.zeros((k, p), none.dtype), -gaps)  # S
 
-    # Columns of all that follows: x, ẋ, u, u̇, ü.
-    zero_n, zero_p = jnp.zeros((k, n), none.dtype), jnp.zeros((k, p), none.dtype)
-    w = jnp.concatenate([basis, zero_n, place, zero_p, zero_p], axis=1)
-    rate = jnp.concatenate([zero_n, basis, zero_p, place, zero_p], axis=1)  # ẇ
-    bent = jnp.concatenate([zero_n, zero_n, zero_p, zero_p, place], axis=1)  # ẅ but for Z ẍ
-    if turning is None:
-        dv, dvdot = rate, bent
+    zero = lambda columns, rows=k: jnp.zeros((rows, columns), none.dtype)
+    w = jnp.concatenate([bases.position, zero(g), place, zero(2 * p)], axis=1)
+    drift = jnp.zeros_like(mass) if turning is None else system.group.ad(state.v) + turning
+    if system.num_velocity_rows:
+        asked = jnp.concatenate([zero(f + g + p, len(gaps)), gaps, zero(p, len(gaps))], axis=1)
+        asked = jnp.concatenate([asked, _slipping(system, state, t, jacobian[gaps.shape[0] :] @ drift) @ w])
+        along, _ = kkt_solve(mass, jacobian, jnp.zeros_like(w), -asked)  # P
+        rate = along + jnp.concatenate([zero(f), bases.velocity, zero(3 * p)], axis=1)  # ẇ
+        dx = bases.position.T @ (mass @ rate)  # ẋ
+        by_x, _, by_u, by_u1, _ = jnp.split(along, cuts, axis=1)
+        bent = by_x @ dx + jnp.concatenate([zero(f + g + p), by_u, by_u1], axis=1)  # ẅ but for Y ν̇
     else:
-        drift = system.group.ad(state.v) + turning
-        dv, dvdot = rate + drift @ w, bent + (drift + turning) @ rate + turning @ (drift @ w)
-    applied = jnp.concatenate([zero_n, zero_n, forces[..., 0], forces[..., 1], zero_p], axis=1)
+        rate = jnp.concatenate([zero(f), bases.velocity, zero(p), place, zero(p)], axis=1)
+        dx = jnp.eye(f, f + g + 3 * p, f, dtype=none.dtype)
+        bent = jnp.concatenate([zero(f + g + 2 * p), place], axis=1)
+    dv, dvdot = rate + drift @ w, bent
+    if turning is not None:
+        dvdot = bent + (drift + turning) @ rate + turning @ (drift @ w)
+    applied = jnp.concatenate([zero(f + g), forces[..., 0], forces[..., 1], zero(p)], axis=1)
     left = stiffness @ w + damping @ dv + mass @ dvdot + applied
-    bend = -basis.T @ left
-    bend = bend.at[:, bend.shape[1] - p :].set(0.0)  # −Zᵀ M S
-    dvdot = dvdot + basis @ bend
-    _, dlam = kkt_solve(mass, jacobian, -(left + mass @ (basis @ bend)), jnp.zeros((jacobian.shape[0], 2 * n + 3 * p)))
+    bend = -bases.velocity.T @ left
+    bend = bend.at[:, bend.shape[1] - p :].set(0.0)  # −Yᵀ M Ṗ
+    dvdot = dvdot + bases.velocity @ bend
+    none_of_rows = zero(w.shape[1], jacobian.shape[0])
+    _, dlam = kkt_solve(mass, jacobian, -(left + mass @ (bases.velocity @ bend)), none_of_rows)
 
     def output(w, dv, dvdot, dlam, u):
         q = system.group.retract(state.q, w)
         moved = State(q=q, v=state.v + dv, vdot=state.vdot + dvdot, lam=state.lam + dlam, a=state.vdot + dvdot)
         return outputs(built(u), moved)
 
-    inputs = jnp.concatenate([jnp.zeros((2 * n, p, 3), none.dtype), _unit_inputs(p, none.dtype)])
+    inputs = jnp.concatenate([jnp.zeros((f + g, p, 3), none.dtype), _unit_inputs(p, none.dtype)])
     at = jnp.zeros(k, none.dtype), jnp.zeros(k, none.dtype), jnp.zeros(k, none.dtype), jnp.zeros_like(state.lam), none
     along = lambda *directions: jax.jvp(output, at, directions)[1]
     rows = jax.vmap(along, in_axes=(1, 1, 1, 1, 0), out_axes=1)(w, dv, dvdot, dlam, inputs)
 
-    cuts = n, 2 * n, 2 * n + p, 2 * n + 2 * p
-    by_x, by_rate, by_u, by_u1, _ = jnp.split(bend, cuts, axis=1)  # −K_r, −C_r, −F_0, −F_1
-    out_x, out_rate, out_u, out_u1, out_u2 = jnp.split(rows, cuts, axis=1)
-    f = n - system.num_states
-    unit = jnp.eye(n, dtype=none.dtype)[:f]
-    upper = jnp.concatenate([jnp.zeros((f, f), none.dtype), unit], axis=1)
-    lower = jnp.concatenate([by_x[:, :f], by_rate], axis=1)
-    return StateSpace(
-        A=jnp.concatenate([upper, lower]),
-        B=jnp.concatenate([unit @ by_u1, by_u + by_rate @ by_u1]),
-        C=jnp.concatenate([out_x[:, :f], out_rate], axis=1),
-        D=out_u + out_rate @ by_u1,
-        D1=out_u1,
-        D2=out_u2,
-    )
+    by_y, by_u, by_u1, _ = jnp.split(jnp.concatenate([dx, bend]), cuts[1:], axis=1)
+    out_y, out_u, out_u1, out_u2 = jnp.split(rows, cuts[1:], axis=1)
+    return StateSpace(A=by_y, B=by_u + by_y @ by_u1, C=out_y, D=out_u + out_y @ by_u1, D1=out_u1, D2=out_u2)
+
+
+def _slipping(system: AbstractSystem, state: State, t, drifting: Float[Array, "r k"]) -> Float[Array, "r k"]:
+    """A N + D_q(A v + b): what rows of velocities ask of ẇ where the place is another one; `drifting`: A N."""
+    slip = lambda w: system.velocity_constraint(system.group.retract(state.q, w), state.v, t)
+    return drifting + jax.jacfwd(slip)(jnp.zeros_like(state.v))
 
 
 def _unit_inputs(p: int, dtype) -> Float[Array, "3p p 3"]:

@@ -6,7 +6,7 @@ coordinates y = [x; ν] about given states, of which none is needed before the o
     w = Z x,     v' = N ν + P x,     B Z = 0,   J N = 0,   Zᵀ M Z = I,   Nᵀ M N = I,     J P = −D_q c Z,   Nᵀ M P = 0
 
 with B the rows of position level, J = [B; A] all of them, and c(q, v, t) = 0 what they ask of velocities: to first
-order all states that satisfy the constraints are of this form (`_second_order.null_space`; P is the least in the metric
+order all states that satisfy the constraints are of this form (`_second_order.Bases`; P is the least in the metric
 of kinetic energy). Back again
 
     x = Zᵀ M log(q_n⁻¹ q),     ν = Nᵀ M (v − v_n).
@@ -25,7 +25,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from lgsens._validate import as_float
-from lgsens.analysis._second_order import null_space
+from lgsens.analysis._second_order import Bases
 from lgsens.dynamics import (
     RESULTS,
     AbstractSystem,
@@ -158,10 +158,7 @@ def step_jacobians(
 
 def _chart(system: AbstractSystem, state: State, t) -> Chart:
     mass, jacobian = system.mass_matrix(), full_jacobian(system, state.q, t)
-    holonomic = jacobian[: jacobian.shape[0] - system.num_velocity_rows]
-    velocity = null_space(system, jacobian)
-    position = null_space(system, holonomic) if system.num_velocity_rows else velocity
-    position = position[:, : position.shape[1] - system.num_states]
+    position, velocity = Bases.of(system, state.q, t)
 
     def left(x):
         return constraint_velocity(system, system.group.retract(state.q, position @ x), state.v, t)
