@@ -173,7 +173,7 @@ def test_an_existing_directory_is_left_alone(coarse, capsys):
 def test_a_file_is_not_overwritten_by_a_folder(tmp_path, capsys):
     (tmp_path / "file").write_text("mine")
     status, _, err = run(capsys, "--out", tmp_path / "file", "--overwrite")
-    assert status == 2 and "exists already" in err
+    assert status == 2 and "is a file: choose another --out DIR" in err
     assert (tmp_path / "file").read_text() == "mine"
 
 

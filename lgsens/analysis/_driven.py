@@ -82,7 +82,17 @@ def columns(argument: str, given: Mapping[str, Any], known: Collection[str], wha
             raise ValueError(f"`{argument}`: {name!r} is not one of {what}: there are none, add one.")
         if name not in known:
             raise ValueError(f"`{argument}`: {suggestion(name, known)}, {what}.")
-    return {name: as_float(given[name], None, f"`{argument}[{name!r}]`") for name in sorted(given)}
+    values = {name: as_float(given[name], None, f"`{argument}[{name!r}]`") for name in sorted(given)}
+    for name, value in values.items():
+        require(
+            lambda value: np.isfinite(value).all(),
+            lambda name=name, value=value: (
+                f"`{argument}[{name!r}]` must be finite, got {value[~np.isfinite(value)][0]} at place "
+                f"{np.argwhere(~np.isfinite(value))[0].tolist()}."
+            ),
+            value,
+        )
+    return values
 
 
 def require_distances(joints: Mapping[str, AbstractJoint], values: Mapping[str, jax.Array]) -> None:

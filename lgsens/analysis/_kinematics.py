@@ -102,7 +102,7 @@ def kinematics(
         )
     values = columns("driven", driven, where, "the drivers and distance joints of the model")
     require_distances(model.joints, values)
-    columns("driven", rates or {}, where, "the drivers and distance joints of the model")
+    columns("rates", rates or {}, where, "the drivers and distance joints of the model")
     names, times = list(values), {} if t is None else {"t": as_float(t, None, "`t`")}
     shape = of_one_length(times | values, ", and `t` be one")
     if driven and t is not None and rates is None:
@@ -134,7 +134,12 @@ def kinematics(
         known, cause, of = not isinstance(result, Tracer), result, details
         if known and int(result) != RESULTS.successful and int(details["position"]) == 0:
             cause, of = cause_of_failure(system, start, result, details)
-        states = throw_if_failed(states, cause, of | {"names": names} if known else of, names_of_all(system))
+        states = throw_if_failed(
+            states,
+            cause,
+            of | {"names": names, "left_out": system.repeated_names} if known else of,
+            names_of_all(system),
+        )
     return Kinematics(values=values, t=time, states=states, result=result, system=system)
 
 

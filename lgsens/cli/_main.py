@@ -65,7 +65,12 @@ class _Parser(argparse.ArgumentParser):
             ("rack", "its travel, or 0.06", "way of the rack [m]"),
         ):
             metavar = "M" if "[m]" in meaning else "SHARE"
-            self.add_argument(f"--{name}", type=_positive, metavar=metavar, help=f"{of}{meaning} (default: {default})")
+            self.add_argument(
+                f"--{name}",
+                type=_way if name == "rack" else _positive,
+                metavar=metavar,
+                help=f"{of}{meaning} (default: {default})",
+            )
 
     def quiet(self, nothing: str) -> None:
         """`--quiet`."""
@@ -83,6 +88,13 @@ def _positive(text: str) -> float:
     value = _read(float, text, "a number")
     if not (value > 0 and math.isfinite(value)):
         raise argparse.ArgumentTypeError(f"must be positive, got {text}")
+    return value
+
+
+def _way(text: str) -> float:
+    value = _positive(text)
+    if value > 2.0:  # no wheel of a vehicle moves as far
+        raise argparse.ArgumentTypeError(f"{value:g} m is more than wheels move; did you mean {value / 1e3:g}?")
     return value
 
 
@@ -154,7 +166,7 @@ def _parser() -> argparse.ArgumentParser:
         meaning = f"keep the {angle} curve within this of the one at the start [degree] (default: it may change)"
         optimize.add_argument(f"--keep-{angle}", type=_positive, metavar="DEG", help=meaning)
     kept = "wheel travel up and down over which curves are kept and drawn [m]"
-    optimize.option("--travel", 0.05, kept, type=_positive, metavar="M")
+    optimize.option("--travel", 0.05, kept, type=_way, metavar="M")
     optimize.vehicle("with --vary: ")
     optimize.quiet("no progress bar and no table")
 
@@ -168,7 +180,7 @@ def _parser() -> argparse.ArgumentParser:
     curves.hardpoints()
     curves.out("out/curves", "curves.png, curves.csv and travel.html")
     curves.add_argument("--axle", choices=["rear", "front"], help="(default: that of the file, else rear)")
-    curves.option("--travel", 0.08, "up and down [m]", type=_positive, metavar="M")
+    curves.option("--travel", 0.08, "up and down [m]", type=_way, metavar="M")
     curves.option("--points", 41, "positions", type=_count)
     curves.quiet("no table")
 
@@ -197,7 +209,7 @@ def _parser() -> argparse.ArgumentParser:
         ("traction", 2000.0, "force on each wheel [N]"),
         ("aligning", 150.0, "moment on each wheel [N m]"),
     ):
-        kc.option(f"--{name}", default, meaning, type=_positive)
+        kc.option(f"--{name}", default, meaning, type=_way if meaning.endswith("[m]") else _positive)
     kc.vehicle()
     kc.quiet("no table")
 

@@ -81,8 +81,7 @@ _MESSAGES = {
     ),
     RESULTS.position_failed: (
         "No position satisfies the joints for these values of the driven ones: they are out of reach, or the mechanism "
-        "passes a dead centre, where the driven values do not determine it, or begins in one, its reference; or the "
-        "equations that redundant='remove' has left were met in another way than those removed. Ask for "
+        "passes a dead centre, where the driven values do not determine it, or begins in one, its reference. Ask for "
         "values within reach, drive another coordinate, come there in smaller steps, or begin elsewhere."
     ),
     RESULTS.invalid_numbers: (

@@ -156,7 +156,7 @@ class Assembly:
         if moments != "Inertia":
             xy, xz, yz = self.data.vector(section, "Products of Inertia") * (self.side, 1.0, self.side)
             inertia += np.array([[0, xy, xz], [xy, 0, yz], [xz, yz, 0]])
-        self.place(body, self.data.number(section, "Mass"), inertia, centre, np.eye(3) if axes is None else axes)
+        self.place(body, self.data.mass(section), inertia, centre, np.eye(3) if axes is None else axes)
 
     def place(self, body: str, mass: float, inertia: np.ndarray, centre, axes) -> None:
         """A body whose inertia is in its own axes."""
@@ -261,17 +261,24 @@ class Assembly:
 
     def _spring(self, section: str, a: str, at_a: Any, b: str, at_b: Any) -> None:
         ends = {"at_a": self.point(at_a), "at_b": self.point(at_b)}
+        if np.array_equal(*ends.values()):
+            raise ValueError(
+                f"{self.data.path}: {section} has both ends at {ends['at_a'].tolist()} m, and no direction."
+            )
         names = self.name(a), self.name(b)
         free, label = self.data.get(section, "Free Length"), self.label(section)
         curves, numbers = [], []
         for of in ("Spring", "Damping"):
-            number, rows = (
-                float(self.data.get(section, f"{of} Coefficient", 0.0)),
-                self.data.get(section, f"{of} Curve Data"),
-            )
-            curve = ([-1.0, 1.0], [-number, number]) if rows is None and number else rows and np.transpose(rows)
+            key, rows = f"{of} Coefficient", self.data.curve(section, f"{of} Curve Data")
+            number = self.data.number(section, key) if self.data.has(section, key) else 0.0
+            curve = ([-1.0, 1.0], [-number, number]) if rows is None and number else rows
             curves.append(None if curve is None else made(Sampled, curve[0], curve[1], "monotone"))
-            numbers.append(None if rows else number)
+            numbers.append(None if rows is not None else number)
+            if rows is not None:
+                self.notes.append(
+                    f"{label}: {of} Curve Data by a smooth monotone curve, which goes on straight beyond its ends; in "
+                    "Chrono straight lines, and constants beyond"
+                )
         if None in numbers:
             given = {"spring": curves[0], "damper": curves[1], "free_length": free}
             self.forces[label] = made(CurveSpringDamper, *names, **ends, **given)

@@ -48,17 +48,40 @@ class Data:
         return found
 
     def number(self, section: str, key: str) -> float:
-        value = self.need(section, key)
-        if not isinstance(value, int | float):
-            raise ValueError(f"{self.path}: {section}/{key} must be a number, got {value!r}.")
-        return float(value)
+        return self._as_number(self.need(section, key), f"{section}/{key}")
 
     def vector(self, section: str, key: str) -> np.ndarray:
         return as_vector(self.need(section, key), f"{self.path}: {section}/{key}")
 
     def angle(self, key: str) -> float:
         """An angle in degrees at the top of the file [rad]."""
-        return float(np.radians(float(self.content.get(key, 0.0))))
+        return float(np.radians(self._as_number(self.content.get(key, 0.0), key)))
+
+    def mass(self, section: str, key: str = "Mass") -> float:
+        mass = self.number(section, key)
+        if not 0.0 < mass < np.inf:
+            raise ValueError(f"{self.path}: {section}/{key} must be positive, got {mass!r} kg.")
+        return mass
+
+    def curve(self, section: str, key: str) -> np.ndarray | None:
+        """The columns of a table of pairs, of increasing places; None where there is none."""
+        if (rows := self.get(section, key)) is None:
+            return None
+        try:
+            columns = np.array(rows, dtype=float).T
+        except (TypeError, ValueError):
+            columns = np.zeros(0)
+        if columns.ndim != 2 or len(columns) != 2 or columns.shape[1] < 2 or not np.all(np.diff(columns[0]) > 0.0):
+            raise ValueError(
+                f"{self.path}: {section}/{key} must be two or more pairs of numbers, the first ones increasing, "
+                f"got {_shown(rows)}."
+            )
+        return columns
+
+    def _as_number(self, value: Any, where: str) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ValueError(f"{self.path}: {where} must be a number, got {value!r}.")
+        return float(value)
 
     def left(self) -> list[str]:
         """What nobody has asked for."""

@@ -91,6 +91,8 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
             more = f"It is so at {place}, {time}. {worst} `throw=False` returns the data." if step else worst
         case RESULTS.position_failed:
             more = f"It failed at position {int(details['position'])}{_driven(details)}, {time}. {worst}"
+            if details.get("left_out"):
+                more += " Or equations that redundant='remove' left out are not met where the others are."
         case RESULTS.statics_failed | RESULTS.not_held:
             more = f"It failed at point {int(details['position'])}{_driven(details)}."
             if len(details.get("free", ())):

@@ -376,6 +376,40 @@ def test_numbers_of_a_file():
     np.testing.assert_allclose(moments, [0.4469, 0.4469, 0.8938], rtol=1e-12)
 
 
+def with_entry(tmp_path, section, key, value):
+    """The double wishbone with another entry, at the top where `section` is ""."""
+    content = json.loads((DATA / "DoubleWishbone.json").read_text(encoding="utf-8"))
+    (content[section] if section else content)[key] = value
+    (tmp_path / "file.json").write_text(json.dumps(content), encoding="utf-8")
+    return chrono(tmp_path / "file.json")
+
+
+def test_curves_are_carried_over_in_another_form(tmp_path):
+    """Through their points, which is said."""
+    rows = [[-1.0, -800.0], [0.0, 0.0], [1.0, 1200.0]]
+    imported = with_entry(tmp_path, "Shock", "Damping Curve Data", rows)
+    assert any("Shock: Damping Curve Data by a smooth monotone curve" in note for note in imported.report.notes)
+    found = [imported.model.forces["left Shock"].damper(at) for at, _ in rows]
+    np.testing.assert_allclose(found, [force for _, force in rows], rtol=1e-14, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "message"),
+    [
+        ("Shock", "Damping Curve Data", [[0, 0, 1], [1, 2]], "Shock/Damping Curve Data must be two or more pairs"),
+        ("Shock", "Damping Curve Data", [[0, 0], [0, 2]], "the first ones increasing"),
+        ("Upright", "Mass", -4, r"Upright/Mass must be positive, got -4\.0 kg"),
+        ("", "Camber Angle (deg)", "a", r"Camber Angle \(deg\) must be a number, got 'a'"),
+        ("Spring", "Location Arm", [-0.07, 0.52, 0.27], "Spring has both ends at"),
+    ],
+)
+def test_wrong_entries_are_named(section, key, value, message, tmp_path):
+    if key == "Location Arm":
+        value = json.loads((DATA / "DoubleWishbone.json").read_text(encoding="utf-8"))[section]["Location Chassis"]
+    with pytest.raises(ValueError, match=message):
+        with_entry(tmp_path, section, key, value)
+
+
 def test_rates_of_leaves():
     """A front leaf of 0.45 m of a spring of 94748.2 N/m: 94748.2 · 0.45²/2 N m/rad, as the generic form of it says."""
     spring = chrono(DATA / "SAEToeBarLeafspringAxle.json").model.forces["left Frontleaf torsion y"]
