@@ -4,11 +4,10 @@ import _thread
 import argparse
 import contextlib
 import io
-import math
 import os
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -16,6 +15,7 @@ import jax
 
 from lgsens._xla import compilation_cache
 from lgsens.cli import _curves, _doctor, _import, _kc, _optimize, _paper, _top, _tradeoff
+from lgsens.cli._argument_types import count, named, positive, relative, way
 from lgsens.cli._report import INTERRUPTED, UNFINISHED, interrupted, version
 from lgsens.examples import DEFAULT, PARAMETERS, shipped
 from lgsens.model import ISO_8608
@@ -67,7 +67,7 @@ class _Parser(argparse.ArgumentParser):
             metavar = "M" if "[m]" in meaning else "SHARE"
             self.add_argument(
                 f"--{name}",
-                type=_way if name == "rack" else _positive,
+                type=way if name == "rack" else positive,
                 metavar=metavar,
                 help=f"{of}{meaning} (default: {default})",
             )
@@ -75,46 +75,6 @@ class _Parser(argparse.ArgumentParser):
     def quiet(self, nothing: str) -> None:
         """`--quiet`."""
         self.add_argument("--quiet", action="store_true", help=nothing)
-
-
-def _read(kind: Callable[[str], Any], text: str, what: str) -> Any:
-    try:
-        return kind(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"must be {what}, got {text!r}") from error
-
-
-def _positive(text: str) -> float:
-    value = _read(float, text, "a number")
-    if not (value > 0 and math.isfinite(value)):
-        raise argparse.ArgumentTypeError(f"must be positive, got {text}")
-    return value
-
-
-def _way(text: str) -> float:
-    value = _positive(text)
-    if value > 2.0:  # no wheel of a vehicle moves as far
-        raise argparse.ArgumentTypeError(f"{value:g} m is more than wheels move; did you mean {value / 1e3:g}?")
-    return value
-
-
-def _count(text: str) -> int:
-    value = _read(int, text, "a whole number")
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, got {text}")
-    return value
-
-
-def _named(text: str) -> tuple[str, float | tuple[float, float]]:
-    """NAME=NUMBER or NAME=LOWER:UPPER."""
-    name, _, bound = text.rpartition("=")
-    try:
-        low, *more = (float(end) for end in bound.split(":"))
-    except ValueError:
-        low, more = math.nan, []
-    if not name or len(more) > 1 or not all(map(math.isfinite, (low, *more))):
-        raise argparse.ArgumentTypeError(f"must be NAME=NUMBER or NAME=LOWER:UPPER, got {text!r}")
-    return name, (low, more[0]) if more else low
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -141,32 +101,32 @@ def _parser() -> argparse.ArgumentParser:
     )
     free = "of an axle: numbers that are free, by keys of its file, and how far: points either way [m], camber and toe"
     free += " [degree], rates by a share of their value, or any between LOWER:UPPER; as often as needed"
-    optimize.add_argument("--vary", type=_named, action="append", metavar="PATTERN=WIDTH", help=free)
+    optimize.add_argument("--vary", type=named, action="append", metavar="PATTERN=WIDTH", help=free)
     kept = (
         "of an axle: its toe or camber curve [degree], or a characteristic that `lgsens kc` shows, in its unit, that "
     )
     kept += "stays within a width of its start, or between LOWER:UPPER; as often as needed"
-    optimize.add_argument("--keep", type=_named, action="append", metavar="NAME=WIDTH", help=kept)
+    optimize.add_argument("--keep", type=named, action="append", metavar="NAME=WIDTH", help=kept)
     road = (
         "minimize the RMS acceleration, weighted by ISO 2631, on a random road of this class of ISO 8608, in place of"
     )
     road += " the integral over the bump, whose limits stay (default: the bump alone)"
     optimize.add_argument("--road", choices=list(ISO_8608), help=road)
-    optimize.add_argument("--speed", type=_positive, metavar="V", help="on the random road [m/s] (default: 20)")
+    optimize.add_argument("--speed", type=positive, metavar="V", help="on the random road [m/s] (default: 20)")
     limit = "most RMS tyre load and wheel travel on the random road, over those at the start (default: 1.1 each)"
-    optimize.add_argument("--limit", type=_named, action="append", metavar="tyre|travel=FACTOR", help=limit)
-    optimize.option("--t1", 2.0, "duration [s]", type=_positive)
-    optimize.option("--dt", 2e-3, "step size [s]", type=_positive)
+    optimize.add_argument("--limit", type=named, action="append", metavar="tyre|travel=FACTOR", help=limit)
+    optimize.option("--t1", 2.0, "duration [s]", type=positive)
+    optimize.option("--dt", 2e-3, "step size [s]", type=positive)
     reached = "in place of --dt: as many steps as Psi_0 over the bump and its gradient at the start take to have this "
     reached += "relative error"
-    optimize.add_argument("--accuracy", type=_positive, metavar="ERROR", help=reached)
-    optimize.option("--steps", 300, "most gradients that the optimizer takes", type=_count)
+    optimize.add_argument("--accuracy", type=positive, metavar="ERROR", help=reached)
+    optimize.option("--steps", 300, "most gradients that the optimizer takes", type=count)
     optimize.option("--wheel", "hinged", "whether the wheel turns on its hinge", choices=["hinged", "locked"])
     for angle in ("camber", "toe"):
         meaning = f"keep the {angle} curve within this of the one at the start [degree] (default: it may change)"
-        optimize.add_argument(f"--keep-{angle}", type=_positive, metavar="DEG", help=meaning)
+        optimize.add_argument(f"--keep-{angle}", type=positive, metavar="DEG", help=meaning)
     kept = "wheel travel up and down over which curves are kept and drawn [m]"
-    optimize.option("--travel", 0.05, kept, type=_way, metavar="M")
+    optimize.option("--travel", 0.05, kept, type=way, metavar="M")
     optimize.vehicle("with --vary: ")
     optimize.quiet("no progress bar and no table")
 
@@ -180,8 +140,8 @@ def _parser() -> argparse.ArgumentParser:
     curves.hardpoints()
     curves.out("out/curves", "curves.png, curves.csv and travel.html")
     curves.add_argument("--axle", choices=["rear", "front"], help="(default: that of the file, else rear)")
-    curves.option("--travel", 0.08, "up and down [m]", type=_way, metavar="M")
-    curves.option("--points", 41, "positions", type=_count)
+    curves.option("--travel", 0.08, "up and down [m]", type=way, metavar="M")
+    curves.option("--points", 41, "positions", type=count)
     curves.quiet("no table")
 
     kc = commands.add_parser(
@@ -199,7 +159,7 @@ def _parser() -> argparse.ArgumentParser:
     kc.add_argument(
         "--gradient", metavar="NAME,…|all", help="characteristics to differentiate by the hardpoints (default: none)"
     )
-    kc.option("--points", 41, "of each sweep, odd", type=_count)
+    kc.option("--points", 41, "of each sweep, odd", type=count)
     kc.add_argument("--rigid", action="store_true", help="ideal joints in place of bushings")
     for name, default, meaning in (
         ("travel", 0.08, "of both wheels [m]"),
@@ -209,7 +169,7 @@ def _parser() -> argparse.ArgumentParser:
         ("traction", 2000.0, "force on each wheel [N]"),
         ("aligning", 150.0, "moment on each wheel [N m]"),
     ):
-        kc.option(f"--{name}", default, meaning, type=_way if meaning.endswith("[m]") else _positive)
+        kc.option(f"--{name}", default, meaning, type=way if meaning.endswith("[m]") else positive)
     kc.vehicle()
     kc.quiet("no table")
 
@@ -219,7 +179,7 @@ def _parser() -> argparse.ArgumentParser:
         description="The sensitivity of the paper's spinning top (§8) by every method, beside its reference.",
     )
     top.set_defaults(run=_top.run)
-    top.option("--h", 1e-3, "step size [s]", type=_positive)
+    top.option("--h", 1e-3, "step size [s]", type=positive)
 
     paper = commands.add_parser(
         "paper",
@@ -243,8 +203,8 @@ def _parser() -> argparse.ArgumentParser:
     read.set_defaults(run=_import.run)
     read.add_argument("file", metavar="FILE", help="MJCF or URDF (extra `mujoco`), or a suspension of Chrono, .json")
     written = "simulate T seconds, write motion.html and motion.csv"
-    read.add_argument("--simulate", type=_positive, metavar="T", help=written)
-    read.option("--dt", 1e-3, "step size [s]", type=_positive)
+    read.add_argument("--simulate", type=positive, metavar="T", help=written)
+    read.option("--dt", 1e-3, "step size [s]", type=positive)
     read.out("out/import", "motion.html and motion.csv")
     read.quiet("no report and no progress bar")
 
@@ -264,8 +224,8 @@ def _parser() -> argparse.ArgumentParser:
     tradeoff.out("out/tradeoff", "tradeoff.json and tradeoff.png")
     tradeoff.resume()
     targets = "relative errors for which to recommend a setting (default: 1e-2 1e-4 1e-6 1e-8)"
-    tradeoff.add_argument("--targets", type=_positive, nargs="+", default=list(_tradeoff.TARGETS), help=targets)
-    tradeoff.option("--rounds", 5, "timed calls, at least 5", type=_count)
+    tradeoff.add_argument("--targets", type=relative, nargs="+", default=list(_tradeoff.TARGETS), help=targets)
+    tradeoff.option("--rounds", 5, "timed calls, at least 5", type=count)
     costs = ["seconds", "cpu_seconds"]
     tradeoff.option("--by", "seconds", "the cost: time of the clock or of the processor", choices=costs)
     tradeoff.quiet("no progress bar and no table")
@@ -278,8 +238,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     doctor.set_defaults(run=_doctor.run)
     doctor.add_argument("scene", metavar="FILE|NAME", help="as in `lgsens tradeoff`, or a suspension as in `optimize`")
-    doctor.add_argument("--t1", type=_positive, help="duration [s] (default: that of the scene, 1 of a suspension)")
-    doctor.option("--dt", 1e-3, "step size [s]", type=_positive)
+    doctor.add_argument("--t1", type=positive, help="duration [s] (default: that of the scene, 1 of a suspension)")
+    doctor.option("--dt", 1e-3, "step size [s]", type=positive)
     doctor.quiet("no progress bar")
     return parser
 

@@ -87,7 +87,8 @@ class Certificate(NamedTuple):
         if self.unresolved > _UNRESOLVED:
             said.append(
                 f"in {100 * float(self.unresolved):.0f} % of the steps accelerations change as much as they are large: "
-                "the steps do not resolve the motion, take many more of them, or model what is fast as rigid"
+                "the steps do not resolve the motion, take many more of them, or model it without what is fast, a "
+                "stiff spring as rigid, a short ramp as a longer one"
             )
         else:
             if kinks := [kink for kink in self.kinks if not kink.jump]:

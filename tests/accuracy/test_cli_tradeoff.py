@@ -88,6 +88,11 @@ def test_bad_files(text, words, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+def test_errors_are_relative(tmp_path, capsys):
+    status, _, error = run(capsys, "top", "--targets", "2", "--out", tmp_path / "out")
+    assert status == 2 and "argument --targets: must be less than 1, got 2; it is relative" in error
+
+
 @pytest.mark.parametrize("name", SCENES)
 def test_scenes(name):
     scene = SCENES[name]()
