@@ -2,6 +2,7 @@
 
 import os
 import time
+import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -121,7 +122,8 @@ def minimize(
             interrupted; with more `num_steps` a finished one goes on. To recognize another `fun`, x0 is evaluated
             again.
 
-    A step into a region where f, g or the gradient is not finite is halved until they are. Raises
+    A step into a region where f, g or the gradient is not finite is halved until they are. Warns of a gradient that is
+    zero at x0. Raises
     `ValueError` for bounds of another shape than x0, lower ≥ upper, x0 outside them, a logarithmic scale over
     0, `num_steps` < 1, a tolerance that is out of range, an f or g that is not finite at x0 or has no derivative in the
     mode, and a checkpoint of another problem. Derivations and sources: `lgsens/optimize/_slsqp.py` and
@@ -220,6 +222,13 @@ class Minimization:
             raise ValueError(
                 "The objective, a constraint or the gradient is not finite at `x0` (objective "
                 f"{float(first.objective)}); start from a design that can be simulated."
+            )
+        if float(first.gradient_norm) == 0.0 and not np.any(method.slope(x)[1]):
+            warnings.warn(
+                "The gradient of the objective is zero at `x0`, by every variable, and the search ends there. It does "
+                "not depend on them (a number that `float` or NumPy made of one, `stop_gradient`), or x0 is a "
+                "stationary point, a symmetric design say: start elsewhere.",
+                stacklevel=3,
             )
         store = None if checkpoint is None else Checkpoint(checkpoint, self._box, x, self._tolerances)
         course, reason = Course(start, num_steps, store), "interrupted"

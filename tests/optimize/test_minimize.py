@@ -85,6 +85,16 @@ def test_a_search_from_a_bound_begins_with_the_whole_slope(forward):
     assert found.history.gradient_norm[0] == pytest.approx(0.2, rel=1e-15)  # rounding of 0.1 and of the slope
 
 
+@pytest.mark.parametrize("forward", [True, False])
+def test_an_objective_that_knows_nothing_of_the_variables_is_said(forward):
+    """Not where only the box holds the first step."""
+    lost = lambda x: 3.0 + jax.lax.stop_gradient(x["a"]) ** 2
+    with pytest.warns(UserWarning, match="gradient of the objective is zero at `x0`"):
+        quiet(lost, {"a": 1.0}, {"a": -2.0}, {"a": 2.0}, forward=forward)
+    held = quiet(lambda x: x["a"], {"a": -2.0}, {"a": -2.0}, {"a": 2.0}, forward=forward)
+    assert held.reason == "converged" and held.history.gradient_norm[0] == 0.0
+
+
 def test_a_tight_tolerance_is_reached():
     result = quiet(disc, {"a": -1.0, "b": 0.0}, {"a": -2.0, "b": -2.0}, {"a": 2.0, "b": 2.0}, tolerance=1e-10)
     assert result.reason == "converged"
