@@ -22,9 +22,9 @@ UNFINISHED = "search.npz", "tradeoff.json"  # from which --resume goes on
 @contextlib.contextmanager
 def output_folder(out: Path, overwrite: bool) -> Iterator[Path]:
     """A new folder, or with `overwrite` one that may exist, and gone again after a failure."""
-    if out.exists() and not (overwrite and out.is_dir()):
-        if not out.is_dir():
-            raise ValueError(f"output directory {str(out)!r} is a file: choose another --out DIR")
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"output directory {str(out)!r} is a file: choose another --out DIR")
+    if out.exists() and not overwrite:
         remedy = "choose another --out DIR, or give --overwrite to replace the files in it"
         raise ValueError(f"output directory {str(out)!r} exists already: {remedy}")
     created = not out.exists()
