@@ -190,7 +190,8 @@ def test_a_fixed_moment_is_a_load():
         forces[f"spring of {bar}"] = lg.TorsionSpringDamper(None, bar, stiffness=100.0, **axis)
         forces[bar] = lg.AppliedForce(bar, **load)
     found = lg.statics(lg.Model(bodies, joints, forces), loads=dict.fromkeys(loads, np.array([0.0, 10.0])))
-    along = found.along()
+    along, table = found.along(), found.to_pandas()
+    assert table["one.factor"].tolist() == table["other.factor"].tolist() == [0.0, 10.0] and table["stable"].all()
     for bar, moment in moments.items():
         # round-off of angles of 0.1 rad in rotations and their logarithm, a few
         np.testing.assert_allclose(found.joint(bar).angle, [0.0, 0.1 * moment], atol=1e-13)

@@ -59,6 +59,11 @@ class Statics(AbstractRun):
     def _kinematics(self):
         return self.states, self.t
 
+    def _besides(self):
+        driven = drivers(self.system)
+        factors = {f"{name}.factor": of for name, of in self.values.items() if name not in driven}
+        return factors | {"stable": self.stable, "snapped": self.snapped}
+
     def along(self, direction: int = 0) -> "Statics":
         """The same positions with derivatives along a direction: velocities are dx/ds, `multiplier` is dλ/ds, the rate
         of a spring dℓ/ds (its motion ratio). Forces of dampers and joints mean nothing here."""

@@ -261,7 +261,7 @@ class Assembly:
 
     def _spring(self, section: str, a: str, at_a: Any, b: str, at_b: Any) -> None:
         ends = {"at_a": self.point(at_a), "at_b": self.point(at_b)}
-        if np.array_equal(*ends.values()):
+        if np.array_equal(ends["at_a"], ends["at_b"]):
             raise ValueError(
                 f"{self.data.path}: {section} has both ends at {ends['at_a'].tolist()} m, and no direction."
             )

@@ -70,8 +70,9 @@ class Data:
         try:
             columns = np.array(rows, dtype=float).T
         except (TypeError, ValueError):
-            columns = np.zeros(0)
-        if columns.ndim != 2 or len(columns) != 2 or columns.shape[1] < 2 or not np.all(np.diff(columns[0]) > 0.0):
+            columns = np.zeros((0, 0))
+        shape = columns.shape
+        if len(shape) != 2 or shape[0] != 2 or shape[1] < 2 or not np.all(np.diff(columns[0]) > 0.0):
             raise ValueError(
                 f"{self.path}: {section}/{key} must be two or more pairs of numbers, the first ones increasing, "
                 f"got {_shown(rows)}."

@@ -59,6 +59,8 @@ def quantities(run: Any, what: str) -> dict[str, Quantity]:
     def add(name: str, values, unit: str | None, axes: Axes):
         found[name] = Quantity(np.asarray(values), axes, unit)
 
+    for name, values in run._besides().items():
+        add(name, values, None, {})
     for name in whole.body_names:
         for field, values in run.body(name)._asdict().items():
             add(f"{name}.{field}", values, _UNITS[field], vector | {"body_axis": _AXES} if values.ndim == 3 else vector)

@@ -219,13 +219,17 @@ class AbstractRun(AbstractMotion):
     result: eqx.AbstractVar[Int[Array, ""]]
     _axes_of_time: ClassVar[int] = 1
 
+    def _besides(self) -> dict[str, Array]:
+        """What a table has besides, by name, a number without unit for each time."""
+        return {}
+
     def to_xarray(self) -> Any:
         """An `xarray.Dataset` over the dimension "time": all bodies, joints and states of force elements.
 
         Variables are "top.position" (time, axis), "top.orientation" (time, axis, body_axis), … as in `BodyMotion`;
         "hinge.angle", "hinge.angle_rate", …, "hinge.force", "hinge.moment" as in `JointMotion`, "hinge.multiplier";
-        "motor.output" as in `states_of`. Each has its unit as attribute `units`, but for multipliers and states, whose
-        meaning their elements say.
+        "motor.output" as in `states_of`; of `statics` "load.factor", "stable", "snapped". Each has its unit as
+        attribute `units`, but for multipliers and states, whose meaning their elements say.
 
         Raises `ImportError` without xarray (`pip install "lgsens[data]"`), and `ValueError` for a motion that is traced
         or a batch.
