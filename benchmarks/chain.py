@@ -1,14 +1,16 @@
 """How a step, its gradient, compilation and memory grow with the length of a chain.
 
-    python benchmarks/chain.py [--links 8 64 512] [--solvers auto dense] [--schemes index3 stabilized radau]
+    python benchmarks/chain.py [--links 8 64 512] [--solvers auto dense] [--schemes index3 stabilized radau explicit]
         [--out benchmarks/results]
 
 The spatial chain of hinged links, 6 N coordinates and 5 N constraints, h = 1 ms, its end no faster than 8 m/s, by
-generalized-α, index 3 and stabilized index 2, and by Radau IIA. Time per step is the difference of runs of 20 and 100
-steps over the 80 between them, so that the initial state does not count: medians of at least `--repeats` rounds of all
-four programs after one that compiles. "gradient" is that of Ψ, the integral of the square of the last link's height, by
-all numbers of the assembled system, in reverse mode. "auto" is the linear solver that the model chooses; levels are
-those of index 3. The slope is that of log time over log N between two lengths. Writes chain.json and prints a table.
+generalized-α, index 3 and stabilized index 2, by Radau IIA (512 links take more than ten minutes, so only where
+`--links` says so) and by `IndexReducedODE`, explicit steps of order 5. Time per step is the difference of runs of 20
+and 100 steps over the 80 between them, so that the initial state does not count: medians of at least `--repeats` rounds
+of all four programs after one that compiles. "gradient" is that of Ψ, the integral of the square of the last link's
+height, by all numbers of the assembled system, in reverse mode. "auto" is the linear solver that the model chooses;
+levels are those of index 3. The slope is that of log time over log N between two lengths. Writes chain.json and prints
+a table.
 """
 
 import dataclasses
@@ -21,7 +23,8 @@ import time
 
 from benchmark import SINGLE_THREAD, circumstances, environment, interleaved, options, write
 
-SCHEMES = ("index3", "stabilized", "radau")
+SCHEMES = ("index3", "stabilized", "radau", "explicit")
+LINKS = {scheme: (8, 64) if scheme == "radau" else (8, 64, 512) for scheme in SCHEMES}
 STEPS = (20, 100)
 H = 1e-3
 
@@ -34,7 +37,10 @@ def measure(links: int, solver: str, scheme: str, repeats: int) -> dict:
     from lgsens.examples import spatial_chain
 
     integrator = dict(
-        zip(SCHEMES, (lg.GeneralizedAlpha(), lg.GeneralizedAlpha(stabilized=True), lg.RadauIIA()), strict=True)
+        index3=lg.GeneralizedAlpha(),
+        stabilized=lg.GeneralizedAlpha(stabilized=True),
+        radau=lg.RadauIIA(),
+        explicit=lg.IndexReducedODE(),
     )[scheme]
     started = time.perf_counter()
     system = spatial_chain(links, spin=min(3.0, 24.0 / links)).system()
@@ -115,7 +121,7 @@ def table(document: dict) -> str:
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--links", nargs="+", type=int, default=[8, 64, 512])
+    parser.add_argument("--links", nargs="+", type=int)
     parser.add_argument("--solvers", nargs="+", choices=("auto", "dense"), default=["auto"])
     parser.add_argument("--schemes", nargs="+", choices=SCHEMES, default=list(SCHEMES))
     arguments = parser.parse_args()
@@ -125,9 +131,10 @@ def main() -> None:
 
     jax.config.update("jax_enable_x64", True)
     found, rows = environment(SINGLE_THREAD), []
-    for solver, scheme, links in itertools.product(arguments.solvers, arguments.schemes, arguments.links):
-        rows.append(measure(links, solver, scheme, arguments.repeats))
-        print(rows[-1], flush=True)
+    for solver, scheme in itertools.product(arguments.solvers, arguments.schemes):
+        for links in arguments.links or LINKS[scheme]:
+            rows.append(measure(links, solver, scheme, arguments.repeats))
+            print(rows[-1], flush=True)
     write(path, {"environment": found, "rows": rows, "slopes": slopes(rows)})
     print(table(json.loads(path.read_text(encoding="utf-8"))))
 
