@@ -369,7 +369,7 @@ def test_a_state_off_the_joints():
     batch = jax.jit(jax.vmap(whole))(states)
     assert batch.result.tolist() == [lg.RESULTS.successful, lg.RESULTS.off_joints]
     assert np.all(np.isfinite(batch.states.v[0])) and np.all(np.isnan(batch.states.v[1]))
-    with pytest.raises(ValueError, match=says("`state0` does not satisfy the joints at t0", "`equilibrium(model")):
+    with pytest.raises(ValueError, match=says("given state does not satisfy the joints at t0", "`equilibrium(model")):
         lg.raise_if_failed(batch)
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import rolling_disc
-from helpers import some_quick
+from helpers import says, some_quick
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
@@ -298,3 +298,57 @@ def test_small_motions_of_a_disc_that_rolls_in_a_circle():
     assert np.abs(left).max() < 1e-6
     with pytest.raises(ValueError, match="not steady"):
         lg.linearize(model, start)
+
+
+def straight():
+    model = rolling_disc.scene(jnp.asarray(0.0), jnp.array([0.0, 30.0, 0.0]))
+    start = lg.initial_state(model)
+    return model, start, eqx.tree_at(lambda state: state.v, start, start.v.at[0].mul(1.005))
+
+
+def test_a_state_that_slips_is_refused():
+    """By half a percent of its speed."""
+    model, _, slips = straight()
+    with pytest.raises(ValueError, match=says("`state` does not satisfy the joints at t0 = 0 s", "'rolling'")):
+        lg.linearize(model, slips)
+
+
+@pytest.mark.slow  # two programs
+def test_what_is_not_steady_of_a_disc_is_said():
+    """The roll rate in axes of the disc, which turn; and inside `jit` the state that slips."""
+    model, start, slips = straight()
+    outputs = {
+        "height": lambda s: s.body("disc").position[2],
+        "rate": lambda s: s.body("disc").angular_velocity[0],
+    }
+    with pytest.raises(ValueError, match=says("The motion is steady, but outputs", "['rate']")):
+        lg.linearize(model, start, outputs=outputs)
+    assert jax.jit(lambda state: lg.linearize(model, state, throw=False).result)(slips) == lg.RESULTS.off_joints
+
+
+@pytest.mark.slow  # five joints
+def test_a_trailer_whose_hitch_is_driven_follows_it():
+    """λ = −V/a of its heading, which no velocity is left for, and 0 of its wheel."""
+    speed, length, radius = 3.0, 0.8, 0.25
+    moves = {"velocity": (speed, 0.0, 0.0)}
+    bodies = {
+        "hitch": lg.RigidBody(2.0, (1.0, 1.0, 1.0), position=(0.0, 0.0, 0.5), free="x y z", **moves),
+        "trailer": lg.RigidBody(4.0, (0.3, 0.5, 0.6), position=(-0.5, 0.0, 0.5), **moves),
+        "wheel": lg.RigidBody(
+            1.0, (0.02, 0.035, 0.02), (-length, 0.0, radius), angular_velocity=(0.0, speed / radius, 0.0), **moves
+        ),
+    }
+    driver = lambda axis, value: lg.TranslationDriver(None, "hitch", at=(0.0, 0.0, 0.5), axis=axis, value=value)
+    axle = {"at": (-length, 0.0, radius), "axis": (0.0, 1.0, 0.0)}
+    joints = {
+        "pivot": lg.RevoluteJoint("hitch", "trailer", at=(0.0, 0.0, 0.5), axis=(0.0, 0.0, 1.0)),
+        "hub": lg.RevoluteJoint("trailer", "wheel", **axle),
+        "tyre": lg.Rolling("wheel", **axle, radius=radius),
+        "along": driver((1.0, 0.0, 0.0), lg.Polynomial((0.0, speed))),
+        "across": driver((0.0, 1.0, 0.0), 0.0),
+    }
+    model = lg.Model(bodies, joints, {"gravity": lg.Gravity((0.0, 0.0, -9.81))})
+    found = lg.linearize(model, lg.initial_state(model), inputs=["across"])
+    np.testing.assert_allclose(found.eigenvalues, [0.0, -speed / length], atol=1e-12)
+    # a ψ̇ = ẏ − V ψ; and what rolls has no velocities of its own
+    assert found.A.shape == (2, 2) and found.vectors.shape == (2, 2)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from lgsens._brief import brief, listed, roster, shown
@@ -30,7 +31,7 @@ from lgsens.dynamics import (
 )
 from lgsens.liegroups import unskew
 from lgsens.model import Model
-from lgsens.simulation import Instant, Trajectory, as_system, throw_if_failed
+from lgsens.simulation import Instant, Trajectory, as_system, check_state0, on_joints, throw_if_failed
 
 Output = Callable[[Instant], Float[Array, ""]]
 
@@ -209,8 +210,9 @@ def linearize(
     Returns a `Linearization`, differentiable by every number of the model: matrices, eigenvalues, mode shapes,
     frequency responses. The matrices depend on Z, which is a smooth function of the numbers. Eigenvalues are computed
     on a CPU only. Raises `ValueError` for names of inputs or outputs that do not fit, redundant constraints, a
-    mechanism without freedom, and a motion that is not steady; `SimulationError` where no equilibrium is found; inside
-    `jit` the numbers are NaN. Sources: `_second_order`, `_steady`.
+    mechanism without freedom, a state off its joints, a motion that is not steady, and outputs that are not;
+    `SimulationError` where no equilibrium is found; inside `jit` the numbers are NaN. Sources: `_second_order`,
+    `_steady`.
     """
     system, t0 = as_system(model), as_float(t0, (), "`t0`")
     check_inputs(model, inputs)
@@ -219,19 +221,24 @@ def linearize(
         if not callable(function):
             raise ValueError(f"`outputs[{name!r}]` must be a function of an instant, got {function!r}.")
     require_independent(system, "`linearize`")
-    if system.group.dim - system.num_states <= len(system.constraint_names):
+    rows = len(system.constraint_names) - system.num_velocity_rows
+    if system.group.dim - system.num_states <= rows:
         raise ValueError(
-            f"`model`: its joints have {len(system.constraint_names)} equations for "
+            f"`model`: its joints have {rows} equations for "
             f"{system.group.dim - system.num_states} coordinates and leave no freedom, unless some of them repeat "
             "others: `constraint_rank` tells, and Model(…, redundant='remove') leaves these out."
         )
     if state is not None:
         require_linear(system, "`linearize` of a motion")
+        check_state0(system, state, t0, "state", exactly=True)
     if rotation is not None and state is None:
         raise ValueError("`rotation` is that of a motion; give its `state` as well, `initial_state(model)` say.")
     rotation = as_float(jnp.zeros(3) if rotation is None else rotation, (3,), "`rotation`")
     found, details = _linearize_jit(model, state, t0, rotation, inputs, tuple(outputs.items()))
-    return throw_if_failed(found, found.result, details, names_of_all(system)) if throw else found
+    if not throw:
+        return found
+    details |= {} if isinstance(found.result, Tracer) else {"outputs": list(outputs)}
+    return throw_if_failed(found, found.result, details, names_of_all(system))
 
 
 @eqx.filter_jit
@@ -252,7 +259,7 @@ def _linearize_jit(model, given: State | None, t0, rotation, names: tuple[str, .
         state, result, details = initial.state, initial.result, {"violation": initial.violation}
         bases = Bases.of(system, state.q, t0)
         space = at(state, None, bases)
-        steady = accelerates_steadily(system, state, None, space.A)
+        steady, changing = accelerates_steadily(system, state, None, space.A), jnp.zeros(len(outputs), bool)
     else:
         turning = turning_axes(system, given, rotation)
         q, v, turn = later(system, given, rotation, turning)
@@ -263,11 +270,15 @@ def _linearize_jit(model, given: State | None, t0, rotation, names: tuple[str, .
         turned = jax.tree.map(lambda basis: turn @ basis, bases)
         spaces = jax.vmap(lambda state, bases: at(state, turning, bases))(states, twice(bases, turned))
         (state, space), (_, again) = (jax.tree.map(lambda leaf, i=i: leaf[i], (states, spaces)) for i in (0, 1))
-        result = jnp.where(system.is_valid() & finite(state), RESULTS.successful, RESULTS.invalid_numbers)
-        steady = accelerates_steadily(system, state, turning, space.A) & _alike(space, again)
+        result = jnp.where(on_joints(system, given, t0), RESULTS.successful, RESULTS.off_joints)
+        result = jnp.where(system.is_valid() & finite(state), result, RESULTS.invalid_numbers)
+        alike = _alike(space, again)
+        steady = accelerates_steadily(system, state, turning, space.A) & alike.A & alike.B
+        changing = ~(alike.C & alike.D & alike.D1 & alike.D2)
     jacobian = full_jacobian(system, state.q, t0)
     redundant = is_redundant(system, constraint_jacobian(system, state.q, t0))
-    result = jnp.where((result == RESULTS.successful) & ~steady, RESULTS.not_steady, result)
+    unsteady = jnp.where(steady, RESULTS.outputs_not_steady, RESULTS.not_steady)
+    result = jnp.where((result == RESULTS.successful) & ~(steady & ~jnp.any(changing)), unsteady, result)
     result = jnp.where(redundant, RESULTS.redundant_constraints, result).astype(jnp.int32)
     usable = result == RESULTS.successful
     # LAPACK does not like NaN, and a failure is said all the same.
@@ -285,7 +296,7 @@ def _linearize_jit(model, given: State | None, t0, rotation, names: tuple[str, .
         inputs=names,
         outputs=tuple(name for name, _ in outputs),
     )
-    return found, jax.lax.stop_gradient(details | {"jacobian": jacobian})
+    return found, jax.lax.stop_gradient(details | {"jacobian": jacobian, "changing": changing})
 
 
 def _scalar(name: str, value: Any, t0) -> Float[Array, ""]:
@@ -296,8 +307,9 @@ def _scalar(name: str, value: Any, t0) -> Float[Array, ""]:
     return jnp.asarray(value, t0.dtype)
 
 
-def _alike(space: StateSpace, again: StateSpace) -> Bool[Array, ""]:
-    """Whether two sets of matrices are the same, each to 1e-6 of its largest number."""
+def _alike(space: StateSpace, again: StateSpace) -> StateSpace:
+    """Whether two sets of matrices are the same, each to 1e-6 of its largest number: A and B, and rows of outputs."""
     enough = jnp.finfo(space.A.dtype).eps ** 0.375
-    close = lambda a, b: jnp.max(jnp.abs(a - b), initial=0.0) <= enough * (1.0 + jnp.max(jnp.abs(a), initial=0.0))
-    return jnp.all(jnp.stack([close(a, b) for a, b in zip(space, again)]))
+    off = lambda a, b: jnp.max(jnp.abs(a - b), axis=1, initial=0.0) > enough * (1.0 + jnp.max(jnp.abs(a), initial=0.0))
+    rows = StateSpace(*(~off(a, b) for a, b in zip(space, again)))
+    return rows._replace(A=jnp.all(rows.A), B=jnp.all(rows.B))

@@ -40,6 +40,13 @@ class Scene(NamedTuple):
     scale: Any = None
     t0: float = 0.0
 
+    def model(self) -> Any:
+        """Of the parameters. Raises `ValueError` for a `build` that fails."""
+        try:
+            return self.build(self.parameters)
+        except Exception as error:  # whatever a user's function may raise
+            raise ValueError(f"{self.title}: `build(parameters)` fails: {type(error).__name__}: {error}") from error
+
 
 def top() -> Scene:
     """The paper's top, §8: Ψ = ∫ x² dt with respect to its eight numbers."""
@@ -130,6 +137,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Measure a scene, print the table and the recommendations, write `tradeoff.json` and `tradeoff.png`."""
     plotting.figure()  # asks for matplotlib now, not after minutes
     scene = SCENES[arguments.scene]() if arguments.scene in SCENES else from_file(Path(arguments.scene))
+    scene.model()
     with output_folder(arguments.out, arguments.overwrite or arguments.resume) as out:
         path = unfinished(out, "tradeoff.json", arguments.resume)
         known = Table.from_document(json.loads(path.read_text(encoding="utf-8"))) if arguments.resume else None

@@ -23,6 +23,7 @@ class RESULTS(IntEnum):
     off_joints = 14
     angle_jumped = 15
     joints_apart = 16
+    outputs_not_steady = 17
 
     @property
     def message(self) -> str:
@@ -95,6 +96,10 @@ _MESSAGES = {
         "equilibrium, or name the `rotation` of axes in which it does not change (a body that turns about another axis "
         "than that of its symmetry has none)."
     ),
+    RESULTS.outputs_not_steady: (
+        "The motion is steady, but outputs of it change with time: take them in axes in which they do not, not in "
+        "those of a body that turns."
+    ),
     RESULTS.statics_failed: (
         "No static equilibrium was found for these driven values and loads: they are out of reach, or the equilibrium "
         "becomes unstable on the way (a linkage that snaps through). Ask for less, or come there in smaller steps."
@@ -104,9 +109,9 @@ _MESSAGES = {
         "hinge: `FixedJoint`), hold it (`RigidBody.free`), or give it a spring, however weak; or drive it."
     ),
     RESULTS.off_joints: (
-        "`state0` does not satisfy the joints at t0, by its positions or by its velocities. Give a state of this model "
-        "at this time: `initial_state(model, t0=t0)`, `equilibrium(model, t0=t0)`, or the last one of a run of a model "
-        "with the same hardpoints."
+        "The given state does not satisfy the joints at t0, by its positions or by its velocities. Give a state of "
+        "this model at this time: `initial_state(model, t0=t0)`, `equilibrium(model, t0=t0)`, or the last one of a run "
+        "of a model with the same hardpoints."
     ),
     RESULTS.steps_exhausted: (
         "Error control needs more steps than `num_steps` allows. Try more `num_steps` or a looser `tolerance`; "

@@ -129,7 +129,7 @@ def advance(
     tolerance, constraint_tolerance = tolerances
     penalty, count = search.penalty, jnp.ones_like(search.inner)
     worst = jnp.max(trial.constraints, initial=-jnp.inf)
-    norm = jnp.linalg.norm(box.clip(trial.z - trial.gradient) - trial.z)
+    norm = jnp.linalg.norm(box.descent(trial.z, trial.gradient))
     sigma = jnp.max(jnp.abs(trial.estimate - search.multipliers), initial=0.0) / penalty
 
     converged = accepted & (worst <= constraint_tolerance) & (sigma <= tolerance) & (norm <= tolerance)

@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +38,11 @@ class Box(NamedTuple):
     def clip(self, z: Array) -> Array:
         """The projection of z on the box."""
         return jnp.clip(z, *(end.astype(z.dtype) for end in self.ends))
+
+    def descent(self, z: Any, gradient: Any) -> Array:
+        """clip(z − ∇) − z: the projected gradient step, in which a small ∇ is not lost beside a large z."""
+        lower, upper = (end.astype(z.dtype) - z for end in self.ends)
+        return jnp.clip(-gradient, lower, upper)
 
     def scaled(self, x):
         return (_on_scale(x, self.log) - self.zero) / (self.one - self.zero)

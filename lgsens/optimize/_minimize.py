@@ -55,10 +55,11 @@ class OptimizationResult(NamedTuple):
         constraints: g(x), in the shape `fun` gave them.
         feasible: whether max g(x) ≤ constraint_tolerance.
         reason: why the search ended: "converged"; "steps", all of them were taken; "stalled", no step along −∇L
-            lowers L any more: round-off, a gradient that is wrong, or designs ahead that cannot be simulated
-            (`history.objective` is not finite there: keep away from them by a constraint, of a linkage that it can be
-            closed); "infeasible", the violation has a minimum here; "interrupted" from the keyboard (Ctrl-C) after the
-            first evaluation: nothing that was found is lost.
+            lowers L any more: round-off, a gradient that is wrong, an objective without a least value (of x beyond all
+            measure: give bounds), or designs ahead that cannot be simulated (`history.objective` is not finite there:
+            keep away from them by a constraint, of a linkage that it can be closed); "infeasible", the violation has a
+            minimum here; "interrupted" from the keyboard (Ctrl-C) after the first evaluation: nothing that was found is
+            lost.
         step: the evaluation at which x was found.
         history: the course of the minimization.
         multipliers: μ at the end, shaped as the constraints: the gain in f/|f(x₀)| per unit by which a constraint is

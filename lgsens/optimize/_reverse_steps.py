@@ -44,20 +44,31 @@ class Method:
         self.box, self.start = box, lambda x: start(box.scaled(x), num_constraints)
         self.one_step = make_step(fun, box, tolerances)  # to be traced
         self.step: Callable = jax.jit(self.one_step)
+        self.slope_alone: Callable = jax.jit(jax.value_and_grad(lambda z: fun(box.value(z))[0]))
 
     def compile(self, x: Array) -> None:
         """Compile the step, for any x of its kind."""
         self.step = self.step.lower(self.start(x)).compile()
 
     def begin(self, x: Array) -> tuple[Carry, outer.Row]:
-        """What follows from the evaluation at x₀."""
-        return self.step(self.start(x))
+        """What follows from the evaluation at x₀. Raises `ValueError` for a constraint that is not finite there."""
+        carry, row = self.step(self.start(x))
+        if int(carry.rejected) and np.isfinite(row.objective) and np.isfinite(row.gradient_norm):
+            raise ValueError(
+                "A constraint is not finite at `x0`; leave out what can never be active, and start from a design that "
+                "can be simulated."
+            )
+        return carry, row
 
     def slope(self, x: Array) -> tuple[np.ndarray, np.ndarray]:
-        """f at x, and its gradient by z: that of the first L with hardly any penalty."""
+        """f at x, and its gradient by z: that of the first L with hardly any penalty; where this is not finite a
+        program of its own, as a constraint may be to blame."""
         begun = self.start(x)
         penalty = jnp.full_like(begun.search.penalty, jnp.finfo(x.dtype).tiny)
         carry, row = self.step(begun._replace(search=begun.search._replace(penalty=penalty)))
+        if int(carry.rejected):
+            f, slope = self.slope_alone(begun.z)
+            return np.asarray(f), np.asarray(slope)
         return np.asarray(row.objective), np.asarray(carry.gradient * carry.search.scale)
 
     def go_on(self, course: Course) -> str:

@@ -105,7 +105,7 @@ class Method:
             cone = np.concatenate([jacobian[near], -unit[z <= lower + tolerance], unit[z >= upper - tolerance]])
             with contextlib.suppress(RuntimeError):  # out of its iterations: this point is no optimum then
                 multipliers[near] = scipy.optimize.nnls(cone.T, -slope)[0][: near.size]
-        norm = np.linalg.norm(np.clip(z - (slope + multipliers @ jacobian), *self.box.ends) - z)
+        norm = np.linalg.norm(np.asarray(self.box.descent(z, slope + multipliers @ jacobian)))
         sigma = np.max(np.abs(np.maximum(g, -multipliers)), initial=0.0)
         worst, norm, sigma = (np.asarray(number, f.dtype) for number in (np.max(g, initial=-np.inf), norm, sigma))
         return Evaluation(x, f, worst, norm, sigma, z, g, slope, jacobian, multipliers)

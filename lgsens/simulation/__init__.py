@@ -29,8 +29,10 @@ from lgsens.simulation._start import (
     Begin as Begin,
     as_system as as_system,
     begin as begin,
+    check_state0 as check_state0,
     equilibrium as equilibrium,
     initial_state as initial_state,
+    on_joints as on_joints,
 )
 from lgsens.simulation._to_accuracy import Compared as Compared, aligned as aligned, to_accuracy as to_accuracy
 from lgsens.simulation._trajectory import (

@@ -89,6 +89,8 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
             more = f"It did so in {place}, {time}. `throw=False` returns the data."
         case RESULTS.joints_apart:
             more = f"It is so at {place}, {time}. {worst} `throw=False` returns the data." if step else worst
+        case RESULTS.outputs_not_steady if "outputs" in details:
+            more = f"They are {[str(name) for name, moves in zip(details['outputs'], details['changing']) if moves]}."
         case RESULTS.position_failed:
             more = f"It failed at position {int(details['position'])}{_driven(details)}, {time}. {worst}"
             if details.get("left_out"):
@@ -126,6 +128,7 @@ def _exception(result: int, details: dict[str, Any], names: tuple[str, ...], not
         RESULTS.position_failed,
         RESULTS.invalid_numbers,
         RESULTS.not_steady,
+        RESULTS.outputs_not_steady,
         RESULTS.not_held,
     )
     of_values = result == RESULTS.singular_configuration and "position" in details

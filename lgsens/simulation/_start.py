@@ -99,21 +99,26 @@ def _found_state(find: Callable[..., Initial], model: Model | AbstractSystem, t0
     return throw_if_failed(initial.state, initial.result, details, names_of_all(system))
 
 
-def check_state0(system: AbstractSystem, state0: State | Start | None, t0) -> None:
-    """Raise `ValueError` for what is no state of the system, and for one that is known to be off its joints at t0."""
+def check_state0(
+    system: AbstractSystem, state0: State | Start | None, t0, name: str = "state0", exactly: bool = False
+) -> None:
+    """Raise `ValueError` for what is no state of the system, and for one that is known to be off its joints at t0.
+
+    `name`: of the argument. `exactly`: as in `on_joints`.
+    """
     if state0 is None:
         return
     state0 = state0.state if isinstance(state0, Start) else state0
     known = jax.tree.map(primal_value, (system, state0, t0))
     if not is_concrete(known):
-        _as_state(system, state0)
+        _as_state(system, state0, name)
         return
-    off = jax.tree.map(np.asarray, _off_jit(*known))
+    off = jax.tree.map(np.asarray, _off_jit(known[0], known[1], known[2], exactly))
     time = f"t0 = {float(known[2]):.6g} s"
     if not off.known:
         raise ValueError(
-            "`state0` is no configuration: the orientation of a body is not a rotation matrix, as a mean of several is "
-            "none. Give a state of this model, `initial_state(model)` or `trajectory.state(i)`."
+            f"`{name}` is no configuration: the orientation of a body is not a rotation matrix, as a mean of several "
+            "is none. Give a state of this model, `initial_state(model)` or `trajectory.state(i)`."
         )
     for values, most, what, advice in (
         (off.positions, off.most_position, "|Φ|", ""),
@@ -129,7 +134,7 @@ def check_state0(system: AbstractSystem, state0: State | Start | None, t0) -> No
         if np.max(beyond, initial=0.0) > 0.0:
             i = int(np.argmax(beyond))
             raise ValueError(
-                f"`state0` does not satisfy the joints at {time}: {what} = {abs(values[i]):.3g}, largest in joint "
+                f"`{name}` does not satisfy the joints at {time}: {what} = {abs(values[i]):.3g}, largest in joint "
                 f"{system.constraint_names[i]!r}. Give a state of this model at this time: `initial_state(model, "
                 "t0=t0)`, `equilibrium(model, t0=t0)`, or `trajectory.state(-1)` with t0 = trajectory.t[-1]." + advice
             )
@@ -141,7 +146,7 @@ class _Off(NamedTuple):
     Rows are lengths or sines of angles: of Φ a thousandth of the scene, or of 1 in a larger one. Loose tolerances and
     drift leave less, and so does a state written with four digits. In index 3 B v is −h² B c (`GeneralizedAlpha`), some
     hundredths of v at six steps in a period and ρ∞ = 0.9: of c a tenth of the sum of its terms, a hundredth of the
-    largest such sum, and what of Φ in a second.
+    largest such sum, and what of Φ in a second; `exactly`, where none of that is wanted, of c a thousandth of both.
     """
 
     positions: Float[Array, " m_p"]
@@ -151,13 +156,14 @@ class _Off(NamedTuple):
     known: Bool[Array, ""]
 
     @classmethod
-    def of(cls, system: AbstractSystem, state0: State, t0, jacobian: Matrix) -> "_Off":
+    def of(cls, system: AbstractSystem, state0: State, t0, jacobian: Matrix, exactly: bool = False) -> "_Off":
         scale = system.coordinate_scale()
         least = 1e-3 * jnp.min(scale[: scale.shape[0] - system.num_states], initial=1.0)
         prescribed = prescribed_velocity(system, state0.q, t0)  # J is known, and this zero in most scenes
         velocities, size = jacobian @ state0.v + prescribed, jax.tree.map(jnp.abs, jacobian)
         terms = size @ jnp.abs(state0.v) + jnp.abs(prescribed)
-        most = 0.1 * terms + 0.01 * jnp.max(terms, initial=0.0) + least
+        own, every = (1e-3, 1e-3) if exactly else (0.1, 0.01)
+        most = own * terms + every * jnp.max(terms, initial=0.0) + least
         positions = system.constraint(state0.q, t0)
         return cls(positions, least, velocities, most, system.is_configuration(state0.q))
 
@@ -168,16 +174,22 @@ class _Off(NamedTuple):
 
 
 @eqx.filter_jit
-def _off_jit(system: AbstractSystem, state0: State, t0) -> _Off:
+def _off_jit(system: AbstractSystem, state0: State, t0, exactly: bool) -> _Off:
     state0 = _as_state(system, state0)
-    return _Off.of(system, state0, t0, constraint_jacobian(system, state0.q, t0))
+    return _Off.of(system, state0, t0, constraint_jacobian(system, state0.q, t0), exactly)
 
 
-def _as_state(system: AbstractSystem, state0: Any) -> State:
+def on_joints(system: AbstractSystem, state: State, t) -> Bool[Array, ""]:
+    """Whether positions and velocities of a state satisfy the joints, exactly: not as index 3 leaves velocities."""
+    off = _Off.of(system, state, t, constraint_jacobian(system, state.q, t), exactly=True)
+    return off.on_joints & off.known
+
+
+def _as_state(system: AbstractSystem, state0: Any, name: str = "state0") -> State:
     """A state in the precision of the system; `ValueError` for what is none, or has other shapes than the system's."""
     if not isinstance(state0, State):
         raise ValueError(
-            "`state0` must be a State: one of `equilibrium` or `initial_state`, or `trajectory.state(-1)` to continue "
+            f"`{name}` must be a State: one of `equilibrium` or `initial_state`, or `trajectory.state(-1)` to continue "
             f"in steps of the same size, `trajectory.continued()` in others; got {type(state0).__name__}."
         )
     q, v = system.reference()
@@ -192,7 +204,7 @@ def _as_state(system: AbstractSystem, state0: Any) -> State:
     ]
     if wrong:
         raise ValueError(
-            f"`state0` must be one state of this model; its shapes are others: {'; '.join(wrong)} (bodies, then states "
+            f"`{name}` must be one state of this model; its shapes are others: {'; '.join(wrong)} (bodies, then states "
             "of force elements). Take it from `initial_state(model)` or `trajectory.state(i)` of the same model; for a "
             "batch of states jax.vmap(lambda state0: simulate(model, state0=state0, …))(states)."
         )

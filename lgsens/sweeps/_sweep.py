@@ -24,7 +24,9 @@ class SweepResult(NamedTuple):
     Attributes:
         designs: the designs, as a pytree of arrays.
         values: what `fn` returned; those of a design that failed are NaN or stop short, see `ok`.
-        ok: whether a design succeeded: all of its values finite, no simulation failed; shape (N,).
+        ok: whether a design succeeded: all of its values finite, and no `Trajectory` or `Saved` among them failed;
+            shape (N,). A failed simulation is NaN in what is computed of it, which a comparison, an `argmax` or a
+            `where` turns into a number: return the trajectory as well, or `jnp.where(run.result == 0, value, jnp.nan)`.
         batch_size: designs computed at once.
         compile_seconds, run_seconds: wall time of tracing and compilation, and of the batches [s].
     """

@@ -74,6 +74,7 @@ def test_a_file_of_ones_own(tmp_path, capsys):
         ("t1 = 1.0", ("must define `build`, a function p ↦ Model", "`criterion`", "`parameters`")),
         ("t1 = one", ("cannot be run: NameError", "one")),
         ("def", ("cannot be run: SyntaxError",)),
+        (FILE.replace("build(p)", "build(p, q)"), ("`build(parameters)` fails: TypeError", "'q'")),
         (FILE + "settings = [20]\n", ("`settings` must be values of Setting",)),
         (None, ("is neither a file nor one of", "quarter-car", "top")),
     ],

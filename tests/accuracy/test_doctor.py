@@ -6,6 +6,7 @@ import pytest
 import lgsens as lg
 from lgsens.accuracy import doctor
 from lgsens.accuracy._doctor import of_numbers
+from lgsens.cli._doctor import read
 from lgsens.cli._main import main
 
 FILE = """
@@ -61,6 +62,12 @@ def test_numbers_that_look_like_other_units_or_nothing(changes, extreme, number)
     found = {each.extreme: each for each in of_numbers(pendulum(**changes)) if each.near}
     assert list(found) == [extreme]
     np.testing.assert_allclose(found[extreme].number, number, rtol=1e-6)
+
+
+def test_a_scene_runs_from_its_own_begin(tmp_path):
+    (tmp_path / "mine.py").write_text(f"{FILE}t0 = 0.25\n", encoding="utf-8")
+    model, *times = read(str(tmp_path / "mine.py"))
+    assert isinstance(model, lg.Model) and times == [0.25, 0.75]
 
 
 def test_command(tmp_path, capsys):

@@ -73,9 +73,10 @@ def test_a_program_searches_from_any_start():
         program.value_and_grad({"a": 0.5})
 
 
-def test_a_constraint_that_can_never_be_active_is_refused():
-    with pytest.raises(ValueError, match="A constraint is −∞ at `x0`"):
-        quiet(lambda x: (x**2, jnp.stack([-jnp.inf, x - 3.0])), jnp.asarray(1.0), -1.0, 2.0)
+@pytest.mark.parametrize("forward", [True, False])
+def test_a_constraint_that_can_never_be_active_is_refused(forward):
+    with pytest.raises(ValueError, match=r"A constraint is (−∞|not finite) at `x0`"):
+        quiet(lambda x: (x**2, jnp.stack([-jnp.inf, x - 3.0])), jnp.asarray(1.0), -1.0, 2.0, forward=forward)
 
 
 @pytest.mark.parametrize("forward", [True, False])
@@ -93,6 +94,30 @@ def test_an_objective_that_knows_nothing_of_the_variables_is_said(forward):
         quiet(lost, {"a": 1.0}, {"a": -2.0}, {"a": 2.0}, forward=forward)
     held = quiet(lambda x: x["a"], {"a": -2.0}, {"a": -2.0}, {"a": 2.0}, forward=forward)
     assert held.reason == "converged" and held.history.gradient_norm[0] == 0.0
+
+
+@pytest.mark.parametrize("forward", [True, False])
+def test_where_nothing_bounds_the_objective_it_does_not_converge(forward):
+    """At x = 1e17, where a slope of 1 is less than round-off."""
+    found = quiet(lambda x: -x[0], [1.0], None, None, num_steps=300, forward=forward)
+    assert found.reason != "converged" and found.history.gradient_norm[-1] >= 1.0
+
+
+@pytest.mark.parametrize(
+    ("fun", "at", "expected"),
+    [
+        (lambda x: jnp.sqrt(x["a"]), -1.0, (np.nan, np.nan)),
+        (lambda x: jnp.sqrt(x["a"]), 0.0, (0.0, np.inf)),
+        (lambda x: ((x["a"] - 1.0) ** 2, jnp.stack([jnp.sqrt(x["a"]) - 9.0])), -1.0, (4.0, -4.0)),
+    ],
+    ids=["objective", "gradient", "constraint"],
+)
+def test_a_gradient_where_something_is_not_finite(fun, at, expected):
+    """In reverse mode as in forward mode: that of the objective, and not zero."""
+    for forward in (True, False):
+        program = Minimization(fun, {"a": 1.0}, lower={"a": -2.0}, upper={"a": 2.0}, forward=forward, progress=False)
+        value, gradient = program.value_and_grad({"a": at})
+        np.testing.assert_allclose((value, gradient["a"]), expected, rtol=1e-14)
 
 
 def test_a_tight_tolerance_is_reached():
