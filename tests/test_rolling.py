@@ -307,8 +307,10 @@ def straight():
 
 
 def test_a_state_that_slips_is_refused():
-    """By half a percent of its speed."""
+    """By half a percent of its speed. Two equations are of velocities alone, of five freedoms of its place three are left."""
     model, _, slips = straight()
+    summary = model.summary()
+    assert summary.degrees_of_freedom == 3 and "\nof velocities alone         2\n" in str(summary)
     with pytest.raises(ValueError, match=says("`state` does not satisfy the joints at t0 = 0 s", "'rolling'")):
         lg.linearize(model, slips)
 

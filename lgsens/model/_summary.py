@@ -34,7 +34,7 @@ class Summary:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """k − m: those of the mechanism, if no equation repeats another."""
+        """k − m: those of the mechanism, if no equation repeats another; of its velocities, where wheels roll."""
         return self.coordinates - self.constraints
 
     def __str__(self) -> str:
@@ -72,6 +72,8 @@ def summarize(
         ("Constraint equations", len(constraint_names)),
         ("Degrees of freedom", coordinates - len(constraint_names)),
     ]
+    if system.num_velocity_rows:
+        totals.insert(2, ("of velocities alone", system.num_velocity_rows))
     if system.num_states:
         totals.append(("States of forces", system.num_states))
     lines += [f"{what:<24}{number:>5}" for what, number in totals]
