@@ -307,7 +307,7 @@ def straight():
 
 
 def test_a_state_that_slips_is_refused():
-    """By half a percent of its speed. Two equations are of velocities alone, of five freedoms of its place three are left."""
+    """By half a percent of its speed. Two equations are of velocities alone: of five freedoms three are left."""
     model, _, slips = straight()
     summary = model.summary()
     assert summary.degrees_of_freedom == 3 and "\nof velocities alone         2\n" in str(summary)
