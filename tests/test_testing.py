@@ -311,6 +311,7 @@ def turned_top():
     return eqx.tree_at(where, model, (turn, jnp.array([1.0, 6.0, 7.0])))
 
 
+@pytest.mark.slow  # eight leaves; those of functions are in the quick run
 def test_every_leaf_of_a_simulation():
     report = check_sensitivities(end, turned_top()).raise_if_failed()
     names = {check.name for check in report.checks}

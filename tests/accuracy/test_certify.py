@@ -135,6 +135,7 @@ def height_at_the_end(mass, peak):
     return end[0]
 
 
+@pytest.mark.slow  # the certificate of equal steps is in the quick run
 def test_of_steps_that_end_at_breaks():
     """To the next term, O(ωh) with ωh = 0.045 as above, by mass and by the time at which the force has its kink."""
     p = {"mass": jnp.asarray(1.0), "peak": jnp.asarray(0.5037)}

@@ -78,6 +78,7 @@ def test_densities_add_up_to_the_errors_of_a_certificate():
     np.testing.assert_allclose(np.linalg.norm(rows[0, 1:].sum(1)), of_gradient, rtol=0.05)
 
 
+@pytest.mark.slow  # where the steps are is in the quick run
 def test_a_tolerance_is_reached(early):
     found = lg.steps_for(EARLY, build, P, tolerance=3e-4, **SCENE)
     assert max(float(found.value_error), float(found.gradient_error)) <= 3e-4

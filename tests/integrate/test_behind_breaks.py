@@ -52,7 +52,8 @@ def errors(signal, integrator, num_steps):
     return off[taken], within[taken]
 
 
-@pytest.mark.parametrize("integrator", some_quick(["aligned", "equal", "stabilized"]))
+@pytest.mark.slow  # samples, below, are in the quick run
+@pytest.mark.parametrize("integrator", ["aligned", "equal", "stabilized"])
 def test_forces_on_a_ramp_are_of_second_order(integrator):
     (coarse, within), (fine, also_within) = errors("ramp", integrator, 75), errors("ramp", integrator, 150)
     assert coarse[~within].max() < 1.5e-2  # (h/T)² of a polynomial whose fourth derivative is 60 times the second

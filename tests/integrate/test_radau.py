@@ -213,6 +213,7 @@ def test_factors_are_those_of_the_equations(solver, scene):
     np.testing.assert_allclose(flat(weights) @ flat(change), flat(weighted) @ flat(rows), rtol=1e-12)
 
 
+@pytest.mark.slow  # two programs
 def test_a_start_that_stiff_damping_stops():
     """J θ̈ + c θ̇ + k θ = 0 with c/J = 1e5 1/s: v̇ of the start would turn the body by 10 rad in a step of 10 ms."""
     inertia, c, k, speed, t1 = 1e-4, 10.0, 1.0, 2.0, 0.1

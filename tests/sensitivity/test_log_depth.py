@@ -114,7 +114,7 @@ def linear_problem(scheme, num_steps, uneven=False):
     return scheme, states, parameters, *(random_like((Variation.none(states), parameters), rng) for _ in range(2))
 
 
-@pytest.mark.slow  # small versions: test_depth, test_right_hand_sides_share_the_products
+@pytest.mark.slow  # small version: test_right_hand_sides_share_the_products
 @pytest.mark.parametrize(
     ("scheme", "uneven"),
     [
@@ -248,7 +248,8 @@ def programs(scheme, n):
     }
 
 
-@pytest.mark.parametrize("scheme", some_quick([ALPHA, lg.RadauIIA()]))
+@pytest.mark.slow  # three programs; that steps compose is in the quick run
+@pytest.mark.parametrize("scheme", [ALPHA, lg.RadauIIA()])
 def test_depth(scheme):
     """Eight times as many steps: eight times the depth of the sweeps, and three levels more of the scan.
 
