@@ -116,6 +116,7 @@ def state_space(
     """The matrices at one state; `turning`: Γ, None at rest; `bases`: those there."""
     none = jnp.zeros((num_inputs, 3), state.v.dtype)
     system, p = built(none), num_inputs
+    rolls = system.num_velocity_rows > 0
     k, f, g = *bases.position.shape, bases.velocity.shape[1]
     cuts = f, f + g, f + g + p, f + g + 2 * p  # of columns of x, ν, u, u̇, ü
     mass = system.mass_matrix()
@@ -128,18 +129,17 @@ def state_space(
     zero = lambda columns, rows=k: jnp.zeros((rows, columns), none.dtype)
     w = jnp.concatenate([bases.position, zero(g), place, zero(2 * p)], axis=1)
     drift = jnp.zeros_like(mass) if turning is None else system.group.ad(state.v) + turning
-    if system.num_velocity_rows:
+    if rolls:
         asked = jnp.concatenate([zero(f + g + p, len(gaps)), gaps, zero(p, len(gaps))], axis=1)
         asked = jnp.concatenate([asked, _slipping(system, state, t, jacobian[gaps.shape[0] :] @ drift) @ w])
-        along, _ = kkt_solve(mass, jacobian, jnp.zeros_like(w), -asked)  # P
-        rate = along + jnp.concatenate([zero(f), bases.velocity, zero(3 * p)], axis=1)  # ẇ
-        dx = bases.position.T @ (mass @ rate)  # ẋ
-        by_x, _, by_u, by_u1, _ = jnp.split(along, cuts, axis=1)
-        bent = by_x @ dx + jnp.concatenate([zero(f + g + p), by_u, by_u1], axis=1)  # ẅ but for Y ν̇
+        pushed, _ = kkt_solve(mass, jacobian, jnp.zeros_like(w), -asked)  # P
     else:
-        rate = jnp.concatenate([zero(f), bases.velocity, zero(p), place, zero(p)], axis=1)
-        dx = jnp.eye(f, f + g + 3 * p, f, dtype=none.dtype)
-        bent = jnp.concatenate([zero(f + g + 2 * p), place], axis=1)
+        pushed = jnp.concatenate([zero(f + g + p), place, zero(p)], axis=1)
+    rate = pushed + jnp.concatenate([zero(f), bases.velocity, zero(3 * p)], axis=1)  # ẇ
+    # ẋ; zeros of A are exact without rolling, of which a motion that nothing holds has pairs
+    dx = bases.position.T @ (mass @ rate) if rolls else jnp.eye(f, w.shape[1], f, dtype=none.dtype)
+    by_x, _, by_u, by_u1, _ = jnp.split(pushed, cuts, axis=1)
+    bent = by_x @ dx + jnp.concatenate([zero(f + g + p), by_u, by_u1], axis=1)  # ẅ but for Y ν̇
     dv, dvdot = rate + drift @ w, bent
     if turning is not None:
         dvdot = bent + (drift + turning) @ rate + turning @ (drift @ w)
