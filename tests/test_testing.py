@@ -369,6 +369,7 @@ WRONG_CRITERIA = {
     "not transposed": (not_transposed, np.array([0.3, 0.7]), {}, {("x", "reverse, forward")}),
     # the corner lies between the points of the differences; those of the remainder lead away from it
     "a corner": (lambda x: jnp.abs(x - 1.0), 1.0 + 1e-4, {}, {("x", "forward, differences")}),
+    "a corner ahead": (lambda x: jnp.abs(x - 1.0), 1.0 - 1e-4, {}, {("x", "forward, differences"), REMAINDER}),
 }
 
 

@@ -257,14 +257,16 @@ def _linearize_jit(model, given: State | None, t0, rotation, names: tuple[str, .
     if given is None:
         initial = equilibrium(system, t0)
         state, result, details = initial.state, initial.result, {"violation": initial.violation}
-        bases = Bases.of(system, state.q, t0)
+        jacobian = full_jacobian(system, state.q, t0)
+        bases = Bases.of(system, jacobian)
         space = at(state, None, bases)
         steady, changing = accelerates_steadily(system, state, None, space.A), jnp.zeros(len(outputs), bool)
     else:
         turning = turning_axes(system, given, rotation)
         q, v, turn = later(system, given, rotation, turning)
         twice = lambda now, then: jax.tree.map(lambda *leaves: jnp.stack(leaves), now, then)
-        (q, v), bases = twice((given.q, given.v), (q, v)), Bases.of(system, given.q, t0)
+        jacobian = full_jacobian(system, given.q, t0)
+        (q, v), bases = twice((given.q, given.v), (q, v)), Bases.of(system, jacobian)
         vdot, lam = jax.vmap(lambda q, v: accelerations(system, q, v, t0))(q, v)
         states = State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
         turned = jax.tree.map(lambda basis: turn @ basis, bases)
@@ -275,7 +277,6 @@ def _linearize_jit(model, given: State | None, t0, rotation, names: tuple[str, .
         alike = _alike(space, again)
         steady = accelerates_steadily(system, state, turning, space.A) & alike.A & alike.B
         changing = ~(alike.C & alike.D & alike.D1 & alike.D2)
-    jacobian = full_jacobian(system, state.q, t0)
     redundant = is_redundant(system, constraint_jacobian(system, state.q, t0))
     unsteady = jnp.where(steady, RESULTS.outputs_not_steady, RESULTS.not_steady)
     result = jnp.where((result == RESULTS.successful) & ~(steady & ~jnp.any(changing)), unsteady, result)

@@ -57,7 +57,7 @@ import jax.scipy.linalg as jsl
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import AbstractSystem, State, full_jacobian, kkt_solve
+from lgsens.dynamics import AbstractSystem, State, kkt_solve
 
 Built = Callable[[Float[Array, "p 3"]], AbstractSystem]  # the system, given u, u̇ and ü of its p inputs
 Outputs = Callable[[AbstractSystem, State], Float[Array, " o"]]
@@ -81,9 +81,9 @@ class Bases(NamedTuple):
     velocity: Float[Array, "k g"]  # Y
 
     @classmethod
-    def of(cls, system: AbstractSystem, q, t) -> "Bases":
-        jacobian, rows = full_jacobian(system, q, t), system.num_velocity_rows
-        velocity = null_space(system, jacobian)
+    def of(cls, system: AbstractSystem, jacobian: Float[Array, "m k"]) -> "Bases":
+        """`jacobian`: J there, rows of velocities last."""
+        rows, velocity = system.num_velocity_rows, null_space(system, jacobian)
         places = null_space(system, jacobian[: jacobian.shape[0] - rows]) if rows else velocity
         return cls(places[:, : places.shape[1] - system.num_states], velocity)
 

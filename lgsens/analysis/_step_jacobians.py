@@ -158,7 +158,7 @@ def step_jacobians(
 
 def _chart(system: AbstractSystem, state: State, t) -> Chart:
     mass, jacobian = system.mass_matrix(), full_jacobian(system, state.q, t)
-    position, velocity = Bases.of(system, state.q, t)
+    position, velocity = Bases.of(system, jacobian)
 
     def left(x):
         return constraint_velocity(system, system.group.retract(state.q, position @ x), state.v, t)

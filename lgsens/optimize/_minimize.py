@@ -124,11 +124,10 @@ def minimize(
             again.
 
     A step into a region where f, g or the gradient is not finite is halved until they are. Warns of a gradient that is
-    zero at x0. Raises
-    `ValueError` for bounds of another shape than x0, lower ≥ upper, x0 outside them, a logarithmic scale over
-    0, `num_steps` < 1, a tolerance that is out of range, an f or g that is not finite at x0 or has no derivative in the
-    mode, and a checkpoint of another problem. Derivations and sources: `lgsens/optimize/_slsqp.py` and
-    `_augmented_lagrangian.py`.
+    zero at x0. Raises `ValueError` for bounds of another shape than x0, lower ≥ upper, x0 outside them, a logarithmic
+    scale over 0, `num_steps` < 1, a tolerance that is out of range, an f or g that is not finite at x0 or has no
+    derivative in the mode, and a checkpoint of another problem. Derivations and sources:
+    `lgsens/optimize/_slsqp.py` and `_augmented_lagrangian.py`.
     """
     as_count(num_steps, "num_steps")  # before anything is compiled
     search = Minimization(

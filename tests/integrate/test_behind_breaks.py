@@ -67,7 +67,7 @@ def test_a_ramp_may_begin_at_t0():
     assert off[~within].max() < 1.5e-2  # first order: 0.2
 
 
-@pytest.mark.slow  # equal and aligned steps are in the quick run
+@pytest.mark.slow  # samples, below, are in the quick run
 def test_error_control_sees_it():
     off, _ = errors("ramp", "adaptive", 400)
     assert off.max() < 3e-3  # tolerance^(2/3) = 1e-4, times what s⁗ T² is of s̈, 30; first order: 0.1
