@@ -67,7 +67,6 @@ from lgsens.dynamics._rank import (
     repeated_rows as repeated_rows,
 )
 from lgsens.dynamics._redundant import (
-    AbstractRedundantSystem as AbstractRedundantSystem,
     least_norm as least_norm,
     require_independent as require_independent,
     softness as softness,

@@ -33,7 +33,6 @@ Initial state. K = [[M, Bᵀ], [B, 0]] is singular and its equations are consist
 in the corner of K_c leaves ε^k of the error after k iterations (proximal point method).
 """
 
-import abc
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -56,20 +55,9 @@ _FALLS = 0.99  # what round-off leaves along n does not
 _ENOUGH = 1e-12  # of the first correction
 
 
-class AbstractRedundantSystem(AbstractSystem):
-    """A system whose constraints may be redundant."""
-
-    @property
-    @abc.abstractmethod
-    def compliance(self) -> Float[Array, " m"] | None:
-        """d > 0: how much each constraint gives way to its multiplier, of the size of B M⁻¹ Bᵀ; the multipliers
-        that minimize Σ d_i λ_i² are those of the system. None: no redundant constraint is accepted."""
-
-
 def softness(system: AbstractSystem) -> Float[Array, " m"] | None:
     """c; None: no constraint may be redundant."""
-    compliance = system.compliance if isinstance(system, AbstractRedundantSystem) else None
-    return None if compliance is None else SOFTNESS * lax.stop_gradient(compliance)
+    return None if system.compliance is None else SOFTNESS * lax.stop_gradient(system.compliance)
 
 
 def require_independent(system: AbstractSystem, method: str) -> None:
@@ -119,10 +107,9 @@ def refined(product: Callable, solve: Callable, rhs):
 @partial(jax.jit, inline=True)  # one program where it is not called inside another
 def least_norm(system: AbstractSystem, q, lam: Float[Array, " m"], t) -> Float[Array, " m"]:
     """The multipliers of least Σ d_i λ_i² with the same Bᵀλ, at one instant; λ itself if none may be redundant."""
-    compliance = system.compliance if isinstance(system, AbstractRedundantSystem) else None
-    if compliance is None:
+    if system.compliance is None:
         return lam
-    root = jnp.sqrt(compliance)
+    root = jnp.sqrt(system.compliance)
     # Any metric of the coordinates gives the same projection; this one makes them comparable.
     rows = full_jacobian(system, q, t) * lax.stop_gradient(system.coordinate_scale())[None, :] / root[:, None]
     normal = rows @ rows.T

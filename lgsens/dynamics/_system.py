@@ -153,6 +153,12 @@ class AbstractSystem(eqx.Module):
         return jnp.zeros_like(self.reference()[1], shape=0)
 
     @property
+    def compliance(self) -> Float[Array, " m"] | None:
+        """d > 0: how much each constraint gives way to its multiplier, of the size of B M⁻¹ Bᵀ, where constraints may
+        be redundant; the multipliers that minimize Σ d_i λ_i² are those of the system. None: they may not be."""
+        return None
+
+    @property
     def repeated_names(self) -> tuple[str, ...]:
         """A name for each equation that was left out because the m constraints imply it."""
         return ()

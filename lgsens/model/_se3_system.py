@@ -25,14 +25,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import AbstractRedundantSystem, State, Tangents
+from lgsens.dynamics import AbstractSystem, State, Tangents
 from lgsens.liegroups import SE3, Power, RigidMotions, skew
 from lgsens.linear import SparseMatrix
 from lgsens.model._frames import ROTATION
 from lgsens.model._system import MultibodySystem
 
 
-class SE3System(AbstractRedundantSystem):
+def _of_bodies(name: str) -> Any:
+    return property(lambda self: getattr(self.bodies, name))
+
+
+class SE3System(AbstractSystem):
     """A `MultibodySystem` in coordinates of SE(3); built by `Model(formulation="SE3")`, dense.
 
     Attributes:
@@ -41,6 +45,24 @@ class SE3System(AbstractRedundantSystem):
 
     bodies: MultibodySystem
     assembled: bool = eqx.field(static=True)
+
+    # What positions, numbers and Ω alone tell is the same.
+    angular_velocities = _of_bodies("angular_velocities")
+    branches = _of_bodies("branches")
+    breaking = _of_bodies("breaking")
+    compliance = _of_bodies("compliance")
+    constraint = _of_bodies("constraint")
+    constraint_names = _of_bodies("constraint_names")
+    coordinate_scale = _of_bodies("coordinate_scale")
+    distance = _of_bodies("distance")
+    is_configuration = _of_bodies("is_configuration")
+    is_valid = _of_bodies("is_valid")
+    mass_matrix = _of_bodies("mass_matrix")
+    num_states = _of_bodies("num_states")
+    num_velocity_rows = _of_bodies("num_velocity_rows")
+    reads_multipliers = _of_bodies("reads_multipliers")
+    repeated_constraint = _of_bodies("repeated_constraint")
+    repeated_names = _of_bodies("repeated_names")
 
     @property
     def group(self) -> Power | RigidMotions:
@@ -79,36 +101,9 @@ class SE3System(AbstractRedundantSystem):
         rate = lambda vdot: self.to_bodies(q, self._acceleration(v, vdot))
         return State(q=q, v=self.to_bodies(q, v), vdot=rate(state.vdot), lam=state.lam, a=rate(state.a))
 
-    @property
-    def constraint_names(self):
-        return self.bodies.constraint_names
-
     def reference(self):
         pose, velocity = self.bodies.reference()
         return pose, self._from_bodies(pose, velocity)
-
-    def coordinate_scale(self):
-        return self.bodies.coordinate_scale()
-
-    def mass_matrix(self):
-        return self.bodies.mass_matrix()
-
-    def angular_velocities(self, v):
-        return self.bodies.angular_velocities(v)
-
-    def is_valid(self):
-        return self.bodies.is_valid()
-
-    def is_configuration(self, q):
-        return self.bodies.is_configuration(q)
-
-    @property
-    def compliance(self):
-        return self.bodies.compliance
-
-    @property
-    def num_states(self):
-        return self.bodies.num_states
 
     def settled(self, q, v, t):
         return self._from_bodies(q, self.bodies.settled(q, self.to_bodies(q, v), t))
@@ -117,22 +112,8 @@ class SE3System(AbstractRedundantSystem):
         vdot = self.to_bodies(q, self._acceleration(v, vdot))
         return self._from_bodies(q, self.bodies.residual(q, self.to_bodies(q, v), vdot, lam, t))
 
-    @property
-    def repeated_names(self):
-        return self.bodies.repeated_names
-
-    def repeated_constraint(self, q, t):
-        return self.bodies.repeated_constraint(q, t)
-
-    def constraint(self, q, t):
-        return self.bodies.constraint(q, t)
-
     def constraint_jacobian(self, q, t):
         return self._from_bodies(q, self.bodies.constraint_jacobian(q, t))
-
-    @property
-    def num_velocity_rows(self):
-        return self.bodies.num_velocity_rows
 
     def velocity_constraint(self, q, v, t):
         return self.bodies.velocity_constraint(q, self.to_bodies(q, v), t)
@@ -162,10 +143,6 @@ class SE3System(AbstractRedundantSystem):
         damping = damping.at[corner].add(-mass[:, None, None] * skews(u))
         damping = damping.at[at[:, :, None], at[:, None, :]].add(mass[:, None, None] * skews(omega))
         return Tangents(stiffness, damping, self._from_bodies(q, jacobian))
-
-    @property
-    def reads_multipliers(self):
-        return self.bodies.reads_multipliers
 
     def multiplier_jacobian(self, q, v, lam, t):
         every = self.bodies.multiplier_jacobian(q, self.to_bodies(q, v), lam, t)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import suggestion
-from lgsens.dynamics import AbstractRedundantSystem, AbstractSparseSystem, Tangents, finite, least_norm
+from lgsens.dynamics import AbstractSparseSystem, Tangents, finite, least_norm
 from lgsens.liegroups import Pose, Poses, Power, R3xSO3, cross, skew, turn
 from lgsens.linear import AbstractLinearSolver, Blocks, SparseMatrix, added, chosen
 from lgsens.model._blocks_of_bodies import body_blocks, rotation_operators
@@ -43,7 +43,7 @@ from lgsens.model._topology import Topology, topology
 _traced_once = partial(jax.jit, inline=True)
 
 
-class MultibodySystem(AbstractSparseSystem, AbstractRedundantSystem):
+class MultibodySystem(AbstractSparseSystem):
     """Rigid bodies, joints and forces as stacked numbers.
 
     For body i with coordinates [x_i, θ_i] (paper §3.2, signs as in ERRATA):

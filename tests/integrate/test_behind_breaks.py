@@ -31,17 +31,18 @@ SCHEMES = {
 }
 
 
-def driven(signal):
+def driven(signal, formulation="R3xSO3"):
     """A body on a rail, moved by a driver; it may move across, too."""
     driver = lg.TranslationDriver(None, "body", at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0), value=signal)
-    return lg.Model({"body": lg.RigidBody(MASS, None, free="x y")}, {"driver": driver})
+    body = lg.RigidBody(MASS, None, free="x y")
+    return lg.Model({"body": body}, {"driver": driver}, formulation=formulation)
 
 
 @functools.cache
-def errors(signal, integrator, num_steps):
+def errors(signal, integrator, num_steps, formulation="R3xSO3"):
     """Of the driver's force against m s̈, relative to the largest, and which steps end behind a break in them."""
     signal = SIGNALS[signal]
-    run = lg.simulate(driven(signal), t1=T1, num_steps=num_steps, integrator=SCHEMES[integrator])
+    run = lg.simulate(driven(signal, formulation), t1=T1, num_steps=num_steps, integrator=SCHEMES[integrator])
     t, force = np.asarray(run.t), np.asarray(run.joint("driver").axial_force)
     exact = MASS * np.asarray(jax.vmap(jax.grad(jax.grad(signal)))(run.t))
     within = np.zeros(t.size, bool)
@@ -74,11 +75,20 @@ def test_error_control_sees_it():
 
 
 @pytest.mark.parametrize(
-    ("signal", "integrator"), some_quick([("cubic", "equal"), ("monotone", "equal"), ("cubic", "aligned")])
+    ("signal", "integrator", "formulation"),
+    some_quick(
+        [
+            ("cubic", "equal", "SE3"),
+            ("cubic", "equal", "R3xSO3"),
+            ("monotone", "equal", "R3xSO3"),
+            ("cubic", "aligned", "R3xSO3"),
+        ],
+        count=2,
+    ),
 )
-def test_behind_samples_forces_are_exact(signal, integrator):
+def test_behind_samples_forces_are_exact(signal, integrator, formulation):
     """Between samples of a cubic the third derivative is constant, and the scheme has no error of v̇."""
-    off, within = errors(signal, integrator, 130)
+    off, within = errors(signal, integrator, 130, formulation)
     # what behind is behind a break, 1.5e-8 h, times v̈/v̇ = 1/h at most; no aligned step has a break in it
     assert (off if integrator == "aligned" else off[~within]).max() < 1e-8
 

@@ -1,6 +1,7 @@
 """One scene on R³ × SO(3) and on SE(3): the same equations, another solution of second order, the same derivatives."""
 
 import dataclasses
+import inspect
 
 import equinox as eqx
 import jax
@@ -14,7 +15,7 @@ import lgsens as lg
 from lgsens.dynamics import State, autodiff_constraint_jacobian, autodiff_tangents
 from lgsens.examples import four_bar, heavy_top
 from lgsens.liegroups import RigidMotions
-from lgsens.model import SE3System
+from lgsens.model import MultibodySystem, SE3System
 
 
 def on_se3(model):
@@ -70,6 +71,14 @@ def test_mass_and_gyroscopic_forces_are_those_of_the_kinetic_energy():
     close(mass, np.diag([1.3, 1.3, 1.3, 0.2, 0.3, 0.4]), 1)
     expected = mass @ vdot - system.group.ad(v).T @ (mass @ v)
     close(system.residual(q, v, vdot, jnp.zeros(0), jnp.asarray(0.0)), expected, 20)
+
+
+def test_nothing_of_a_scene_is_left_out():
+    """What a `MultibodySystem` says in place of `AbstractSystem`, its equations on SE(3) do, too."""
+    interface = {name: said for name, said in vars(lg.AbstractSystem).items() if not name.startswith("_")}
+    own = lambda kind: {name for name, said in interface.items() if inspect.getattr_static(kind, name) is not said}
+    assert {"breaking", "compliance", "residual"} <= own(MultibodySystem)
+    assert own(MultibodySystem) == own(SE3System)
 
 
 @pytest.mark.slow  # two programs; the top about its fixed point is in the quick run
