@@ -48,10 +48,10 @@ def error_estimate(trajectory: Trajectory, integrator: AbstractIntegrator = Gene
     scheme says it has.
 
     The estimate is the leading term of the error in the motion, h^p times a function of time, p the order of the
-    scheme, right up to O(h^{p+1}). It does not see round-off, Newton's tolerance, the trapezoidal rule of a criterion,
-    forces that jump between two steps, a step with which the scheme does not resolve the motion at all, or the
-    transients (−ρ∞)ⁿ h² of v̇ and λ in the first steps. Where sizes of steps are no smooth function of time, errors of
-    v̇ and λ of index 3 are told in part only. The configuration and the velocity at t0 count as exact.
+    scheme, right up to O(h^{p+1}), and of generalized-α in equal steps the transients (−ρ∞)ⁿ of v̇ and λ. It does not
+    see round-off, Newton's tolerance, the trapezoidal rule of a criterion, forces that jump between two steps, or a
+    step with which the scheme does not resolve the motion at all. Where sizes of steps are no smooth function of time,
+    errors of v̇ and λ of index 3 are told in part only. The configuration and the velocity at t0 count as exact.
 
     Returns a `StateError` on the times of the trajectory; `corrected` adds it. Raises `ValueError` for a trajectory by
     another integrator, in unequal steps where the integrator has equal ones, or with too few steps, and for a scheme

@@ -18,10 +18,12 @@ from lgsens.dynamics._breaks import (
 )
 from lgsens.dynamics._constraints import (
     constraint_acceleration as constraint_acceleration,
+    constraint_jerk as constraint_jerk,
     constraint_velocity as constraint_velocity,
     fixed_velocity_rate as fixed_velocity_rate,
     full_jacobian as full_jacobian,
     names_of_all as names_of_all,
+    of_position_level as of_position_level,
     prescribed_velocity as prescribed_velocity,
 )
 from lgsens.dynamics._equilibrium import equilibrium as equilibrium
@@ -34,7 +36,6 @@ from lgsens.dynamics._initial import (
     given_way as given_way,
     initial_state as initial_state,
     is_redundant as is_redundant,
-    normal_jerk as normal_jerk,
     split_velocity as split_velocity,
 )
 from lgsens.dynamics._kinematics import (

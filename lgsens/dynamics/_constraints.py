@@ -83,6 +83,17 @@ def constraint_acceleration(system: AbstractSystem, q, v, vdot, t) -> Float[Arra
     return jax.jvp(lambda q, v, t: constraint_velocity(system, q, v, t), (q, v, t), motion)[1]
 
 
+def constraint_jerk(system: AbstractSystem, q, v, vdot, t) -> Float[Array, " m"]:
+    """d²/dt² c at v̈ = 0, of the same motion: J v̈ is what it lacks."""
+    motion = system.group.to_ambient(q, v), vdot, jnp.ones_like(t)
+    return jax.jvp(lambda q, v, t: constraint_acceleration(system, q, v, vdot, t), (q, v, t), motion)[1]
+
+
+def of_position_level(system: AbstractSystem, rows: Float[Array, " m"]) -> Float[Array, " m"]:
+    """The rows that have position level, 0 in place of the others."""
+    return rows.at[-system.num_velocity_rows :].set(0.0) if system.num_velocity_rows else rows
+
+
 def fixed_velocity_rate(system: AbstractSystem, q, v, t) -> Float[Array, " m"]:
     """γ: d/dt c at v̇ = 0."""
     motion = system.group.to_ambient(q, v), jnp.ones_like(t)

@@ -10,9 +10,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._xla import while_loop
 from lgsens.dynamics._constraints import (
-    constraint_acceleration,
     fixed_velocity_rate,
     full_jacobian,
+    of_position_level,
     prescribed_velocity,
     violation_of_all,
 )
@@ -57,9 +57,7 @@ def given_way(system: AbstractSystem, q, lam, t) -> Float[Array, " k"] | None:
     soft = softness(system)
     if soft is None:
         return None
-    gap = soft * lam
-    if system.num_velocity_rows:  # which say nothing of positions
-        gap = gap.at[-system.num_velocity_rows :].set(0.0)
+    gap = of_position_level(system, soft * lam)
     return ConstrainedMass.of(system, q, t).solve(jnp.zeros(system.group.dim, lam.dtype), gap)[0]
 
 
@@ -102,21 +100,6 @@ def _implicit_accelerations(system: AbstractSystem, q, v, t):
     start = jnp.zeros(k + jacobian.shape[0], v.dtype)
     y = lax.custom_root(equation, start, newton, tangent_solve)
     return y[:k], scale * y[k:]
-
-
-def normal_jerk(
-    system: AbstractSystem, q, v, vdot, t, other, factors: Factors | None = None
-) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-    """N v̈ and N x of a velocity x, N the M-orthogonal projection on the constraint directions.
-
-    N v̈ is what the constraints ask for: the least with J v̈ + d(J v̇ + γ)/dt = 0, the latter at fixed v̈ = 0.
-    """
-    motion = system.group.to_ambient(q, v), vdot, jnp.ones_like(t)
-    rate = lambda q, v, t: constraint_acceleration(system, q, v, vdot, t)
-    kkt = ConstrainedMass.of(system, q, t, factors)
-    rows = jnp.stack([-jax.jvp(rate, (q, v, t), motion)[1], kkt.jacobian @ other])
-    jerk, normal = jax.vmap(lambda row: kkt.solve(jnp.zeros_like(v), row)[0])(rows)
-    return jerk, normal
 
 
 def acceleration_and_jerk(system: AbstractSystem, q, v, t, factors: Factors | None = None):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from lgsens.dynamics import ConstrainedMass, consistent_velocity, given_way, normal_jerk
+from lgsens.dynamics import ConstrainedMass, consistent_velocity, constraint_jerk, given_way, of_position_level
 from lgsens.integrate._alpha import AbstractAlpha
 from lgsens.integrate._grid import Start
 
@@ -22,10 +22,10 @@ class AbstractAlphaBegin(AbstractAlpha):
 
         A smooth motion has a_n = v̇(t_n + Δ h), Δ = α_m − α_f, and with exact values the increment (27) misses the true
         one by h³ c (`missed_increment`). The constraint at t_{n+1} takes B c h³ out again, through the velocity once
-        the scheme is under way: B v_n = −h² B c there. Started with B v_0 = 0 it must do so through the first
-        accelerations, and λ is off by O(h) for some steps. So v_0 receives h² N c, N the M-orthogonal projection on the
-        constraint directions, and a_0 = v̇_0 + Δ h N v̈_0. Stabilized index 2 keeps B v = 0, and takes B c h³ out by its
-        correction. Where constraints may be redundant, the joints start with what they give way in a step, Φ = βh² c λ.
+        the scheme is under way: B v_n = h² B c there. Started with B v_0 = 0 it must do so through the first
+        accelerations, and λ is off by O(h) for some steps. So v_0 receives h² times `offsets`, and a_0 = v̇_0 + h of
+        them. Stabilized index 2 keeps B v = 0, and takes B c h³ out by its correction. Where constraints may be
+        redundant, the joints start with what they give way in a step, Φ = βh² c λ.
 
         The rest of v̈_0 is left out of a_0. By eq. (29) what a_0 lacks, δ = −Δ h (v̈_0 − N v̈_0), is gone after some
         steps like (−α_m/(1 − α_m))ⁿ, and what it leaves is an offset of v of Σ h ((1 − γ) δ_n + γ δ_{n+1}), which is
@@ -36,14 +36,23 @@ class AbstractAlphaBegin(AbstractAlpha):
         state = self.complete(system, initial.state)
         if not (self.second_order_start and system.constraint_names):
             return Start(state)
-        q, v, vdot = state.q, state.v, state.vdot
-        turning = self.missed_increment(system, v, vdot, jnp.zeros_like(v))
-        jerk, normal = normal_jerk(system, q, v, vdot, t0, turning, initial.factors)
-        a_1 = self.delta * jerk
+        a_1, v_2 = self.offsets(system, state, t0, initial.factors)
         if self.stabilized:
             return Start(state, a_1=a_1)
-        v_2 = self.missed_increment(system, v, vdot, jerk) - turning + normal  # N c, linear in v̈
-        return Start(state, q_2=given_way(system, q, self.beta * state.lam, t0), v_2=v_2, a_1=a_1)
+        return Start(state, q_2=given_way(system, state.q, self.beta * state.lam, t0), v_2=v_2, a_1=a_1)
+
+    def offsets(self, system, state, t, factors=None):
+        """(a − v̇)/h and (v − v_exact)/h² along the constraint directions once the scheme is under way: Δ N v̈, and the
+        least x, in the metric of M, with B x = B c; A x = 0 of rows that are kept at velocity level.
+
+        N v̈ is what the constraints ask for: the least with J v̈ + d(J v̇ + γ)/dt = 0, the latter at fixed v̈ = 0.
+        """
+        q, v, vdot = state.q, state.v, state.vdot
+        turning = self.missed_increment(system, v, vdot, jnp.zeros_like(v))
+        asked = -constraint_jerk(system, q, v, vdot, t)
+        kkt = ConstrainedMass.of(system, q, t, factors)
+        off = of_position_level(system, self.jerk_share * asked + kkt.jacobian @ turning)
+        return jax.vmap(lambda row: kkt.solve(jnp.zeros_like(v), row)[0])(jnp.stack([self.delta * asked, off]))
 
     def resumed(self, system, given, t0):
         given = super().resumed(system, given, t0)
@@ -66,7 +75,7 @@ class AbstractAlphaBegin(AbstractAlpha):
             a_n* = v̇_n + r (a_n − v̇_n),
 
         and with the velocity off the constraints by as much as steps of the new size keep it. Under way index 3 has
-        c(q_n, v_n) = −h² B c, c of `missed_increment` (see `start`), and with η = N v, the least change of v_n, in the
+        c(q_n, v_n) = h² B c, c of `missed_increment` (see `start`), and with η = N v, the least change of v_n, in the
         metric of M, that takes it to c(q_n, v) = 0,
 
             v_n* = v_n + (r² − 1) η,     c(q_n, v_n*) = r² c(q_n, v_n).
