@@ -40,10 +40,10 @@ _MESSAGES = {
     RESULTS.redundant_constraints: (
         "The joints constrain the same motion twice, so the multipliers are not unique. Give the bodies of a planar "
         "mechanism free='x y rz', replace one of the joints named by one with fewer equations (a revolute by a "
-        "spherical or a cylindrical joint, say), or remove it where the `free` coordinates of its bodies satisfy it "
-        "anyway. Or let Model(…, redundant='remove') leave out what repeats, or keep it and take the multipliers of "
-        "least norm, redundant='minimum_norm'; unless they do so in this configuration only, a singular one: "
-        "`constraint_rank` tells."
+        "spherical or a cylindrical joint, say; in a plane a cylindrical one by a revolute or a prismatic joint), or "
+        "remove it where the `free` coordinates of its bodies satisfy it anyway. Or let Model(…, redundant='remove') "
+        "leave out what repeats, or keep it and take the multipliers of least norm, redundant='minimum_norm'; unless "
+        "they do so in this configuration only, a singular one: `constraint_rank` tells."
     ),
     RESULTS.newton_failed: (
         "Newton's iteration did not converge. Try a smaller step (more `num_steps`), more "

@@ -42,6 +42,17 @@ def single_rotation(free: Iterable[str]) -> int | None:
     return axes[0] if len(axes) == 1 else None
 
 
+def plane_of(free: Iterable[str]) -> int | None:
+    """The axis (0, 1, 2) normal to the plane in which bodies with these degrees of freedom move; None: in none. Along
+    a line only they move in no one plane."""
+    free = {*free}
+    across = [i for i, name in enumerate(TRANSLATIONS) if name not in free]
+    if not free & {*ROTATIONS}:
+        return across[0] if len(across) == 1 else None
+    axis = single_rotation(free)
+    return axis if axis in across else None
+
+
 def is_along(direction, axis: int) -> bool:
     """Whether a direction is that of a coordinate axis, to the accuracy of data given with eight digits."""
     direction = np.asarray(direction)

@@ -19,7 +19,7 @@ from lgsens._validate import axis_field, point_field, require
 from lgsens.liegroups import cross
 from lgsens.model._constraints import AbstractRows, Coincidence, Distance, InPlane, Orthogonality
 from lgsens.model._frames import Frame, normals
-from lgsens.model._free import single_rotation
+from lgsens.model._free import ROTATIONS, TRANSLATIONS, is_along, single_rotation
 from lgsens.model._relative import (
     ANGLE,
     ARM_ANGLES,
@@ -211,6 +211,17 @@ class UniversalJoint(AbstractJoint):
         arm_a, arm_b = self._arms()
         own = Frame(self.at, jnp.stack([arm_a, arm_b, cross(arm_a, arm_b)], axis=1))
         return own, own
+
+    def violable_about(self, name, free, axis):
+        require(
+            lambda a, b: is_along(a, axis) or is_along(b, axis),
+            f"Joint {name!r}: one of its arms, `axis_a` {self.axis_a} or `axis_b` {self.axis_b}, must be that of "
+            f"{ROTATIONS[axis]!r}, the only rotation that {self.a!r} and {self.b!r} have; turn it, or free all "
+            "rotations of one of them.",
+            self.axis_a,
+            self.axis_b,
+        )
+        return tuple(i != axis or TRANSLATIONS[i] in free for i in range(3)), (False,)  # they turn about that arm
 
     def constraints(self, a, b):
         arm_a, arm_b = self._arms()

@@ -17,7 +17,7 @@ from lgsens.model._constraints import AbstractClosedFormConstraint, InPlane
 from lgsens.model._drivers import Angle
 from lgsens.model._elements import body_fixed
 from lgsens.model._frames import Frame, normals
-from lgsens.model._free import TRANSLATIONS, single_rotation
+from lgsens.model._free import TRANSLATIONS
 from lgsens.model._joints import AbstractJoint
 from lgsens.model._relative import ANGLE, DISPLACEMENT, frames_at
 from lgsens.model._signal_fields import prescribed_field, require_ratio
@@ -154,9 +154,8 @@ class ScrewJoint(AbstractJoint):
     def hinge(self):
         return self.axis
 
-    def violable(self, constraints, free):
-        axis = single_rotation(free)  # about the screw's
-        aside = axis is None or any(name in free for i, name in enumerate(TRANSLATIONS) if i != axis)
+    def violable_about(self, name, free, axis):
+        aside = any(name in free for i, name in enumerate(TRANSLATIONS) if i != axis)  # the rotation is the screw's
         return (False,), (False,), (aside,), (aside,), (True,)
 
     def constraints(self, a, b):

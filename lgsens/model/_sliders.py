@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from lgsens._validate import axis_field, point_field, require
 from lgsens.liegroups import cross
 from lgsens.model._frames import normals
-from lgsens.model._free import ROTATIONS
+from lgsens.model._free import ROTATIONS, TRANSLATIONS
 from lgsens.model._joints import AbstractJoint, _in_plane, _orthogonality, _same_orientation
 from lgsens.model._relative import ANGLE, DISPLACEMENT, ROTATION_VECTOR, frames_at
 
@@ -45,7 +45,8 @@ class AbstractAlongLine(AbstractJoint):
         require(
             lambda line: abs(line[axis]) <= np.sqrt(np.finfo(line.dtype).eps) * np.abs(line).max(),
             f"{type(self).__name__} between {self.a!r} and {self.b!r}: `axis` {self.axis} leaves the plane of their "
-            f"motion, that of the rotation {ROTATIONS[axis]!r}; turn it into the plane, or free more of them.",
+            f"motion, normal to {TRANSLATIONS[axis]}; turn it into the plane, or free more of them. What a line normal "
+            "to the plane does there, a RevoluteJoint or a SphericalJoint does.",
             self.axis,
         )
         return found(self.a, self.b, at=self.at, axis=self.axis, normal=axis)
@@ -64,8 +65,9 @@ class PrismaticJoint(AbstractAlongLine):
         axis: direction of sliding, inertial frame, shape (3,), any length > 0.
 
     Between bodies that move in a plane (`RigidBody.free`), in which `axis` lies, 2 equations are left: the multipliers
-    are a moment about the plane's normal, and the force of `b` on `a` across the axis. Raises `ValueError` for a wrong
-    shape, a zero axis, and one that leaves the plane of such bodies. Source: Haug (1989), §9.4.
+    are a moment about the plane's normal, if they turn about it, and the force of `b` on `a` across the axis. Raises
+    `ValueError` for a wrong shape, a zero axis, and one that leaves the plane of such bodies. Source: Haug (1989),
+    §9.4.
     """
 
     coordinates = (DISPLACEMENT,)
@@ -86,8 +88,8 @@ class _PrismaticInPlane(PrismaticJoint):
     def _triad(self):
         return _triad_in_plane(self.axis, self.normal)
 
-    def violable_about(self, name, free, axis):
-        return (True,), (False,), (False,), (True,), (False,)
+    def violable(self, constraints, free):
+        return (bool(free & {*ROTATIONS}),), (False,), (False,), (True,), (False,)
 
 
 class CylindricalJoint(AbstractAlongLine):
@@ -139,7 +141,7 @@ class _PointOnLineInPlane(PointOnLineJoint):
     def _triad(self):
         return _triad_in_plane(self.axis, self.normal)
 
-    def violable_about(self, name, free, axis):
+    def violable(self, constraints, free):
         return (True,), (False,)
 
 

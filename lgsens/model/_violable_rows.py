@@ -5,15 +5,14 @@ from collections.abc import Sequence
 from lgsens._validate import require
 from lgsens.model._body import RigidBody
 from lgsens.model._constraints import AbstractRows
-from lgsens.model._free import ROTATIONS, TRANSLATIONS, is_along, single_rotation
+from lgsens.model._free import ROTATIONS, is_along, plane_of, single_rotation
 from lgsens.model._joints import AbstractJoint
 
 
 def in_plane(joint: AbstractJoint, bodies: Sequence[RigidBody]) -> AbstractJoint:
     """The joint as it is between its bodies, one or two: where all of them move in one plane, in that plane."""
-    free = {name for body in bodies for name in body.free}
-    axis = single_rotation(free)
-    return joint if axis is None or TRANSLATIONS[axis] in free else joint.in_plane(axis)
+    axis = plane_of(name for body in bodies for name in body.free)
+    return joint if axis is None else joint.in_plane(axis)
 
 
 def violable_rows(
@@ -31,7 +30,7 @@ def violable_rows(
     """
     free = {name for body in bodies for name in body.free}
     axis = single_rotation(free)
-    if axis is not None and joint.assembled and (hinge := joint.hinge) is not None:
+    if axis is not None and (hinge := joint.hinge) is not None:
         require(
             lambda direction: is_along(direction, axis),
             f"Joint {name!r}: `axis` {hinge} must be that of {ROTATIONS[axis]!r}, the only rotation that "

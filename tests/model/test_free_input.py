@@ -94,6 +94,7 @@ def test_a_model_needs_a_degree_of_freedom():
 # Joints.
 
 PLANAR = {"free": "x y rz"}
+BARREL = {"pitch": 0.5, "travel": lg.Polynomial((0.0, 0.5 / (2.0 * np.pi)))}
 CONNECTIONS = {
     "planar bodies on a ball": (PLANAR, PLANAR, lambda a, b: lg.SphericalJoint(a, b, at=X), 2),
     "planar bodies on a hinge": (PLANAR, PLANAR, lambda a, b: lg.RevoluteJoint(a, b, at=X, axis=(0, 0, -2.0)), 2),
@@ -104,6 +105,15 @@ CONNECTIONS = {
     "planar on all": (PLANAR, {}, lambda a, b: lg.RevoluteJoint(a, b, at=X, axis=X), 5),
     "heave on the ground": ({"free": "z"}, None, lambda a, b: lg.FixedJoint(a, b, at=X), 1),
     "translations": ({"free": "x y"}, {"free": "y z"}, lambda a, b: lg.FixedJoint(a, b, at=X), 3),
+    "a bead on a wire": ({"free": "x y"}, None, lambda a, b: lg.PointOnLineJoint(b, a, at=X, axis=(1.0, 2.0, 0)), 1),
+    "a block on a rail": (
+        {"free": "x"},
+        {"free": "z"},
+        lambda a, b: lg.PrismaticJoint(b, a, at=X, axis=(1.0, 0, 1.0)),
+        1,
+    ),
+    "a cross in a plane": (PLANAR, PLANAR, lambda a, b: lg.UniversalJoint(a, b, at=X, axis_a=Y, axis_b=Z), 2),
+    "a barrel cam": ({"free": "rz"}, {"free": "z"}, lambda a, b: lg.ScrewJoint(a, b, at=Z, axis=Z, **BARREL), 1),
     "assembled by the user": (PLANAR, PLANAR, lambda a, b: lg.DistanceJoint(a, b, at_a=X, at_b=Y, length=1.0), 1),
 }
 
@@ -128,6 +138,12 @@ def test_equations_that_no_body_can_violate_are_gone():
     assert model.summary().equations == {"slide": 0}
     with pytest.raises(ValueError, match=says("Joint 'pin': `axis`", "'rz', the only rotation", "turn the axis")):
         lg.Model({"a": body(**PLANAR)}, {"pin": lg.RevoluteJoint("a", None, at=X, axis=X)}).system()
+    cross = lg.UniversalJoint("a", None, at=X, axis_a=X, axis_b=Y)
+    with pytest.raises(ValueError, match=says("Joint 'cross'", "one of its arms", "'rz', the only rotation")):
+        lg.Model({"a": body(**PLANAR)}, {"cross": cross}).system()
+    barrel = lg.ScrewJoint("a", None, at=X, axis=X, **BARREL)
+    with pytest.raises(ValueError, match=says("Joint 'cam': `axis`", "'rz', the only rotation")):
+        lg.Model({"a": body(**PLANAR)}, {"cam": barrel}).system()
 
 
 def test_a_superfluous_guide_is_named():

@@ -98,9 +98,25 @@ def test_friction_reads_what_is_left():
     np.testing.assert_allclose(found, jax.value_and_grad(expected)(slope), rtol=1e-7)
 
 
+@pytest.mark.parametrize("joint", [lg.PointOnLineJoint, pytest.param(lg.PrismaticJoint, marks=pytest.mark.slow)])
+def test_a_bead_on_a_wire(joint):
+    """A point mass that moves in a plane, without rotations: g sin α along the wire, m g cos α across."""
+    slope, wire = 0.6, np.array([np.cos(0.6), 0.0, -np.sin(0.6)])
+    model = lg.Model(
+        {"bead": lg.RigidBody(2.0, None, free="x z")},
+        {"wire": joint(None, "bead", at=(0.0, 0.0, 0.0), axis=wire)},
+        {"gravity": lg.Gravity((0.0, 0.0, -9.81))},
+    )
+    found = lg.simulate(model, **SETTINGS)
+    np.testing.assert_allclose(found.body("bead").position[-1], 0.02 * 9.81 * np.sin(slope) * wire, atol=1e-12)
+    across = np.array([np.sin(slope), 0.0, np.cos(slope)])  # a wire that is pressed by the bead
+    force = np.asarray(found.joint("wire").force)
+    np.testing.assert_allclose(np.abs(force @ across), 2.0 * 9.81 * np.cos(slope), rtol=1e-10)
+
+
 def test_a_line_that_leaves_the_plane_is_refused():
     for joint in (lg.PrismaticJoint, lg.PointOnLineJoint):
         body = lg.RigidBody(1.0, (0.1, 0.1, 0.1), free="x y rz")
         line = joint(None, "b", at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.2))
-        with pytest.raises(ValueError, match=says(joint.__name__, "'b'", "`axis`", "leaves the plane", "'rz'")):
+        with pytest.raises(ValueError, match=says(joint.__name__, "'b'", "`axis`", "leaves the plane", "normal to z")):
             lg.Model({"b": body}, {"line": line}).system()
