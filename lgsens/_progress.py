@@ -23,6 +23,8 @@ def compiling(what: str, progress: bool = True) -> Iterator[None]:
 class _Silent:
     """Stands in for the bar."""
 
+    n = total = 0
+
     def __enter__(self):
         return self
 

@@ -10,7 +10,7 @@ from lgsens._progress import progress_bar
 from lgsens._validate import as_count
 from lgsens.accuracy._balance import quality
 from lgsens.accuracy._programs import Program, Study, crowded, failed, in_turns, make_room
-from lgsens.accuracy._reference import Reference, converge
+from lgsens.accuracy._reference import MOST_RUNS, Reference, converge
 from lgsens.accuracy._setting import Build, Function, Setting, ladder
 from lgsens.accuracy._table import Row, Table
 from lgsens.linear import tuned
@@ -64,15 +64,17 @@ def work_precision(
     if as_count(rounds, "rounds") < _LEAST_ROUNDS:
         raise ValueError(f"`rounds` must be at least {_LEAST_ROUNDS}, got {rounds}: a median of fewer says little.")
     study = Study.of(fn, build, p, scale, t0, t1)
+    study.require_number(settings[0])
     reference = known.reference if reference is None and known is not None else reference
     if reference is not None and np.shape(reference.gradient) != study.scale.shape:
         raise ValueError(
             f"`reference`: its gradient must have shape {study.scale.shape}, got {np.shape(reference.gradient)}."
         )
-    with progress_bar(len(settings) + (6 if reference is None else 0), "program", progress) as bar:
+    with progress_bar(len(settings) + (MOST_RUNS if reference is None else 0), "program", progress) as bar:
         if reference is None:
             bar.set_postfix({"compiling": "the reference"})
             reference = converge(study, min(setting.num_steps for setting in settings), bar.update)
+            bar.total = bar.n + len(settings)
         rows = {} if known is None else {(row.setting.label, row.setting.num_steps): row for row in known}
         of = lambda setting: (setting.label, setting.num_steps)
         found = lambda: Table(tuple(rows[of(each)] for each in settings if of(each) in rows), reference, rounds)

@@ -17,7 +17,7 @@ from lgsens.criteria import Criterion, Task, reverse_by_parts
 from lgsens.dynamics import RESULTS
 from lgsens.linear import tuned
 from lgsens.sensitivity import DirectDifferentiation
-from lgsens.simulation import Trajectory, check_integrator, check_sensitivity, cut, richardson
+from lgsens.simulation import Trajectory, check_integrator, check_sensitivity, cut, interval, richardson, simulate
 
 
 class Study(NamedTuple):
@@ -38,7 +38,18 @@ class Study(NamedTuple):
         p = jax.tree.map(lambda leaf: as_float(leaf, None, "`p`"), p)
         if not jax.tree.leaves(p):
             raise ValueError("`p` has no arrays; there is nothing to differentiate.")
-        return cls(fn, build, p, _scales(p, scale), as_float(t0, (), "`t0`"), as_float(t1, (), "`t1`"))
+        return cls(fn, build, p, _scales(p, scale), *interval(t0, t1))
+
+    def require_number(self, setting: Setting) -> None:
+        """Raises `ValueError` where a setting's model is none, or Ψ of its motion no number: told before it is
+        compiled, since what raises later is a row that has failed."""
+        fn, build = _with_parameters(self.fn), setting.version(self.build)
+        run = lambda p: simulate(build(p), t0=self.t0, t1=self.t1, num_steps=setting.num_steps, throw=False)
+        found = jax.eval_shape(lambda p: fn(run(p), p), self.p)
+        shape = getattr(found, "shape", None)
+        if shape != ():
+            what = repr(found) if shape is None else f"shape {shape}"
+            raise ValueError(f"`fn` must return a number, got {what}; reduce it (jnp.sum), or take one entry.")
 
 
 def _scales(p, scale) -> np.ndarray:
@@ -99,6 +110,10 @@ class _OfTrajectory(NamedTuple):
         return self.function(trajectory)
 
 
+def _with_parameters(fn: Function) -> Callable:
+    return fn if isinstance(fn, Criterion) else _OfTrajectory(fn)
+
+
 class Program:
     """A setting of a study, compiled; what another one has compiled before serves it as well."""
 
@@ -112,7 +127,7 @@ class Program:
         check_sensitivity(self._method)
         self._start = None if state0 is None else lambda p: state0
         self._build = setting.version(study.build)
-        self._fn = study.fn if isinstance(study.fn, Criterion) else _OfTrajectory(study.fn)
+        self._fn = _with_parameters(study.fn)
         self.temporary_bytes = None
         seconds = []
         for call in (self._watched, _called):

@@ -33,6 +33,8 @@ _TRUSTED = 1e-3  # an error above which a route is no reference
 _LEAST_RATIO = 1 / 8
 _ROUND_OFF = 1e-12  # no error is estimated below: what the round-off of some hundred steps may leave
 _HOPELESS = 3  # runs without a finite number at the start, after which there is none to come
+_DOUBLED, _HALVED = 5, 7  # runs of the two routes, at most
+MOST_RUNS = _DOUBLED + _HALVED
 _AGREEMENT = 3.0  # the difference of two routes that the sum of their estimated errors explains
 
 
@@ -161,9 +163,9 @@ def converge(study: Study, coarsest: int, progress: Callable[[], Any] = lambda: 
     of_scheme = lambda levels, enough=TARGET: extrapolated(
         "GeneralizedAlpha, extrapolated", scheme, 4 * coarsest, levels, enough
     )
-    explicit = doubled("IndexReducedODE(Dopri8)", runs(IndexReducedODE(diffrax.Dopri8())), 2 * coarsest, 5)
+    explicit = doubled("IndexReducedODE(Dopri8)", runs(IndexReducedODE(diffrax.Dopri8())), 2 * coarsest, _DOUBLED)
     if not max(explicit.error) <= _TRUSTED:
-        implicit = of_scheme(7)
+        implicit = of_scheme(_HALVED)
     else:
         for levels in (3, 4, 5):  # no better than it takes to see whether the two agree
             implicit = of_scheme(levels)

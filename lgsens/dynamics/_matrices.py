@@ -51,8 +51,8 @@ def require_linear(system: AbstractSystem, method: str) -> None:
     if system.reads_multipliers:
         raise ValueError(
             f"{method} needs forces that do not depend on multipliers, and the model has friction from the forces of "
-            "its joints. Use GeneralizedAlpha with DirectDifferentiation() or AdjointVariable(), or give the friction "
-            "a `preload` and own_forces=False."
+            "its joints. Use `simulate` by GeneralizedAlpha, with DirectDifferentiation() or AdjointVariable(), or "
+            "give the friction a `preload` and own_forces=False."
         )
 
 
