@@ -150,9 +150,9 @@ class Table:
         return setting | numbers | {"below_reference": self.is_below_reference(row)}
 
 
-def _short(text: str, length: int = 90) -> str:
+def _short(text: str) -> str:
     line = " ".join(text.split())
-    return line if len(line) <= length else line[: length - 1] + "…"
+    return line if len(line) <= 90 else line[:89] + "…"
 
 
 def _number(value: Any, optional: bool = False) -> Any:

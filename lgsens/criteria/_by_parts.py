@@ -21,7 +21,7 @@ from lgsens.criteria._packed import Packed
 from lgsens.dynamics import RESULTS, AbstractSystem, State, is_redundant, names_of_all, softness
 from lgsens.integrate import AbstractIntegrator, Steps
 from lgsens.sensitivity import AbstractSensitivity
-from lgsens.simulation import Trajectory, as_system, begin, cut, for_any_number, run
+from lgsens.simulation import Begin, Trajectory, as_system, begin, cut, for_any_number, run
 
 
 class Parts(NamedTuple):
@@ -36,24 +36,43 @@ class Parts(NamedTuple):
 
 
 class Task(NamedTuple):
-    """Criteria, functions of (trajectory, p), and what they are criteria of; `start`: p ↦ state0, or None."""
+    """Criteria, functions of (trajectory, p), and what they are criteria of; `start`: p ↦ state0, or None.
 
-    criteria: tuple[Callable, ...]
+    The methods are of the flat vector of parameters.
+    """
+
+    criteria: tuple[Any, ...]  # a `Criterion` is one, too
     build: Callable[[Any], Any]
     start: Callable[[Any], State] | None
     integrator: AbstractIntegrator
-    num_steps: int
+    num_steps: Any  # an int or `Steps`
     t0: Any
     t1: Any
+    unravel: Any = None  # set inside of `jit`, where it is no key of the cache
+
+    def system(self, p) -> AbstractSystem:
+        return as_system(self.build(self.unravel(p)))
+
+    def begin(self, p) -> tuple[AbstractSystem, Begin]:
+        """The system and how its motion begins."""
+        system = self.system(p)
+        state0 = None if self.start is None else self.start(self.unravel(p))
+        return system, begin(self.integrator.scheme, system, self.t0, state0)
+
+    def simulate(self, p, sensitivity: AbstractSensitivity):
+        """Ψ of all criteria, and the run."""
+        system, begun = self.begin(p)
+        trajectory, details = run(system, begun, self.t0, self.t1, self.num_steps, self.integrator, sensitivity)
+        values = jnp.stack([criterion(trajectory, self.unravel(p)) for criterion in self.criteria])
+        return values, (trajectory, details)
 
 
 def reverse_by_parts(
-    task: Any, p, method: AbstractSensitivity, names: tuple[str, ...] = (), call: Callable = lambda f, *a: f(*a)
+    task: Task, p, method: AbstractSensitivity, names: tuple[str, ...] = (), call: Callable = lambda f, *a: f(*a)
 ) -> tuple[Parts, Trajectory]:
     """Ψ and dΨ/dp of each criterion of a task in reverse mode, and the motion (`cut` is to be).
 
-    `task`: a `Task`, or what has its fields; `names`: of criteria that are asked what they use; `call`: makes the
-    calls, and sees the programs.
+    `names`: of criteria that are asked what they use; `call`: makes the calls, and sees the programs.
     """
     t0, t1 = task.t0, task.t1
     numbers, functions = eqx.partition((task.build, task.start), eqx.is_array)  # a method of a pytree has numbers

@@ -13,7 +13,7 @@ from lgsens._brief import brief
 from lgsens._validate import as_count, as_parameters
 from lgsens._xla import tracing
 from lgsens.criteria._advice import direct_or_adjoint
-from lgsens.criteria._by_parts import Parts, reverse_by_parts, unique
+from lgsens.criteria._by_parts import Parts, Task, reverse_by_parts, unique
 from lgsens.criteria._certify import certify, check_certifiable
 from lgsens.criteria._criterion import Criterion, stacked
 from lgsens.criteria._criterion_use import Use, checked_for
@@ -33,17 +33,13 @@ from lgsens.sensitivity import (
     direct_on_the_fly,
 )
 from lgsens.simulation import (
-    Begin,
     Reached,
     aligned,
-    as_system,
-    begin,
     check_accuracy,
     check_integrator,
     for_any_number,
     interval,
     outcome,
-    run,
     throw_if_failed,
     warn_of_single_precision,
 )
@@ -175,7 +171,7 @@ def differentiate(
             "start needs four points. AdjointVariable() has no such limit."
         )
     names = tuple(f"Criterion {jax.tree_util.keystr(path)}".strip() for path, _ in paths)
-    task = _Task(leaves, build, state0, None, integrator, num_steps, t0, t1)
+    task = Task(leaves, build, state0, integrator, num_steps, t0, t1)
     details, labels, note = None, (), ""
     if isinstance(method, IndexReduced):
         value, gradient = by_index_reduced(task, p, method)
@@ -201,35 +197,6 @@ def _flies(method: Method, integrator: AbstractIntegrator) -> bool:
     return isinstance(method, DirectDifferentiation) and not (integrator.extrapolated or integrator.scheme.has_stages)
 
 
-class _Task(NamedTuple):
-    """What the methods share: criteria and scene as functions of the flat vector of parameters."""
-
-    criteria: tuple[Criterion, ...]
-    build: Callable[[Any], Any]
-    start: Callable[[Any], State] | None
-    unravel: Any  # set inside of `jit`, where it is no key of the cache
-    integrator: AbstractIntegrator
-    num_steps: Any  # an int or `Steps`
-    t0: Float[Array, ""]
-    t1: Float[Array, ""]
-
-    def system(self, p) -> AbstractSystem:
-        return as_system(self.build(self.unravel(p)))
-
-    def begin(self, p) -> tuple[AbstractSystem, Begin]:
-        """The system and how its motion begins."""
-        system = self.system(p)
-        state0 = None if self.start is None else self.start(self.unravel(p))
-        return system, begin(self.integrator.scheme, system, self.t0, state0)
-
-    def simulate(self, p, sensitivity: AbstractSensitivity):
-        """Ψ of all criteria, and the run."""
-        system, begun = self.begin(p)
-        trajectory, details = run(system, begun, self.t0, self.t1, self.num_steps, self.integrator, sensitivity)
-        values = jnp.stack([criterion(trajectory, self.unravel(p)) for criterion in self.criteria])
-        return values, (trajectory, details)
-
-
 class _Found(NamedTuple):
     """What a method returns: Ψ (c,), dΨ/dp (c, p), and how the simulation went."""
 
@@ -240,7 +207,7 @@ class _Found(NamedTuple):
 
 
 @eqx.filter_jit
-def _differentiate_jit(task: _Task, p, names: tuple[str, ...], method):
+def _differentiate_jit(task: Task, p, names: tuple[str, ...], method):
     flat, unravel = ravel_pytree(p)
     task = task._replace(unravel=unravel)
     system, integrator = task.system(flat), task.integrator
@@ -259,7 +226,7 @@ def _differentiate_jit(task: _Task, p, names: tuple[str, ...], method):
     return Parts(tuple(found.value), gradient, result, found.details, names_of_all(system), note)
 
 
-def _on_the_fly(task: _Task, p, constant: bool) -> _Found:
+def _on_the_fly(task: Task, p, constant: bool) -> _Found:
     integrator, scheme = task.integrator, task.integrator.scheme
 
     def start(p):
@@ -275,7 +242,7 @@ def _on_the_fly(task: _Task, p, constant: bool) -> _Found:
     return _Found(found.value, found.gradient, *ended)
 
 
-def _forwards(task: _Task, p, method: AbstractSensitivity) -> _Found:
+def _forwards(task: Task, p, method: AbstractSensitivity) -> _Found:
     """The derivative of the trajectory in forward mode, contracted by the criteria."""
 
     def function(p):
@@ -286,7 +253,7 @@ def _forwards(task: _Task, p, method: AbstractSensitivity) -> _Found:
     return _Found(value, gradient, result, details)
 
 
-def _continuous_adjoint(task: _Task, p, method: ContinuousAdjoint, uses: list[Use]) -> _Found:
+def _continuous_adjoint(task: Task, p, method: ContinuousAdjoint, uses: list[Use]) -> _Found:
     value, (trajectory, details) = task.simulate(p, DirectDifferentiation())
 
     def initial(p):
@@ -317,7 +284,7 @@ def _continuous_adjoint(task: _Task, p, method: ContinuousAdjoint, uses: list[Us
     return _Found(value, cotangents.p + of_initial, trajectory.result, details)
 
 
-def _differences(task: _Task, p, method: FiniteDifferences) -> _Found:
+def _differences(task: Task, p, method: FiniteDifferences) -> _Found:
     value, (trajectory, details) = task.simulate(p, DirectDifferentiation())
     task = task._replace(integrator=task.integrator.frozen(trajectory))  # a derivative is that on the grid found
     distance = method.step * jnp.where(p == 0.0, 1.0, jnp.abs(p))

@@ -1,18 +1,18 @@
 """`IndexReduced` as a method of `differentiate`."""
 
 import functools
-from typing import Any
 
 import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from lgsens.criteria._by_parts import Task
 from lgsens.criteria._criterion import stacked
 from lgsens.criteria._reference_methods import IndexReduced
 from lgsens.simulation import as_system
 
 
-def by_index_reduced(task: Any, p, method: IndexReduced):
+def by_index_reduced(task: Task, p, method: IndexReduced):
     """Values and gradients of the criteria of a task."""
     from lgsens.criteria._index_reduced import integrate_index_reduced  # diffrax takes its time to import
 

@@ -34,14 +34,12 @@ class Initial(NamedTuple):
     factors: Factors | None = None  # of `ConstrainedMass` there
 
 
-def split_velocity(
-    system: AbstractSystem, q, v, t, factors: Factors | None = None
-) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+def split_velocity(system: AbstractSystem, q, v, t) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
     """A change of velocity as the sum of what the constraints allow and what they do not, M-orthogonal to each other.
 
     [[M, Jᵀ], [J, 0]] [v_tangential; μ] = [M v; 0]
     """
-    kkt = ConstrainedMass.of(system, q, t, factors)
+    kkt = ConstrainedMass.of(system, q, t)
     tangential, _ = kkt.solve(kkt.mass @ v, jnp.zeros(kkt.jacobian.shape[0], v.dtype))
     return tangential, v - tangential
 
@@ -102,10 +100,10 @@ def _implicit_accelerations(system: AbstractSystem, q, v, t):
     return y[:k], scale * y[k:]
 
 
-def acceleration_and_jerk(system: AbstractSystem, q, v, t, factors: Factors | None = None):
+def acceleration_and_jerk(system: AbstractSystem, q, v, t):
     """v̇, λ and v̈ of the motion through (q, v): v̈ is the derivative of `accelerations` along q ṽ, v̇ and 1."""
 
-    (vdot, lam), derivative = jax.linearize(partial(accelerations, system, factors=factors), q, v, t)
+    (vdot, lam), derivative = jax.linearize(partial(accelerations, system), q, v, t)
     return vdot, lam, derivative(system.group.to_ambient(q, v), vdot, jnp.ones_like(t))[0]
 
 

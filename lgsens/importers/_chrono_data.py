@@ -31,11 +31,11 @@ class Data:
     def template(self) -> str:
         return str(self.content.get("Template", "TorsionArmSuspension"))
 
-    def get(self, section: str, key: str, default: Any = None) -> Any:
-        """An entry of a section."""
+    def get(self, section: str, key: str) -> Any:
+        """An entry of a section; None: there is none."""
         found = self.content.get(section)
         if not isinstance(found, dict) or key not in found:
-            return default
+            return None
         self.taken.add((section, key))
         return found[key]
 
@@ -57,10 +57,10 @@ class Data:
         """An angle in degrees at the top of the file [rad]."""
         return float(np.radians(self._as_number(self.content.get(key, 0.0), key)))
 
-    def mass(self, section: str, key: str = "Mass") -> float:
-        mass = self.number(section, key)
+    def mass(self, section: str) -> float:
+        mass = self.number(section, "Mass")
         if not 0.0 < mass < np.inf:
-            raise ValueError(f"{self.path}: {section}/{key} must be positive, got {mass!r} kg.")
+            raise ValueError(f"{self.path}: {section}/Mass must be positive, got {mass!r} kg.")
         return mass
 
     def curve(self, section: str, key: str) -> np.ndarray | None:

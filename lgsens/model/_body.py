@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from lgsens._brief import as_called
 from lgsens._validate import as_float, require, shaped
+from lgsens.model._checks import far_from_rotation
 from lgsens.model._frames import Frame
 from lgsens.model._free import ALL_FREE, ROTATIONS, TRANSLATIONS, Free, as_free, is_along, places, single_rotation
 
@@ -222,7 +223,6 @@ def _is_physical(inertia) -> bool:
 
 
 def _is_rotation(matrix) -> bool:
-    """RᵀR = I and det R = 1, to the accuracy of data given with eight digits (single precision: five)."""
+    """To the accuracy of data given with eight digits (single precision: three or four)."""
     matrix = np.asarray(matrix)
-    slack = np.sqrt(np.finfo(matrix.dtype).eps)
-    return bool(np.abs(matrix.T @ matrix - np.eye(3)).max() <= slack and np.linalg.det(matrix) > 0)
+    return not far_from_rotation(matrix, np.sqrt(np.finfo(matrix.dtype).eps))

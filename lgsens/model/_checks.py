@@ -121,15 +121,15 @@ def far_from_rotation(orientation, error: float = 0.1) -> Any:
     return ~((xp.max(xp.stack(errors), axis=0) <= error) & (handed > 0.0))  # NaN is far
 
 
-def is_inertia(inertia, slack: float = 0.1) -> Any:
-    """Whether E of the formulas above is positive semidefinite but for `slack` of the size of J; along leading axes.
+def is_inertia(inertia) -> Any:
+    """Whether E of the formulas above is positive semidefinite but for a tenth of the size of J; along leading axes.
 
     A thin disc is on the edge: differences and optimizers go beyond it by what they change. Of NumPy's arrays by NumPy.
     """
     xp: Any = np if isinstance(inertia, np.ndarray) else jnp
     size = xp.maximum(xp.max(xp.abs(inertia), axis=(-1, -2)), xp.finfo(inertia.dtype).tiny)
     moments = [inertia[..., i, i] / size for i in range(3)]
-    a, b, c = (sum(moments) / 2.0 - moment + slack for moment in moments)
+    a, b, c = (sum(moments) / 2.0 - moment + 0.1 for moment in moments)
     d, e, f = (inertia[..., i, j] / size for i, j in ((1, 2), (0, 2), (0, 1)))
     determinant = a * (b * c - d * d) - b * e * e - c * f * f - 2.0 * d * e * f
     minors = xp.stack([a, b, c, b * c - d * d, a * c - e * e, a * b - f * f, determinant])

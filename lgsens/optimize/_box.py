@@ -120,10 +120,10 @@ def checked_box(x0, lower, upper, log_scale) -> tuple[Array, Callable[[Array], P
     return x, unravel, Box(low, high, log, zero, one)
 
 
-def entry_names(tree) -> list[str]:
-    """Names for the numbers of a pytree, in the order of `ravel_pytree`: stiffness, points[0, 2], x[1]."""
+def entry_names(tree, root: str = "x") -> list[str]:
+    """Names for the numbers of a pytree, in the order of `ravel_pytree`: stiffness, points[0, 2]; of one array x[1]."""
     return [
-        leaf_name(path, "x") + (str(list(map(int, index))) if index else "")
+        leaf_name(path, root) + (str(list(map(int, index))) if index else "")
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
         for index in np.ndindex(np.shape(leaf))
     ]

@@ -26,6 +26,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from lgsens._validate import as_count, as_float, as_parameters, require, suggestion
+from lgsens.optimize._box import entry_names
 from lgsens.sweeps import SweepResult, sweep
 
 _DISTRIBUTIONS = ("normal", "uniform")
@@ -83,16 +84,6 @@ class ToleranceStack(NamedTuple):
     __repr__ = __str__
 
 
-def _names(tree: PyTree) -> tuple[str, ...]:
-    """One for each number: `camber`, `upper_arm.chassis[0, 2]`."""
-    found = []
-    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
-        name = jax.tree_util.keystr(path, simple=True, separator=".") or "value"
-        places = np.ndindex(np.shape(leaf)) if np.ndim(leaf) else [None]
-        found += [name if at is None else f"{name}[{', '.join(map(str, at))}]" for at in places]
-    return tuple(found)
-
-
 def _checked(p: PyTree, tolerances: PyTree) -> tuple[PyTree, PyTree]:
     """Both as arrays, tolerances in the shapes of p."""
     p = as_parameters(p)
@@ -136,7 +127,8 @@ def tolerance_stack(fun: Callable[[PyTree], PyTree], p: PyTree, tolerances: PyTr
     count = sum(leaf.size for leaf in jax.tree.leaves(outputs))
     derivative = jax.jacfwd if flat.size <= 2 * count else jax.jacrev
     jacobian, values = jax.jit(derivative(function, has_aux=True))(flat)
-    return ToleranceStack(_names(p), _names(outputs), ravel_pytree(tolerances)[0], values, jacobian)
+    names = lambda tree: tuple(entry_names(tree, "value"))
+    return ToleranceStack(names(p), names(outputs), ravel_pytree(tolerances)[0], values, jacobian)
 
 
 def monte_carlo(
