@@ -34,8 +34,10 @@ M-orthogonal projection on these directions, v_2 and a_1 the `offsets` of a star
 
 **Derivatives.** v̈ and v⃛ are differences of v̇, averaged so that they do not see the part (−1)ⁿ, which is nearly what
 transients are of for ρ∞ close to 1: their defects would be in resonance with L, which has the same eigenvalue. With
-D and A the difference and the mean of neighbours, v̈ = A⁴ D v̇/h and v⃛ = A³ D² v̇/h² of six values around the middle of a
-step, times ((1 + z)/2)⁴ and ((1 + z)/2)³ of zⁿ, z = −ρ∞: 6e-6 and 1e-4 at 0.9. Of a vibration they keep cos⁴(ωh/2).
+D and A the difference and the mean of neighbours, v̈ = A⁴ D v̇/h and v⃛ = A³ D² v̇/h², of six values around the middle
+of a step, times ((1 + z)/2)⁴ and ((1 + z)/2)³ of zⁿ, z = −ρ∞: 6e-6 and 1e-4 at 0.9. Of a vibration they keep
+cos⁴(ωh/2). Where that is little, since steps do not resolve it, what rings is to be told: coordinates of whose v̈ means
+would hide the half have plain differences, A⁰ and A.
 
 Sources: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I (2008), §II.8 (the principal error term
 solves the variational equation with the local error as its load); Arnold, Brüls & Cardona, Numerische Mathematik 129
@@ -44,6 +46,7 @@ solves the variational equation with the local error as its load); Arnold, Brül
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import (
@@ -59,6 +62,7 @@ from lgsens.integrate._grid import AbstractGrid
 from lgsens.integrate._linearized import Variation
 
 _MEANS = 4  # of neighbours, in v̈
+_HIDDEN, _LARGE = 0.5, 0.03  # what means may take out of v̈, of its own size, where that is such a part of the largest
 
 
 def _in_each_step(f: Float[Array, "i k"], order: int, means: int, num_steps: int) -> Float[Array, "n k"]:
@@ -73,13 +77,25 @@ def _in_each_step(f: Float[Array, "i k"], order: int, means: int, num_steps: int
     return jnp.concatenate([line(f[0], inner[0])[::-1], f, line(f[-1], inner[1])])
 
 
+def _derivatives(vdot: Float[Array, "n+1 k"], h) -> tuple[Float[Array, "n k"], Float[Array, "n k"]]:
+    """v̈ and v⃛ in each step, of coordinates in comparable units."""
+    n = vdot.shape[0] - 1
+    smooth = min(_MEANS, 2 * (n // 2) - 2)
+    (jerk, snap), (mean_jerk, mean_snap) = (
+        (_in_each_step(vdot, 1, means, n) / h, _in_each_step(vdot, 2, max(means - 1, 1), n) / h**2)
+        for means in (0, smooth)
+    )
+    size, hidden = (jnp.max(jnp.abs(x), axis=0) for x in (jerk, jerk - mean_jerk))
+    rings = lax.stop_gradient((hidden > _HIDDEN * size) & (size > _LARGE * jnp.max(size)))[None]
+    return jnp.where(rings, jerk, mean_jerk), jnp.where(rings, snap, mean_snap)
+
+
 def alpha_defects(scheme: AbstractAlphaBegin, system: AbstractSystem, grid: AbstractGrid, states: State) -> Variation:
     """b of equal steps, the first row that of the start; three steps at least."""
-    h, n = grid.first_size, states.v.shape[0] - 1
+    h = grid.first_size
     kappa = scheme.delta * (scheme.alpha_m - 0.5)
-    means = min(_MEANS, 2 * (n // 2) - 2)
-    jerk = _in_each_step(states.vdot, 1, means, n) / h
-    snap = _in_each_step(states.vdot, 2, max(means - 1, 1), n) / h**2
+    jerk, snap = _derivatives(states.vdot / system.coordinate_scale()[None], h)
+    jerk, snap = (rows * system.coordinate_scale()[None] for rows in (jerk, snap))
     middle = lambda f: (f[1:] + f[:-1]) / 2.0
     v, vdot = middle(states.v), middle(states.vdot)
     missed_x = jax.vmap(lambda *at: scheme.missed_increment(system, *at))(v, vdot, jerk)  # c

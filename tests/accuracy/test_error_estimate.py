@@ -135,6 +135,16 @@ def test_accelerations_and_forces_of_a_pendulum_from_the_first_step_on(case, rho
         assert np.abs(told - error).max() < 0.25 * np.abs(error).max()
 
 
+def test_what_rings_is_told():
+    """A damper that steps do not resolve, d h/m = 50, by an initial velocity: v̇ rings as (−0.9)ⁿ, and no mean of it may
+    hide that. Its size is told within a factor of three, though steps so long have no expansion in h."""
+    body = lg.RigidBody(1.0, None, velocity=(1.0, 0.0, 0.0), free="x")
+    damper = lg.SpringDamper(None, "b", at_a=(-1.0, 0.0, 0.0), at_b=(0.0, 0.0, 0.0), stiffness=0.0, damping=5e3)
+    run = lg.simulate(lg.Model({"b": body}, {}, {"damper": damper}), t1=1.0, num_steps=100)
+    size = lambda rows: np.abs(rows[10:30]).max()  # of v̇, which is zero there
+    assert size(run.states.vdot) / 3.0 < size(error_estimate(run).vdot) < 3.0 * size(run.states.vdot)
+
+
 NUM_STEPS = 24
 FRACTIONS = 1.0 + 0.3 * np.sin(np.arange(NUM_STEPS) / 4.0)
 DAMPED = lg.GeneralizedAlpha(0.5, tolerance=1e-12)
