@@ -41,6 +41,7 @@ def trailing_arms(p, *, compliant: bool):
     return lg.Model(bodies, joints, forces), centres
 
 
+@pytest.mark.slow  # the rig against the geometry is in `test_axles`
 def test_rates_and_levers_in_closed_form():
     """Rigid hinges: rates and lever ratios, anti-features from the line to the hinge."""
     vehicle = rigs.Vehicle(wheelbase=2.6, centre_height=0.5, braking_share=0.4, traction_share=1.0)

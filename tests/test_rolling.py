@@ -257,6 +257,7 @@ def test_small_motions_of_a_disc_that_rolls_straight():
         assert left.shape == (6,) and np.abs(left).max() < 1e-6  # √ε of a pair that shares a vector
 
 
+@pytest.mark.slow  # that of a disc that rolls straight is in the quick run
 def test_small_motions_about_an_equilibrium_of_a_disc():
     """On a spring to the axle that rolls with m + C/ρ², and upright as on a pin."""
     spring = lg.SpringDamper(

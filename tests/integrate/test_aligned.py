@@ -110,7 +110,7 @@ def test_breaks_are_those_of_all_signals_of_a_scene():
         },
         model.forces,
     )
-    for scene in (model, lg.simulate(model, t1=0.1, num_steps=2).system):  # as it is given, and assembled
+    for scene in (model, model.equations()):
         np.testing.assert_allclose(np.unique(breaks_of(scene)), [0.0, 0.2, START, 0.4, EDGES[1], 0.5, 0.9])
     lengths = np.asarray(piece_lengths(model, jnp.asarray(0.25), jnp.asarray(0.45)))
     np.testing.assert_allclose(lengths[lengths > 0.0], [START - 0.25, 0.4 - START, 0.05])

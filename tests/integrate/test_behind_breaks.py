@@ -82,8 +82,7 @@ def test_error_control_sees_it():
             ("cubic", "equal", "R3xSO3"),
             ("monotone", "equal", "R3xSO3"),
             ("cubic", "aligned", "R3xSO3"),
-        ],
-        count=2,
+        ]
     ),
 )
 def test_behind_samples_forces_are_exact(signal, integrator, formulation):

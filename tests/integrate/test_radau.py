@@ -169,8 +169,8 @@ def free_points():
 DENSE, SPARSE = lg.DenseLU(), lg.BlockSparse()
 LINEARIZED = [
     (SPARSE, free_points),
-    (SPARSE, machine),
     (SPARSE, points),
+    (SPARSE, machine),
     (DENSE, lambda: spinning_top(0.7)),
     (SPARSE, everything),
     (SPARSE, beam),

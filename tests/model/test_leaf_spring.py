@@ -29,6 +29,7 @@ def closed_form(thickness):
 FLAT = {"camber": 1e-3, "shackle_angle": 0.0}
 
 
+@pytest.mark.slow  # beams against closed forms are in `test_beam_problems`
 def test_a_flat_leaf_is_a_beam_on_two_supports():
     # (camber/length)² = 7e-7, some of it; 10 N bend it by a tenth of a millimetre
     np.testing.assert_allclose(rate(**FLAT), closed_form(0.008), rtol=5e-6)

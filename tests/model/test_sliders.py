@@ -98,7 +98,8 @@ def test_friction_reads_what_is_left():
     np.testing.assert_allclose(found, jax.value_and_grad(expected)(slope), rtol=1e-7)
 
 
-@pytest.mark.parametrize("joint", [lg.PointOnLineJoint, pytest.param(lg.PrismaticJoint, marks=pytest.mark.slow)])
+@pytest.mark.slow  # its equations are in `test_free_input`
+@pytest.mark.parametrize("joint", [lg.PointOnLineJoint, lg.PrismaticJoint])
 def test_a_bead_on_a_wire(joint):
     """A point mass that moves in a plane, without rotations: g sin α along the wire, m g cos α across."""
     slope, wire = 0.6, np.array([np.cos(0.6), 0.0, -np.sin(0.6)])
