@@ -23,9 +23,10 @@ class AbstractAlphaBegin(AbstractAlpha):
         A smooth motion has a_n = v̇(t_n + Δ h), Δ = α_m − α_f, and with exact values the increment (27) misses the true
         one by h³ c (`missed_increment`). The constraint at t_{n+1} takes B c h³ out again, through the velocity once
         the scheme is under way: B v_n = h² B c there. Started with B v_0 = 0 it must do so through the first
-        accelerations, and λ is off by O(h) for some steps. So v_0 receives h² times `offsets`, and a_0 = v̇_0 + h of
-        them. Stabilized index 2 keeps B v = 0, and takes B c h³ out by its correction. Where constraints may be
-        redundant, the joints start with what they give way in a step, Φ = βh² c λ.
+        accelerations, and λ is off by O(h) for some steps. So `offsets` are added: h² N c to v_0 and Δ h N v̈_0 to
+        a_0 = v̇_0, N the M-orthogonal projection on the constraint directions. Stabilized
+        index 2 keeps B v = 0, and takes B c h³ out by its correction. Where constraints may be redundant, the joints
+        start with what they give way in a step, Φ = βh² c λ.
 
         The rest of v̈_0 is left out of a_0. By eq. (29) what a_0 lacks, δ = −Δ h (v̈_0 − N v̈_0), is gone after some
         steps like (−α_m/(1 − α_m))ⁿ, and what it leaves is an offset of v of Σ h ((1 − γ) δ_n + γ δ_{n+1}), which is

@@ -78,8 +78,8 @@ def test_error_control_sees_it():
     ("signal", "integrator", "formulation"),
     some_quick(
         [
-            ("cubic", "equal", "SE3"),
             ("cubic", "equal", "R3xSO3"),
+            ("cubic", "equal", "SE3"),
             ("monotone", "equal", "R3xSO3"),
             ("cubic", "aligned", "R3xSO3"),
         ]
