@@ -36,8 +36,8 @@ M-orthogonal projection on these directions, v_2 and a_1 the `offsets` of a star
 transients are of for ρ∞ close to 1: their defects would be in resonance with L, which has the same eigenvalue. With
 D and A the difference and the mean of neighbours, v̈ = A⁴ D v̇/h and v⃛ = A³ D² v̇/h², of six values around the middle
 of a step, times ((1 + z)/2)⁴ and ((1 + z)/2)³ of zⁿ, z = −ρ∞: 6e-6 and 1e-4 at 0.9. Of a vibration they keep
-cos⁴(ωh/2). Where that is little, since steps do not resolve it, what rings is to be told: coordinates of whose v̈ means
-would hide the half have plain differences, A⁰ and A.
+cos⁴(ωh/2). Where that is little, since steps do not resolve it, what rings is to be told: coordinates of whose v̇ a mean
+A² hides a fifth, sin²(ωh/2), have plain differences, A⁰ and A.
 
 Sources: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I (2008), §II.8 (the principal error term
 solves the variational equation with the local error as its load); Arnold, Brüls & Cardona, Numerische Mathematik 129
@@ -62,7 +62,7 @@ from lgsens.integrate._grid import AbstractGrid
 from lgsens.integrate._linearized import Variation
 
 _MEANS = 4  # of neighbours, in v̈
-_HIDDEN, _LARGE = 0.5, 0.03  # what means may take out of v̈, of its own size, where that is such a part of the largest
+_RINGING, _LARGE = 0.2, 0.03  # what means take out of v̇, of its own size, where that is such a part of the largest
 
 
 def _in_each_step(f: Float[Array, "i k"], order: int, means: int, num_steps: int) -> Float[Array, "n k"]:
@@ -85,8 +85,8 @@ def _derivatives(vdot: Float[Array, "n+1 k"], h) -> tuple[Float[Array, "n k"], F
         (_in_each_step(vdot, 1, means, n) / h, _in_each_step(vdot, 2, max(means - 1, 1), n) / h**2)
         for means in (0, smooth)
     )
-    size, hidden = (jnp.max(jnp.abs(x), axis=0) for x in (jerk, jerk - mean_jerk))
-    rings = lax.stop_gradient((hidden > _HIDDEN * size) & (size > _LARGE * jnp.max(size)))[None]
+    size, hidden = (jnp.max(jnp.abs(x), axis=0) for x in (vdot, jnp.diff(vdot, 2, axis=0) / 4.0))
+    rings = lax.stop_gradient((hidden > _RINGING * size) & (size > _LARGE * jnp.max(size)))[None]
     return jnp.where(rings, jerk, mean_jerk), jnp.where(rings, snap, mean_snap)
 
 
