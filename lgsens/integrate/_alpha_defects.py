@@ -94,8 +94,8 @@ def alpha_defects(scheme: AbstractAlphaBegin, system: AbstractSystem, grid: Abst
     """b of equal steps, the first row that of the start; three steps at least."""
     h = grid.first_size
     kappa = scheme.delta * (scheme.alpha_m - 0.5)
-    jerk, snap = _derivatives(states.vdot / system.coordinate_scale()[None], h)
-    jerk, snap = (rows * system.coordinate_scale()[None] for rows in (jerk, snap))
+    scale = system.coordinate_scale()[None]
+    jerk, snap = (rows * scale for rows in _derivatives(states.vdot / scale, h))
     middle = lambda f: (f[1:] + f[:-1]) / 2.0
     v, vdot = middle(states.v), middle(states.vdot)
     missed_x = jax.vmap(lambda *at: scheme.missed_increment(system, *at))(v, vdot, jerk)  # c
