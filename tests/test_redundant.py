@@ -345,6 +345,25 @@ def test_without_joints_nothing_is_singular(factor_every):
     assert lg.simulate(stone, t1=0.1, num_steps=10, integrator=scheme).result == 0
 
 
+def test_friction_that_sticks_is_no_singular_configuration():
+    """Where a driven slider turns round, the slope of its friction adds γ h μN/w₀ = 25 kg to the 0.1 kg of the matrix.
+
+    Its constraints are the same all the time, and so is the margin, up to the weights of their singular values.
+    """
+    rail = lg.PrismaticJoint(None, "block", at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0))
+    driver = lg.TranslationDriver(
+        None, "block", at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0), value=lg.Harmonic(amplitude=0.1, frequency=2.0)
+    )
+    friction = lg.JointFriction("rail", coefficient=0.3, slip_speed=1e-3, preload=300.0, own_forces=False)
+    block = lg.RigidBody(0.1, (1.0, 1.0, 1.0))
+    model = lg.Model({"block": block}, {"rail": rail, "driver": driver}, {"friction": friction})
+    full_newton = lg.GeneralizedAlpha(factor_every=0)
+    found = lg.simulate(model, t1=0.2, num_steps=40, integrator=full_newton, throw=False)
+    assert found.result == lg.RESULTS.successful
+    known = found.stats.margin
+    assert jnp.min(known) > 0.1 * jnp.max(known)
+
+
 def test_a_pendulum_in_steps_too_long_fails_in_newton():
     """Its rod never loses rank; multipliers jump between solutions, and so do the margins."""
     run = lambda num_steps: lg.simulate(PENDULUM.build(PENDULUM.parameters), t1=10.0, num_steps=num_steps)

@@ -166,10 +166,6 @@ class AbstractEquations(eqx.Module):
     def linearized(self, node: Node, previous: State, state: State) -> AbstractLinearizedStep:
         """Their exact linearization at a converged step."""
 
-    @abc.abstractmethod
-    def margin(self, state: State, t) -> Float[Array, ""]:
-        """A margin (`_singular`) that can be compared with those of other step sizes."""
-
     def no_matrix(self, state: State, node: Node, factor_every: int, kind: Any = Inverse) -> Matrix | None:
         """Zeros in the shapes of the factors of an iteration matrix, to begin with; None: full Newton shares none."""
         if not factor_every:

@@ -93,10 +93,9 @@ class AbstractGeneralizedAlpha(AbstractAlphaBegin):
         due = matrix is not None and self._due(memory, node, before.a.size + before.lam.size)
         equations = shared.step(begun, node)
         state, next_guess, stats, matrix, made = take_step(equations, before, guess, matrix, due, running)
-        margin = guess.pace.margin(made, stats.margin, lambda: shared.margin(state, node.t))
         if matrix is not None:
-            watch = jax.tree.map(partial(jnp.where, made), watch.after(margin, node.t), watch)
-        return state, Memory(Past(next_guess, watch), matrix), stats._replace(margin=margin)
+            watch = jax.tree.map(partial(jnp.where, made), watch.after(stats.margin, node.t), watch)
+        return state, Memory(Past(next_guess, watch), matrix), stats
 
     def _due(self, memory: Memory, node, unknowns: int) -> Bool[Array, ""]:
         """Whether a step wants a new matrix."""

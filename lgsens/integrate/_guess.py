@@ -7,13 +7,11 @@ The parabola through three values at the times τ_0 > τ_1 > τ_2 has at τ the 
 3, −3, 1 at equal distances. Multipliers belong to the ends t_n of steps, algorithmic accelerations to t_n + Δ h_n.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from lgsens._xla import renewed_where
 from lgsens.dynamics import State
 
 _SAME = 2.0  # the change of h up to which modified Newton keeps its matrix
@@ -48,13 +46,6 @@ class Pace(NamedTuple):
     def changed(self, h, before) -> Bool[Array, ""] | bool:
         """Whether a matrix made for steps of size `before` is none for steps of size h."""
         return False if self.h is None else (h > _SAME * before) | (_SAME * h < before)
-
-    def margin(self, made, of_matrix, by_mass: Callable[[], Float[Array, ""]]) -> Float[Array, ""]:
-        """The margin (`_singular`) of a step, where it made a matrix: that of the matrix, or one that can be compared
-        where steps differ."""
-        if self.h is None:
-            return of_matrix
-        return renewed_where(jnp.asarray(made), by_mass, jnp.full_like(of_matrix, jnp.inf))
 
 
 class PastValues(NamedTuple):

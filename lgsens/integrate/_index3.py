@@ -62,7 +62,6 @@ from lgsens.dynamics import (
     AbstractSystem,
     State,
     Tangents,
-    constraint_jacobian,
     factor_size,
     factorized,
     mass_matrix,
@@ -74,7 +73,7 @@ from lgsens.dynamics import (
 )
 from lgsens.integrate._alpha import AbstractAlpha, AbstractEquations, AbstractStep, advance, increment
 from lgsens.integrate._linearized import AbstractLinearizedStep, Node, Variation
-from lgsens.integrate._singular import margin_by_mass, margin_of
+from lgsens.integrate._singular import margin_of
 from lgsens.linear import LU, Factors, Matrix
 
 
@@ -244,6 +243,3 @@ class Index3(AbstractEquations):
         upper = multiplier_jacobian(system, at_state.constraint_jacobian, state.q, state.v, state.lam, node.t)
         factors = factorize_iteration_matrix(self.scheme, system, at_state, self.mass, x, h, upper=upper)
         return Index3LinearizedStep(x, at_state, factors)
-
-    def margin(self, state, t):
-        return margin_by_mass(self.system, self.mass, constraint_jacobian(self.system, state.q, t), self.scale)

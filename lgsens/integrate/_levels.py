@@ -36,7 +36,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import State, full_jacobian, require_independent
+from lgsens.dynamics import State, require_independent
 from lgsens.integrate._alpha import AbstractAlpha, AbstractEquations, increment
 from lgsens.integrate._level_sparse import SparseLevelFactors, level_plan
 from lgsens.integrate._level_step import Counts, LevelFactors, LevelStep, LevelTangents, by_configuration
@@ -219,10 +219,3 @@ class Levels(AbstractEquations):
 
     def margin_at(self, jacobian):
         return margin_by_mass(self.system, self.mass, jacobian, self.scale)
-
-    def margin(self, state, t):
-        system = self.system
-        jacobian = (
-            full_jacobian(system, state.q, t) if self.plan is None else system.sparse_constraint_jacobian(state.q, t)
-        )
-        return self.margin_at(jacobian)

@@ -8,14 +8,15 @@ Let y be a fixed displacement, and S [x; μ] = [0; B y], that is B A⁻¹ Bᵀ �
 values σ_i of B A^{-1/2} and its singular vectors μ is the sum of the u_i (v_i · A^{1/2} y)/σ_i: where the smallest
 falls to zero, so does the margin
 
-    m = |B y|/|μ| ∝ σ_min,
+    m = |Bᵀ μ|/|μ| ∝ σ_min,
 
 linearly in time on both sides of the singular point, without any part along redundant equations. Two successive steps
 with 2 m_n ≤ m_{n−1} ≤ m_{n−2} say that it would be zero before the next one; where Newton's method jumps from one
 solution to another (steps too long for the motion), multipliers and so A jump with it, and m goes up and down. A motion
 that passes a singular configuration at a distance has a minimum of m instead, which steps that resolve it see as such.
-m lies between the squares of the smallest and the largest σ, wherever B y points: 1/|μ| alone would have peaks where
-B y is small.
+m lies between the smallest and the largest singular value of B, wherever y points and whatever A is: another step size,
+or friction that sticks and adds its slope to A, changes 1/|μ| by powers of ten, but both norms alike. Coordinates are
+in rad and lengths of the scene.
 
 m costs one product with the inverse that many steps share. Where m falls so fast that it would be zero before two such
 inverses are over, every step has its own.
@@ -38,13 +39,12 @@ def margin_of(factors: Factors, jacobian: Matrix, scale: Float[Array, " k"]) -> 
     if not jacobian.shape[0]:
         return jnp.full((), jnp.inf, scale.dtype)
     y = scale * jnp.asarray(np.random.default_rng(0).normal(size=scale.shape), scale.dtype)
-    moved = jacobian @ y
-    _, mu = factors.solve(jnp.zeros_like(scale), moved)
-    return jnp.sqrt(jnp.sum(moved**2) / jnp.sum(mu**2))
+    _, mu = factors.solve(jnp.zeros_like(scale), jacobian @ y)
+    return jnp.sqrt(jnp.sum((scale * (mu @ jacobian)) ** 2) / jnp.sum(mu**2))
 
 
 def margin_by_mass(system: AbstractSystem, mass: Matrix, jacobian: Matrix, scale: Float[Array, " k"]):
-    """m with M for A: it can be compared where steps are not equal, and costs a factorization."""
+    """m with M for A, where no factors of S are: it costs a factorization."""
     factors = factorized(system, mass, jacobian.T, jacobian, mass_scale(mass), softness=softness(system))
     return margin_of(factors, jacobian, scale)
 
