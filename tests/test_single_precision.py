@@ -28,6 +28,9 @@ def test_gradients_warn():
     build = lambda mass: lg.Model({"mass": lg.RigidBody(mass, None)}, {}, {"gravity": lg.Gravity((0.0, 0.0, -9.81))})
     with jax.enable_x64(False), pytest.warns(UserWarning, match="single precision.*jax_enable_x64"):
         lg.differentiate(criterion, build, 2.0, t1=0.1, num_steps=4)
+    refused = lambda mass: 1 / 0  # the warning is before all work
+    with jax.enable_x64(False), pytest.warns(UserWarning, match="single precision"), pytest.raises(ZeroDivisionError):
+        lg.certify(criterion, refused, 2.0, t1=0.1, num_steps=8)
 
 
 @pytest.mark.filterwarnings("ignore:lgsens runs in single precision")

@@ -13,6 +13,7 @@ from lgsens.dynamics import RESULTS
 _DUALITY = 1e-6  # round-off of long runs is far below
 _NEAR = 1e-3  # margins to singular configurations, relative to the largest
 _UNRESOLVED = 0.1  # of the steps
+_COARSE = 0.1  # relative errors of which estimates know the size, not the order that they fall with
 
 
 def _some(kinks: Sequence[Kink]) -> str:
@@ -73,10 +74,13 @@ class Certificate(NamedTuple):
         said = []
         if int(self.result) != RESULTS.successful:
             said.append(f"the simulation failed: {RESULTS(int(self.result)).message}")
-        if self.duality > _DUALITY:
+        single = np.asarray(self.value).dtype == np.float32
+        lost = "round-off of single precision, which grows as 1/h²: take double, or fewer steps"
+        if self.duality > (0.1 * self.tolerance if single else _DUALITY):
+            why = "an element is not linear in its tangents, or its equations are nearly singular"
             said.append(
-                f"direct and adjoint derivatives differ by {float(self.duality):.1e}, far above round-off: a rule of "
-                "an element is not linear in its tangents, or its equations are nearly singular"
+                f"direct and adjoint derivatives differ by {float(self.duality):.1e}"
+                + (f": {lost}" if single else f", far above round-off: a rule of {why}")
             )
         if self.exponential:
             said.append(
@@ -120,7 +124,8 @@ class Certificate(NamedTuple):
                 f"a singular configuration is near: the margin falls to {float(self.margin):.1e} of its largest"
             )
         if abs(float(self.newton)) > 0.1 * self.tolerance * abs(float(self.value)):
-            said.append(f"Newton's iteration leaves {float(self.newton):.1e} of Ψ: ask for a smaller `tolerance`")
+            advice = lost if single else "ask for a smaller `tolerance`"
+            said.append(f"Newton's iteration leaves {float(self.newton):.1e} of Ψ: {advice}")
         return tuple(said)
 
     @property
@@ -143,7 +148,8 @@ class Certificate(NamedTuple):
             lines.append(f"Not good to {asked}: the estimates do not hold.")
         else:
             factor = np.ceil(np.sqrt(max(self.relative) / self.tolerance) * 10.0) / 10.0
-            lines.append(f"Not good to {asked}: take {factor:g} times as many steps.")
+            least = "at least " if max(self.relative) > _COARSE else ""
+            lines.append(f"Not good to {asked}: take {least}{factor:g} times as many steps.")
         return "\n".join(lines)
 
     __repr__ = __str__

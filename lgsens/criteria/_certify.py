@@ -58,7 +58,7 @@ from lgsens.integrate import (
     singular_steps,
 )
 from lgsens.sensitivity import KnownRun
-from lgsens.simulation import Trajectory, check_integrator, interval, raise_if_failed
+from lgsens.simulation import Trajectory, check_integrator, interval, raise_if_failed, warn_of_single_precision
 
 _LEAST_STEPS = 8
 _REGULAR = 16.0  # of twice the time; in a regular motion sensitivities grow like t, under a constant force like t²
@@ -110,6 +110,7 @@ def certify(
     if not (isinstance(tolerance, float | int) and 0.0 < tolerance < 1.0):
         raise ValueError(f"`tolerance` must be a number between 0 and 1, got {tolerance!r}.")
     t0, t1 = interval(t0, t1)
+    warn_of_single_precision(t0.dtype)
     p = as_parameters(p)
     motion = known_motion(build, state0, p, t0, t1, num_steps, integrator)
     found, shared, trajectory, rough = _certified(tuple(criteria), motion, p, integrator)

@@ -60,6 +60,19 @@ def test_it_says_how_many_digits_and_what_to_do(oscillator):
     assert "take 2 times as many steps" in str(strict)
     assert not strict.good
     assert strict._replace(tolerance=0.5).good
+    coarse = strict._replace(value_error=0.2 * strict.value)  # the leading term says little of such
+    assert "take at least" in str(coarse)
+
+
+def test_round_off_of_single_precision_is_no_fault_of_elements(oscillator):
+    """Nor of Newton's iteration; what is far below the tolerance is as good as any."""
+    value = np.float32(oscillator.value)
+    single = oscillator._replace(value=value, duality=1e-2, newton=0.1 * value, tolerance=1e-2)
+    assert len(single.warnings) == 2
+    assert all("round-off of single precision" in warning for warning in single.warnings)
+    assert not single._replace(duality=1e-5, newton=1e-5 * value).warnings
+    double = single._replace(value=oscillator.value)
+    assert "a rule of an element" in double.warnings[0] and "a smaller `tolerance`" in double.warnings[1]
 
 
 @pytest.mark.slow
