@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from lgsens.dynamics import AbstractSystem, State
-from lgsens.integrate._linearized import AbstractLinearizedStep, Node
+from lgsens.integrate._linearized import AbstractLinearizedStep, Node, Variation
 from lgsens.integrate._scheme import AbstractScheme
 from lgsens.linear import LU, Inverse
 
@@ -63,6 +63,51 @@ def advance(scheme: AbstractAlpha, system: AbstractSystem, previous: State, u, h
         1.0 - scheme.alpha_f
     )
     return Motion(x, system.group.retract(previous.q, x), v, vdot)
+
+
+class AbstractAlphaLinearizedStep(AbstractLinearizedStep):
+    """Eqs. (24), (27)–(29), linearized at a converged step; the rows for (u, λ) are in between, those of S.
+
+    δw = Ad⁻¹(exp x) δw_n + T(x) (h δv_n + h² (½ − β) δa_n + βh² δu),     δv = δv_n + h (1 − γ) δa_n + γh δu,
+    δv̇ = (α_m δa_n − α_f δv̇_n)/(1 − α_f) + c δu.
+    """
+
+    x: eqx.AbstractVar[Float[Array, " k"]]
+
+    def carried(self, shared, h, previous: Variation, loads, row: Variation, moved=0.0):
+        """δw, δv, δv̇ at δu = 0; `moved`: what else is added to x."""
+        scheme, group, x = shared.scheme, shared.system.group, self.x
+        dx = h * previous.v + (h**2 * (0.5 - scheme.beta)) * previous.a + loads.x + moved
+        w = group.Ad_inv_mv(group.exp(x), previous.w) + group.tangent_mv(x, dx) + row.w
+        v = previous.v + (h * (1.0 - scheme.gamma)) * previous.a + loads.v + row.v
+        vdot = (scheme.alpha_m * previous.a - scheme.alpha_f * previous.vdot) / (1.0 - scheme.alpha_f) + row.vdot
+        return w, v, vdot
+
+    def ended(self, shared, h, carried, u, lam, correction=0.0) -> Variation:
+        """With the solution of the rows in between; `correction`: what is added to δu in x alone."""
+        scheme, (w, v, vdot) = shared.scheme, carried
+        w = w + shared.system.group.tangent_mv(self.x, (scheme.beta * h**2) * (u + correction))
+        return Variation(w, v + (scheme.gamma * h) * u, vdot + scheme.inertia_factor * u, lam, u)
+
+    def of_unknown(self, shared, h, c: Variation):
+        """The transpose of `ended`: what δu is multiplied by, and the part of it by x."""
+        scheme = shared.scheme
+        by_x = (scheme.beta * h**2) * shared.system.group.tangent_rmv(self.x, c.w)
+        return c.a + by_x + (scheme.gamma * h) * c.v + scheme.inertia_factor * c.vdot, by_x
+
+    def carried_back(self, shared, h, mu: Variation) -> tuple[Variation, Float[Array, " k"]]:
+        """The transpose of `carried`: of δ_n, and of x."""
+        scheme, group, x = shared.scheme, shared.system.group, self.x
+        mu_x = group.tangent_rmv(x, mu.w)
+        by_a = (h**2 * (0.5 - scheme.beta)) * mu_x + (h * (1.0 - scheme.gamma)) * mu.v
+        previous = Variation(
+            w=group.Ad_inv_rmv(group.exp(x), mu.w),
+            v=h * mu_x + mu.v,
+            vdot=-(scheme.alpha_f / (1.0 - scheme.alpha_f)) * mu.vdot,
+            lam=jnp.zeros_like(mu.lam),
+            a=by_a + (scheme.alpha_m / (1.0 - scheme.alpha_f)) * mu.vdot,
+        )
+        return previous, mu_x
 
 
 class Wear(NamedTuple):

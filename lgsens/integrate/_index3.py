@@ -71,8 +71,15 @@ from lgsens.dynamics import (
     tangents,
     times_tangent_operator,
 )
-from lgsens.integrate._alpha import AbstractAlpha, AbstractEquations, AbstractStep, advance, increment
-from lgsens.integrate._linearized import AbstractLinearizedStep, Node, Variation
+from lgsens.integrate._alpha import (
+    AbstractAlpha,
+    AbstractAlphaLinearizedStep,
+    AbstractEquations,
+    AbstractStep,
+    advance,
+    increment,
+)
+from lgsens.integrate._linearized import Node, Variation
 from lgsens.integrate._singular import margin_of
 from lgsens.linear import LU, Factors, Matrix
 
@@ -139,7 +146,7 @@ class Index3Loads(NamedTuple):
     v: Float[Array, " k"]
 
 
-class Index3LinearizedStep(AbstractLinearizedStep):
+class Index3LinearizedStep(AbstractAlphaLinearizedStep):
     """The equations above, and the factors of S at the converged state."""
 
     x: Float[Array, " k"]
@@ -151,51 +158,22 @@ class Index3LinearizedStep(AbstractLinearizedStep):
         return margin_of(self.factors, self.tangents.constraint_jacobian, scale)
 
     def forward(self, shared, node, previous, loads, row):
-        scheme, group, h, x = shared.scheme, shared.system.group, node.h, self.x
         k_t, c_t, jacobian = self.tangents
-        dx = h * previous.v + (h**2 * (0.5 - scheme.beta)) * previous.a + loads.x
-        w = group.Ad_inv_mv(group.exp(x), previous.w) + group.tangent_mv(x, dx) + row.w
-        v = previous.v + (h * (1.0 - scheme.gamma)) * previous.a + loads.v + row.v
-        vdot = (scheme.alpha_m * previous.a - scheme.alpha_f * previous.vdot) / (1.0 - scheme.alpha_f) + row.vdot
+        w, v, vdot = carried = self.carried(shared, node.h, previous, loads, row)
         u, lam = self.factors.solve(
             row.a - loads.residual - (shared.mass @ vdot + c_t @ v + k_t @ w),
-            row.lam - (loads.violation + jacobian @ w) / (scheme.beta * h**2),
+            row.lam - (loads.violation + jacobian @ w) / (shared.scheme.beta * node.h**2),
         )
-        return Variation(
-            w=w + group.tangent_mv(x, (scheme.beta * h**2) * u),
-            v=v + (scheme.gamma * h) * u,
-            vdot=vdot + scheme.inertia_factor * u,
-            lam=lam,
-            a=u,
-        )
+        return self.ended(shared, node.h, carried, u, lam)
 
     def backward(self, shared, node, c, loads):
-        scheme, group, h, x = shared.scheme, shared.system.group, node.h, self.x
-        alpha_m, alpha_f = scheme.alpha_m, scheme.alpha_f
         k_t, c_t, jacobian = self.tangents
-        mu_a, mu_lam = self.factors.solve(
-            c.a
-            + (scheme.beta * h**2) * group.tangent_rmv(x, c.w)
-            + (scheme.gamma * h) * c.v
-            + scheme.inertia_factor * c.vdot,
-            c.lam,
-            transposed=True,
-        )
-        mu_phi = mu_lam / (scheme.beta * h**2)
+        mu_a, mu_lam = self.factors.solve(self.of_unknown(shared, node.h, c)[0], c.lam, transposed=True)
+        mu_phi = mu_lam / (shared.scheme.beta * node.h**2)
         mu_w = c.w - mu_a @ k_t - mu_phi @ jacobian
-        mu_v = c.v - mu_a @ c_t
-        mu_vdot = c.vdot - mu_a @ shared.mass
-        mu_x = group.tangent_rmv(x, mu_w)
-        previous = Variation(
-            w=group.Ad_inv_rmv(group.exp(x), mu_w),
-            v=h * mu_x + mu_v,
-            vdot=-(alpha_f / (1.0 - alpha_f)) * mu_vdot,
-            lam=jnp.zeros_like(c.lam),
-            a=(h**2 * (0.5 - scheme.beta)) * mu_x
-            + (h * (1.0 - scheme.gamma)) * mu_v
-            + (alpha_m / (1.0 - alpha_f)) * mu_vdot,
-        )
-        return previous, Index3Loads(-mu_a, -mu_phi, mu_x, mu_v), Variation(mu_w, mu_v, mu_vdot, mu_lam, mu_a)
+        mu = Variation(mu_w, c.v - mu_a @ c_t, c.vdot - mu_a @ shared.mass, mu_lam, mu_a)
+        previous, mu_x = self.carried_back(shared, node.h, mu)
+        return previous, Index3Loads(-mu_a, -mu_phi, mu_x, mu.v), mu
 
 
 class Index3(AbstractEquations):

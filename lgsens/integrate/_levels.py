@@ -37,10 +37,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lgsens.dynamics import State, require_independent
-from lgsens.integrate._alpha import AbstractAlpha, AbstractEquations, increment
+from lgsens.integrate._alpha import AbstractAlpha, AbstractAlphaLinearizedStep, AbstractEquations, increment
 from lgsens.integrate._level_sparse import SparseLevelFactors, level_plan
 from lgsens.integrate._level_step import Counts, LevelFactors, LevelStep, LevelTangents, by_configuration
-from lgsens.integrate._linearized import AbstractLinearizedStep, Variation
+from lgsens.integrate._linearized import Variation
 from lgsens.integrate._singular import margin_by_mass
 from lgsens.linear import Elimination, Matrix
 
@@ -56,7 +56,7 @@ class LevelLoads(NamedTuple):
     v: Float[Array, " k"]
 
 
-class LevelLinearizedStep(AbstractLinearizedStep):
+class LevelLinearizedStep(AbstractAlphaLinearizedStep):
     """The equations above, and the factors of S₂ at the converged state."""
 
     x: Float[Array, " k"]
@@ -77,58 +77,35 @@ class LevelLinearizedStep(AbstractLinearizedStep):
         return jacobian[: counts.positions], jacobian[counts.positions - counts.both :]
 
     def forward(self, shared, node, previous, loads, row):
-        scheme, counts, group, h, x = shared.scheme, shared.counts, shared.system.group, node.h, self.x
-        position, velocity = scheme.beta * h**2, scheme.gamma * h
+        counts, h = shared.counts, node.h
+        position, velocity = shared.scheme.beta * h**2, shared.scheme.gamma * h
         k_t, c_t, *_, rate_stiffness = self.tangents
         of_positions, of_rates = self._jacobians(counts)
         dy = shared.inverse_mass @ (self.curvature @ previous.w + loads.correction)
-        dx = h * previous.v + (h**2 * (0.5 - scheme.beta)) * previous.a + loads.x + position * dy
-        w = group.Ad_inv_mv(group.exp(x), previous.w) + group.tangent_mv(x, dx) + row.w
-        v = previous.v + (h * (1.0 - scheme.gamma)) * previous.a + loads.v + row.v
-        vdot = (scheme.alpha_m * previous.a - scheme.alpha_f * previous.vdot) / (1.0 - scheme.alpha_f) + row.vdot
+        w, v, vdot = carried = self.carried(shared, h, previous, loads, row, position * dy)
         left = counts.as_rows(
             (loads.violation + of_positions @ w) / position, (loads.rate + of_rates @ v + rate_stiffness @ w) / velocity
         )
         u, lam = self.factors.solve(row.a - loads.residual - (shared.mass @ vdot + c_t @ v + k_t @ w), row.lam - left)
-        return Variation(
-            w=w + group.tangent_mv(x, position * (u + shared.correction(self.before, lam))),
-            v=v + velocity * u,
-            vdot=vdot + scheme.inertia_factor * u,
-            lam=lam,
-            a=u,
-        )
+        return self.ended(shared, h, carried, u, lam, shared.correction(self.before, lam))
 
     def backward(self, shared, node, c, loads):
-        scheme, counts, group, h, x = shared.scheme, shared.counts, shared.system.group, node.h, self.x
+        counts, h = shared.counts, node.h
         m = counts.multipliers
-        position, velocity = scheme.beta * h**2, scheme.gamma * h
-        alpha_m, alpha_f = scheme.alpha_m, scheme.alpha_f
+        position, velocity = shared.scheme.beta * h**2, shared.scheme.gamma * h
         k_t, c_t, *_, rate_stiffness = self.tangents
         of_positions, of_rates = self._jacobians(counts)
-        turned = position * group.tangent_rmv(x, c.w)
-        mu_a, mu_lam = self.factors.solve(
-            c.a + turned + velocity * c.v + scheme.inertia_factor * c.vdot,
-            jnp.concatenate([c.lam[:m], c.lam[m:] + self.before @ (shared.inverse_mass @ turned)]),
-            transposed=True,
-        )
+        of_unknown, by_x = self.of_unknown(shared, h, c)
+        of_lam = jnp.concatenate([c.lam[:m], c.lam[m:] + self.before @ (shared.inverse_mass @ by_x)])
+        mu_a, mu_lam = self.factors.solve(of_unknown, of_lam, transposed=True)
         phi, rate = counts.apart(mu_lam)
         phi, rate = phi / position, rate / velocity
         mu_w = c.w - mu_a @ k_t - phi @ of_positions - rate @ rate_stiffness
-        mu_v = c.v - mu_a @ c_t - rate @ of_rates
-        mu_vdot = c.vdot - mu_a @ shared.mass
-        mu_x = group.tangent_rmv(x, mu_w)
+        mu = Variation(mu_w, c.v - mu_a @ c_t - rate @ of_rates, c.vdot - mu_a @ shared.mass, mu_lam, mu_a)
+        previous, mu_x = self.carried_back(shared, h, mu)
         mu_y = position * (shared.inverse_mass @ mu_x)
-        previous = Variation(
-            w=group.Ad_inv_rmv(group.exp(x), mu_w) + mu_y @ self.curvature,
-            v=h * mu_x + mu_v,
-            vdot=-(alpha_f / (1.0 - alpha_f)) * mu_vdot,
-            lam=jnp.zeros_like(c.lam),
-            a=(h**2 * (0.5 - scheme.beta)) * mu_x
-            + (h * (1.0 - scheme.gamma)) * mu_v
-            + (alpha_m / (1.0 - alpha_f)) * mu_vdot,
-        )
-        of_loads = LevelLoads(-mu_a, -phi, -rate, mu_y, mu_x, mu_v)
-        return previous, of_loads, Variation(mu_w, mu_v, mu_vdot, mu_lam, mu_a)
+        previous = previous._replace(w=previous.w + mu_y @ self.curvature)
+        return previous, LevelLoads(-mu_a, -phi, -rate, mu_y, mu_x, mu.v), mu
 
 
 class Levels(AbstractEquations):
