@@ -87,9 +87,9 @@ _MESSAGES = {
     ),
     RESULTS.invalid_numbers: (
         "A number of the scene is not finite, or one that no body has (a mass that is not positive, an inertia whose "
-        "moments break the triangle inequality, an orientation far from a rotation), or a signal has no finite rate or "
-        "acceleration (√t at 0), or `t1` is not later than `t0`. Bound what an optimizer may change; a model "
-        "that is built outside of `jit` names the element."
+        "moments break the triangle inequality, an orientation far from a rotation) or that its `free` leaves out (a "
+        "velocity, the axis of its hinge), or a signal has no finite rate or acceleration (√t at 0), or `t1` is not "
+        "later than `t0`. Bound what an optimizer may change; a model that is built outside of `jit` names the element."
     ),
     RESULTS.not_steady: (
         "The motion is not steady: the equations of small motions about it change with time. Linearize at an "

@@ -13,6 +13,7 @@ import numpy as np
 from lgsens._validate import is_concrete
 from lgsens.liegroups import Pose
 from lgsens.model._body import RigidBody
+from lgsens.model._checks import outside_of_freedom
 from lgsens.model._evaluate_by_kind import StackRow, evaluated, joined, stacked
 from lgsens.model._forces import AbstractConnection, AbstractForce
 from lgsens.model._frames import Frame, ground_frame
@@ -143,6 +144,8 @@ def _assemble(
     mass = stacked([body.mass for body in ordered])
     pieces = [part for body in ordered for part in body.free_velocity]
     velocity = jnp.asarray(np.concatenate(pieces)) if is_concrete(pieces) else jnp.concatenate(pieces)
+    outside = outside_of_freedom(bodies.values(), [(joint, bodies_of(joint)) for joint in joints.values()])
+    velocity = velocity if outside is False else jnp.where(outside, jnp.nan, velocity)
     if more := len(free) - len(ordered):
         add = lambda of, value: jnp.concatenate([of, jnp.broadcast_to(value, (more, *of.shape[1:])).astype(of.dtype)])
         mass, inertia, centre = add(mass, 1.0), add(inertia, 0.0), add(centre, 0.0)

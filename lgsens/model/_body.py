@@ -12,7 +12,17 @@ from lgsens._brief import as_called
 from lgsens._validate import as_float, require, shaped
 from lgsens.model._checks import far_from_rotation
 from lgsens.model._frames import Frame
-from lgsens.model._free import ALL_FREE, ROTATIONS, TRANSLATIONS, Free, as_free, is_along, places, single_rotation
+from lgsens.model._free import (
+    ALL_FREE,
+    ROTATIONS,
+    TRANSLATIONS,
+    Free,
+    as_free,
+    is_along,
+    places,
+    single_rotation,
+    vanish_but_for,
+)
 
 
 class RigidBody(eqx.Module):
@@ -141,11 +151,16 @@ class RigidBody(eqx.Module):
         remedy = "free the others too" if self.inertia is not None else "give an `inertia` to what turns"
         rest = "" if self.pivot is None else " (that of the centre of mass follows from the rotation about `pivot`)"
         require(
-            lambda given: not np.delete(given, np.asarray(self.coordinates, int)).any(),
+            lambda given: vanish_but_for(given[None], [self.coordinates]),
             f"RigidBody: `velocity` {self.velocity} and `angular_velocity` {self.angular_velocity} must vanish but for "
             f"the degrees of freedom `free` = {self.free!r}; {remedy}, or leave out their velocity{rest}.",
-            jnp.concatenate([self.velocity, self.angular_velocity]),
+            self.velocities,
         )
+
+    @property
+    def velocities(self) -> Float[Array, "6"]:
+        """[ẋ, Ω]."""
+        return jnp.concatenate([self.velocity, self.angular_velocity])
 
     @property
     def coordinates(self) -> tuple[int, ...]:
@@ -157,7 +172,7 @@ class RigidBody(eqx.Module):
         """The velocities of the coordinates that the body has, in pieces."""
         if self.free == ALL_FREE:
             return self.velocity, self.angular_velocity
-        return (jnp.concatenate([self.velocity, self.angular_velocity])[np.asarray(self.coordinates, int)],)
+        return (self.velocities[np.asarray(self.coordinates, int)],)
 
     @property
     def frame(self) -> Frame:

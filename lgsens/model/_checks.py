@@ -9,7 +9,7 @@ seven principal minors are not negative.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, get_args
 
 import equinox as eqx
@@ -21,7 +21,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_float, is_concrete, is_float_array, leaf_name
-from lgsens.model._free import single_rotation
+from lgsens.model._free import ALL_FREE, single_rotation, vanish_but_for
 
 _ALIGNED = 1e-2  # rad: a turn about axes further apart is none about either
 
@@ -52,6 +52,22 @@ def check_axes(bodies: Mapping[str, Any], joints: Mapping[str, Any], forces: Map
                     f"{np.asarray(member.about)}, but these turn about {np.asarray(axis)} only, {where}; give it that "
                     "axis."
                 )
+
+
+def outside_of_freedom(bodies: Iterable[Any], joints: Iterable[tuple[Any, Sequence[Any]]]) -> Any:
+    """Whether a traced number says what the degrees of freedom of bodies leave out: a velocity, a tilt, the axis of a
+    joint, which is given with its bodies. Constructors and `violable_rows` say so of known ones. False: none is traced.
+    """
+    velocities = [(body.velocities, body.coordinates) for body in bodies if body.free != ALL_FREE]
+    axes = [(body.orientation[:, axis], (axis,)) for body in bodies if (axis := single_rotation(body.free)) is not None]
+    for joint, own in joints:
+        axis = single_rotation(name for body in own for name in body.free)
+        if axis is not None and joint.hinge is not None:
+            axes.append((joint.hinge, (axis,)))
+    traced = [[(vector, kept) for vector, kept in rules if not is_concrete(vector)] for rules in (velocities, axes)]
+    rows = [(lax.stop_gradient(jnp.stack([vector for vector, _ in rules])), rules) for rules in traced if rules]
+    agree = [vanish_but_for(vectors, [kept for _, kept in rules]) for vectors, rules in rows]
+    return ~jnp.stack(agree).all() if agree else False
 
 
 def strong(element: Any) -> Any:
@@ -163,6 +179,8 @@ def invalid_numbers(system: Any) -> list[str]:
             parts = (f"mass {float(system.mass[i]):.6g} kg", "inertia", "orientation, far from a rotation")
             wrong = [part for part, right in zip(parts, sound) if not right[0]]
         found += [f"body {name!r}: {part}" for part in wrong]
+    if not _finite(system.velocity):
+        found.append("a velocity, or a velocity, tilt or axis of what `free` leaves out of a body")
     for stack in (*system.constraints, *system.loads):
         for path, leaf in jax.tree_util.tree_leaves_with_path(stack.elements):
             bad = sorted({owner for owner, row in zip(stack.owners, np.asarray(leaf)) if not np.all(np.isfinite(row))})

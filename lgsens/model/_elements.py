@@ -7,9 +7,22 @@ import dataclasses
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens.model._frames import ALL, Frame
+
+
+def of_length(element: Any, method: str, value: Any, length: int, of: str) -> Any:
+    """What a method of an element returns. Raises `ValueError` unless it has this length; `of`: what it stands for.
+
+    A shorter one would be broadcast, or leave numbers out, wherever elements are put together.
+    """
+    if jnp.shape(value) != (length,):
+        raise ValueError(
+            f"{type(element).__name__}.{method} must return {of}, shape ({length},), got shape {jnp.shape(value)}."
+        )
+    return value
 
 
 def body_fixed(kind: str, body: str) -> dict[str, Any]:

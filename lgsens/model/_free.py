@@ -1,6 +1,7 @@
 """The degrees of freedom that a body has, by name."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -53,8 +54,14 @@ def plane_of(free: Iterable[str]) -> int | None:
     return axis if axis in across else None
 
 
-def is_along(direction, axis: int) -> bool:
-    """Whether a direction is that of a coordinate axis, to the accuracy of data given with eight digits."""
-    direction = np.asarray(direction)
-    across = np.delete(direction, axis)
-    return bool(np.abs(across).max() <= np.sqrt(np.finfo(direction.dtype).eps) * np.abs(direction).max())
+def vanish_but_for(vectors, kept: Sequence[Collection[int]]) -> Any:
+    """Whether vectors, rows, have no other entries than those kept of each, to the accuracy of data given with eight
+    digits. Of NumPy's arrays by NumPy: inside `jit` JAX would trace it."""
+    size = abs(vectors)
+    others = np.asarray([[float(i not in own) for i in range(size.shape[1])] for own in kept], size.dtype)
+    return (size * others <= np.finfo(size.dtype).eps ** 0.5 * size.max(axis=1, keepdims=True)).all()
+
+
+def is_along(direction, axis: int) -> Any:
+    """Whether a direction is that of a coordinate axis."""
+    return vanish_but_for(np.asarray(direction)[None], [(axis,)])

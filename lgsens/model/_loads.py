@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from lgsens._brief import brief
 from lgsens.liegroups import cross, skew
-from lgsens.model._elements import AbstractElement, body_fixed
+from lgsens.model._elements import AbstractElement, body_fixed, of_length
 from lgsens.model._frames import (
     BODY_DIM,
     ROTATION,
@@ -110,14 +110,19 @@ def num_states(load: Any) -> int:
     return len(load.states) if isinstance(load, AbstractDynamicLoad) else 0
 
 
+def of_states(load: AbstractDynamicLoad, method: str, value: Any) -> Any:
+    """What a method returns that says something of each state."""
+    return of_length(load, method, value, len(load.states), f"a number for each of the states {load.states}")
+
+
 def generalized_force(load: Any, a: Frame, b: Frame, va, vb, t, *z) -> Float[Array, " n"]:
     """Q, and where there are states z the force g on their carriers, n = 12 + 6 for each three of them."""
-    force = load.force(a, b, va, vb, t, *z)
-    if not num_states(load):
+    force = of_length(load, "force", load.force(a, b, va, vb, t, *z), 2 * BODY_DIM, "[F_a, M_a, F_b, M_b]")
+    if not (count := num_states(load)):
         return force
-    rate = load.rate(a, b, va, vb, t, *z)
-    zeros = jnp.zeros(BODY_DIM * (2 + len(carriers(rate.shape[0]))), force.dtype)
-    return zeros.at[: 2 * BODY_DIM].set(force).at[np.asarray(places_of_states(rate.shape[0]))].set(rate)
+    rate = of_states(load, "rate", load.rate(a, b, va, vb, t, *z))
+    zeros = jnp.zeros(BODY_DIM * (2 + len(carriers(count))), force.dtype)
+    return zeros.at[: 2 * BODY_DIM].set(force).at[np.asarray(places_of_states(count))].set(rate)
 
 
 class AbstractClosedFormLoad(AbstractLoad):

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from lgsens.liegroups import Pose, Poses
 from lgsens.linear import added
 from lgsens.model._frames import BODY_DIM, ROTATION
+from lgsens.model._loads import of_states
 from lgsens.model._stack import at_ends, constraint_jacobian, state_coordinates
 
 System = Any  # a MultibodySystem, which asks these functions
@@ -67,6 +68,8 @@ def coordinate_scale(system: System) -> Float[Array, " k"]:
         return jnp.tile(scale, len(system.body_names))
     every = scale[np.concatenate([np.asarray(own, int) for own in system.free])]
     for stack in system.dynamic:
-        sizes = jax.vmap(lambda load, length: load.size(length), in_axes=(0, None))(stack.elements, scale[0])
+        size = lambda load, length: of_states(load, "size", load.size(length))
+        of_each = jax.vmap(size, in_axes=(0, None), axis_size=len(stack.owners))  # an element may have no numbers
+        sizes = of_each(stack.elements, scale[0])
         every = every.at[state_coordinates(stack, system.index)].set(sizes)
     return every

@@ -22,6 +22,7 @@ from lgsens.model._constraints import (
     AbstractRows,
     AbstractVelocityConstraint,
 )
+from lgsens.model._elements import of_length
 from lgsens.model._evaluate_by_kind import StackRow, joined
 from lgsens.model._frames import (
     ALL,
@@ -227,8 +228,17 @@ def stack(placed: Sequence[Placed[Element]]) -> tuple[Stack[Element], ...]:
 
 def position_values(stacks: Sequence[Stack[Any]], q: Pose, t) -> list[Float[Array, "e rows"]]:
     """Φ of the elements of each stack, those that are not kept too."""
-    of_elements = lambda element, *args: element.value(*args)
-    return [stack.map(of_elements, ends, (t,)) for stack, ends in zip(stacks, at_ends(stacks, q))]
+    return [stack.map(value_of, ends, (t,)) for stack, ends in zip(stacks, at_ends(stacks, q))]
+
+
+def value_of(element: AbstractConstraint, *args) -> Float[Array, " rows"]:
+    """Φ of one element."""
+    return of_length(element, "value", element.value(*args), element.num_rows, "its `num_rows` equations")
+
+
+def rate_of(element: AbstractVelocityConstraint, *args) -> Float[Array, " rows"]:
+    """A v + b of one element."""
+    return of_length(element, "rate", element.rate(*args), element.num_rows, "its `num_rows` equations")
 
 
 # Elements with closed-form tangents use them; for the others autodiff perturbs by R (I + θ̃).
@@ -243,11 +253,11 @@ def constraint_jacobian(element: AbstractRows, a: Frame, b: Frame, t, *others: F
 
         def value(x):
             a_, b_, *others_ = tilted((a, b, *others), x)
-            return element.value(a_, b_, t, *others_)
+            return value_of(element, a_, b_, t, *others_)
 
         return jax.jacfwd(value)(zero)
     assert isinstance(element, AbstractVelocityConstraint)
-    return jax.jacfwd(lambda v: element.rate(a, b, v[BODY_A], v[BODY_B], t))(zero)
+    return jax.jacfwd(lambda v: rate_of(element, a, b, v[BODY_A], v[BODY_B], t))(zero)
 
 
 def constraint_force(element: AbstractRows, a: Frame, b: Frame, lam, t, *others: Frame):

@@ -21,7 +21,7 @@ from lgsens.model._constraints import AbstractRows
 from lgsens.model._frames import BODY_DIM, ROTATION, Frame, motion_at
 from lgsens.model._given_joints import GivenJoints, JointsOf
 from lgsens.model._left_out import names_left_out, values_left_out
-from lgsens.model._loads import AbstractDynamicLoad, AbstractLoad, generalized_force
+from lgsens.model._loads import AbstractDynamicLoad, AbstractLoad, generalized_force, of_states
 from lgsens.model._merged_parts import Parts
 from lgsens.model._rate_stiffness import rate_stiffness
 from lgsens.model._sizes import compliance, coordinate_scale, distance
@@ -34,6 +34,7 @@ from lgsens.model._stack import (
     load_by_multipliers,
     load_tangents,
     position_values,
+    rate_of,
     square_blocks,
     state_coordinates,
 )
@@ -224,7 +225,7 @@ class MultibodySystem(AbstractSparseSystem):
 
     def settled(self, q, v, t):
         for stack, ends in zip(self.dynamic, at_ends(self.dynamic, self._placed(q), self.twists(v))):
-            begun = stack.map(lambda load, *args: load.initial(*args), ends, (t,))
+            begun = stack.map(lambda load, *args: of_states(load, "initial", load.initial(*args)), ends, (t,))
             v = v.at[state_coordinates(stack, self.index)].set(begun)
         return v
 
@@ -290,7 +291,7 @@ class MultibodySystem(AbstractSparseSystem):
         of, first = self.topology, self.topology.num_constraints - self.num_velocity_rows
         stacks, rows = self.constraints[of.num_positions :], of.rows[of.num_positions :]
         values = [
-            (stack.map(lambda e, *args: e.rate(*args), ends, (t,)), np.where(own < 0, own, own - first))
+            (stack.map(rate_of, ends, (t,)), np.where(own < 0, own, own - first))
             for stack, ends, own in zip(stacks, at_ends(stacks, self._placed(q), self.twists(v)), rows)
         ]
         return added(values, self.num_velocity_rows, self.mass.dtype)

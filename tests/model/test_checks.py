@@ -102,6 +102,30 @@ def test_traced_numbers_end_a_run():
             lg.raise_if_failed(trajectory)
 
 
+def test_traced_numbers_of_what_a_body_leaves_out_end_a_run():
+    """A velocity out of the plane, a tilt of its axis or of a hinge, which would have no effect; round-off is none."""
+
+    def run(spin, tilt, axis):
+        rotated = jax.scipy.linalg.expm(tilt * jnp.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]))
+        bob = lg.RigidBody(1.0, (1.0, 1.0, 1.0), orientation=rotated, angular_velocity=spin, free="x y rz")
+        hinge = lg.RevoluteJoint(None, "bob", at=(0.0, 0.0, 0.0), axis=axis)
+        return lg.Model({"bob": bob}, {"hinge": hinge}).system().is_valid()
+
+    spin, axis, nothing = jnp.array([0.0, 0.0, 2.0]), jnp.array([0.0, 0.0, 1.0]), jnp.asarray(0.0)
+    off = jnp.array([1.0, 0.0, 0.0])
+    valid = jax.jit(run)
+    results = [
+        bool(valid(*numbers))
+        for numbers in (
+            (spin + 1e-12 * off, nothing, axis + 1e-12 * off),  # far below the eight digits that rules ask for
+            (spin + 0.1 * off, nothing, axis),
+            (spin, nothing + 0.1, axis),
+            (spin, nothing, axis + 0.1 * off),
+        )
+    ]
+    assert results == [True, False, False, False]
+
+
 def test_times_in_the_wrong_order():
     trajectory = traced(scene(), -10 * END)
     assert trajectory.result == lg.RESULTS.invalid_numbers

@@ -12,6 +12,7 @@ from helpers import close, random_body, random_point, says
 import lgsens as lg
 from lgsens.model import (
     AbstractConstraint,
+    AbstractDynamicLoad,
     AbstractForce,
     AbstractJoint,
     AbstractLoad,
@@ -355,3 +356,44 @@ def test_a_network_as_a_force():
     slope = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(jax.grad(lambda p: end(NetLoad(p, static)))(params)))
     at = lambda h: end(NetLoad(jax.tree.map(lambda leaf, one: leaf + h * one, params, along), static))
     np.testing.assert_allclose(slope, (at(1e-4) - at(-1e-4)) / 2e-4, rtol=1e-6)
+
+
+def test_elements_that_return_other_shapes_are_named():
+    """A rate of one number for two states would leave the second as it is, and an initial value would be both."""
+
+    class Memory(AbstractDynamicLoad):
+        states = ("fast", "slow")
+
+        def force(self, a, b, va, vb, t, z):
+            return jnp.zeros(12).at[6].set(z[1])
+
+        def rate(self, a, b, va, vb, t, z):
+            return -z
+
+        def initial(self, a, b, va, vb, t):
+            return jnp.ones(2)
+
+    class Acts(AbstractForce):
+        load: Any
+        bodies = ("beam",)
+
+        def loads(self, bodies):
+            return (Attached(self.load, None, "beam"),)
+
+    bodies = {"beam": lg.RigidBody(1.0, (0.1, 0.2, 0.2))}
+    run = lambda joints, forces: jax.eval_shape(
+        lambda: lg.simulate(lg.Model(bodies, joints, forces), t1=0.1, num_steps=2).t
+    )
+    one = lambda *args: jnp.ones(1)
+    run({}, {"memory": Acts(Memory())})
+    for method, shape, wrong in (("rate", 2, one), ("initial", 2, one), ("size", 2, one), ("force", 12, one)):
+        load = type("Wrong", (Memory,), {method: wrong})()
+        with pytest.raises(ValueError, match=says(f"Wrong.{method} must return", f"({shape},), got shape (1,)")):
+            run({}, {"memory": Acts(load)})
+
+    class Wide(Table):
+        def constraints(self, a, b):
+            return (type("Flat", (Level,), {"value": lambda self, a, b, t: b.position - a.position})(TIP, TIP),)
+
+    with pytest.raises(ValueError, match=says("Flat.value must return its `num_rows` equations, shape (1,)", "(3,)")):
+        run({"table": Wide(None, "beam")}, {})
