@@ -333,6 +333,17 @@ def test_a_truss_snaps_through_and_back_where_its_load_has_its_extremes(points):
     assert found.stable.all()
 
 
+def test_a_snap_is_said_however_loads_are_spaced():
+    """Close to the limit the tangent has no bound, and may point past the other branch, or by chance right at it."""
+    limit = -minimize_scalar(lambda z: -truss_load(z), bounds=(0.0, RISE), method="bounded").fun
+    model, rng = shallow_truss(), np.random.default_rng(1)
+    for _ in range(100):
+        loads = np.concatenate([[0.0], rng.uniform(0.1, 0.999, 1), rng.uniform(1.001, 10.0, 1)]) * limit
+        found = lg.statics(model, loads={"load": loads})
+        assert found.body("top").position[1, 2] > 0.0 > found.body("top").position[2, 2]
+        np.testing.assert_array_equal(found.snapped, [False, False, True])
+
+
 @pytest.mark.slow
 def test_a_perfect_column_stays_straight_and_is_said_to_be_unstable():
     """Above its critical load, that of a chain of `elements` with a hinge's stiffness E I/h and rigid in shear."""

@@ -15,7 +15,9 @@ Where that finds nothing, a quarter of the way is tried, from there more, along 
 tangent by an angle θ is stretched by θ²/2, and Newton's method is lost where forces of E A θ²/2 make K indefinite. So
 it is where a path of stable equilibria, Zᵀ K_t Z positive definite with B Z = 0, comes to one that is not: that is on
 another branch, unless the shortest stage finds it too and the path itself goes through a bifurcation. And so it is
-where Newton's method leaves more than half of what the tangent said: a smooth path leaves the square of a stage.
+where Newton's method moves a point by more than 2 % of the scene off the tangent, or the tangents before and behind say
+what differs by 10 %: a smooth path leaves the square of a stage. (A share of what the tangent says, in place of these,
+is as much as any jump before a limit point, where it has no bound.)
 
 What even the shortest stage does not reach is behind a limit point, where the mechanism snaps through. From the last
 point (and from the reference, where Newton's method finds no first point) it settles: Zᵀ K_t Z gets −1.5 times its
@@ -56,7 +58,7 @@ _MAX_ITERATIONS = 60
 _SOFT = 1e-3  # of the largest stiffness, where there is none
 _DAMPED = 1.5  # of a negative stiffness, added where a mechanism settles
 _SHORTER, _LONGER, _LEAST = 0.25, 2.0, 1e-3  # stages of the way to a point after one that failed, or not; the least
-_LEFT, _NEAR = 0.5, 0.02  # what Newton may leave of a stage, and in any case: rad, of the size of the scene
+_NEAR, _BENT = 0.02, 0.1  # how far Newton may move a point off the tangent, and the latter: rad, of the scene's size
 _SLOW = 0.2  # what a chord iteration may leave of a step before factors are renewed
 
 
@@ -228,19 +230,19 @@ def _path(starts: tuple[int, ...], drive: AbstractDrive, values, rates, t):
             q, lam = move(near.q, near.lam, ahead_of * near.w, ahead_of * near.lam_rate)
             q, lam, factors, moved, done = newton(at, q, lam, factors, stale, settles)
             stable, shortest = factors.stable, first | (share * _SHORTER <= _LEAST)
-            said = share * jnp.max(jnp.abs(near.w / factors.coordinate))
-            jumped = ~first & (moved > jnp.maximum(_LEFT * said, _NEAR))
+            # The last two directions are that of the stage and that onward.
+            along = jnp.concatenate([rates, way[None], jnp.where(to < 1.0, way, ahead)[None]])
+            w, lam_rate = respond(at, along, q, lam, factors)
+            bent = share * jnp.max(jnp.abs((w[-2] - near.w) / factors.coordinate))
+            jumped = ~first & ((moved > _NEAR) | (bent > _BENT))
             through = first | stable | ~near.stable | shortest  # a bifurcation, if not before it
             done = done & jnp.where(settles, stable, through & ~jumped)
-            # The last direction is that onward.
-            along = jnp.concatenate([rates, jnp.where(to < 1.0, way, ahead)[None]])
-            w, lam_rate = respond(at, along, q, lam, factors)
             keep = lambda new, old: jnp.where(done, new, old)
             near = jax.tree.map(keep, _Begin(at, q, lam, w[-1], lam_rate[-1], stable), near)
             snapped = snapped | (done & settles & ~first)
             lost, settles = settles & ~done, ~settles & ~done & shortest
             size = jnp.where(done, _LONGER, jnp.where(settles, 1.0, jnp.where(lost, 0.0, _SHORTER))) * share
-            return near, factors, ~done, keep(to, reached), size, settles, snapped, w[:-1], lam_rate[:-1]
+            return near, factors, ~done, keep(to, reached), size, settles, snapped, w[:-2], lam_rate[:-2]
 
         def unfinished(carry):
             _, _, _, reached, size, *_ = carry
