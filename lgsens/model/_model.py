@@ -109,7 +109,7 @@ class Model(eqx.Module):
                 if not isinstance(key, str):
                     raise ValueError(f"Model: a name in `{name}` must be a string, got {key!r}; give {str(key)!r}.")
         self.bodies, self.joints, self.forces = (
-            {name: strong(member) if isinstance(member, eqx.Module) else member for name, member in (of or {}).items()}
+            {str(name): strong(part) if isinstance(part, eqx.Module) else part for name, part in (of or {}).items()}
             for of in (bodies, joints, forces)
         )
         self.merge_fixed = merge_fixed

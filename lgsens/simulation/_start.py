@@ -69,9 +69,9 @@ def equilibrium(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) ->
     an acceleration at t0, its velocities are those that they give the mechanism at rest, as from an impulse (least
     kinetic energy), its accelerations and multipliers those of the motion that begins. Differentiable, by the implicit
     function theorem; where a body turns freely (a wheel on its hinge) both the state and its derivative are
-    those closest to the reference. It need not be a stable one, where the reference is near one that is not: there
-    `linearize(model).eigenvalues` have positive real parts. Raises `SimulationError` if none is found; inside `jit` the
-    state is NaN.
+    those closest to the reference. Redundant joints share their forces in one way of many. It need not be a stable one,
+    where the reference is near one that is not: there `linearize(model).eigenvalues` have positive real parts. Raises
+    `SimulationError` if none is found; inside `jit` the state is NaN.
     """
     return _found_state(_equilibrium_jit, model, t0, throw)
 

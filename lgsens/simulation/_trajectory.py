@@ -208,7 +208,7 @@ class AbstractMotion(eqx.Module):
         at = states.q, states.v, states.vdot, states.lam, t
         if jnp.ndim(t):
             return question(system, about, *at)
-        found = question(system, about, *jax.tree.map(lambda leaf: leaf[None], at))
+        found = question(system, about, *jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], at))
         return jax.tree.map(lambda leaf: leaf[0], found)
 
 
