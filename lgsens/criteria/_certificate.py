@@ -65,7 +65,7 @@ class Certificate(NamedTuple):
     def relative(self) -> tuple[float, float]:
         """The estimated errors of value and gradient, relative to them (of the gradient by its norm)."""
         norm = lambda tree: float(np.linalg.norm(np.asarray(ravel_pytree(tree)[0])))
-        ratio = lambda error, of: error / of if of > 0.0 else (np.inf if error > 0.0 else 0.0)
+        ratio = lambda error, of: error / of if of > 0.0 else (0.0 if error == 0.0 == of else np.inf)  # NaN: not known
         return ratio(norm(self.value_error), norm(self.value)), ratio(norm(self.gradient_error), norm(self.gradient))
 
     @property
@@ -74,6 +74,10 @@ class Certificate(NamedTuple):
         said = []
         if int(self.result) != RESULTS.successful:
             said.append(f"the simulation failed: {RESULTS(int(self.result)).message}")
+        known = {"Ψ": (self.value, self.value_error), "dΨ/dp": (self.gradient, self.gradient_error)}
+        for name, numbers in known.items():
+            if not np.all(np.isfinite(ravel_pytree(numbers)[0])):
+                said.append(f"{name} or its error is not finite: `differentiate` says where that comes from")
         single = np.asarray(self.value).dtype == np.float32
         lost = "round-off of single precision, which grows as 1/h²: take double, or fewer steps"
         if self.duality > (0.1 * self.tolerance if single else _DUALITY):

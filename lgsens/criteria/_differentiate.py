@@ -18,6 +18,7 @@ from lgsens.criteria._certify import certify, check_certifiable
 from lgsens.criteria._criterion import Criterion, stacked
 from lgsens.criteria._criterion_use import Use, checked_for
 from lgsens.criteria._index_reduced_method import by_index_reduced
+from lgsens.criteria._not_finite import require_finite
 from lgsens.criteria._reference_methods import STENCIL, FiniteDifferences, IndexReduced
 from lgsens.criteria._to_accuracy import differentiate_to
 from lgsens.dynamics import RESULTS, AbstractSystem, Faults, State, names_of_all
@@ -157,11 +158,15 @@ def differentiate(
     p = as_parameters(p)
     warn_of_single_precision(t0.dtype)
     size = sum(leaf.size for leaf in jax.tree.leaves(p))
+    names = tuple(f"Criterion {jax.tree_util.keystr(path)}".strip() for path, _ in paths)
+    task = Task(leaves, build, state0, integrator, num_steps, t0, t1)
     if certificate and method is None:  # whose own value and gradient these are
         found = worth(num_steps=num_steps, throw=False)
         each = structure.flatten_up_to(found)
         own = lambda name: structure.unflatten([getattr(one, name) for one in each])
         if not throw or int(each[0].result) == RESULTS.successful:  # else a run below says which step failed
+            if throw:
+                require_finite(task, p, names, *zip(*((one.value, one.gradient) for one in each)))
             return Sensitivities(own("value"), own("gradient"), AdjointVariable(), each[0].result, certificate=found)
     if method is None:
         method = direct_or_adjoint(size, len(leaves)).method
@@ -170,8 +175,6 @@ def differentiate(
             f"ContinuousAdjoint: `num_steps` must be at least {ContinuousAdjoint.LEAST_STEPS}, got {num_steps}; its "
             "start needs four points. AdjointVariable() has no such limit."
         )
-    names = tuple(f"Criterion {jax.tree_util.keystr(path)}".strip() for path, _ in paths)
-    task = Task(leaves, build, state0, integrator, num_steps, t0, t1)
     details, labels, note = None, (), ""
     if isinstance(method, IndexReduced):
         value, gradient = by_index_reduced(task, p, method)
@@ -189,6 +192,8 @@ def differentiate(
     values, gradients = (jax.tree.unflatten(structure, leaves) for leaves in (value, gradient))
     if throw and details is not None:
         values, gradients = throw_if_failed((values, gradients), result, details, labels, note)
+    if throw:
+        require_finite(task, p, names, value, gradient)
     return Sensitivities(values, gradients, method, result, certificate=worth(num_steps=num_steps, throw=throw))
 
 

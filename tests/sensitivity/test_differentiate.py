@@ -272,6 +272,47 @@ def test_a_failed_simulation_raises_or_says_so():
         assert np.isnan(found.value) and np.isnan(found.gradient)
 
 
+def falls(mass):
+    body = lg.RigidBody(mass, None, free="z")
+    return lg.Model(
+        {"stone": body},
+        {},
+        {"g": lg.Gravity((0.0, 0.0, -9.81)), "pull": lg.AppliedForce("stone", force=(0.0, 0.0, 3.0))},
+    )
+
+
+SPEED = lg.Criterion(integrand=lambda s, p: jnp.linalg.norm(s.body("stone").velocity))  # no derivative at rest
+LATE = lg.Criterion(terminal=lambda s, p: jnp.log(s.body("stone").position[2]))  # of a height below zero
+SLOPE = {"t1": 0.1, "num_steps": 8}
+
+
+@pytest.mark.parametrize("method", some_quick([lg.DirectDifferentiation(), lg.AdjointVariable()]))
+def test_what_is_not_finite_is_said_with_its_place(method):
+    """The motion is as it should be; a gradient of NaN would go into the design without a word."""
+    ask = lambda criterion, build=falls, **more: lg.differentiate(
+        {"it": criterion}, build, 2.0, method=method, **SLOPE, **more
+    )
+    by_p = "'it'.*gradient by p is not finite, as the derivative of `integrand` is not finite at t = 0 s: jnp.linalg"
+    with pytest.raises(ValueError, match=by_p):
+        ask(SPEED)
+    assert np.isnan(ask(SPEED, throw=False).gradient["it"])
+    with pytest.raises(ValueError, match=r"value is nan, as `terminal` is not finite at t = 0.1 s"):
+        ask(LATE)
+    height = lg.Criterion(terminal=lambda s, p: s.body("stone").position[2])
+    with pytest.raises(ValueError, match=r"gradient by p is not finite, though .* finite derivatives.*`build`"):
+        ask(height, lambda mass: falls(2.0 + jnp.sqrt(mass - 2.0)))
+
+
+@pytest.mark.slow  # a program of its own
+def test_a_certificate_of_what_is_not_finite_is_not_good():
+    found = lg.certify({"speed": SPEED, "late": LATE}, falls, 2.0, **SLOPE)
+    for one, name in ((found["speed"], "dΨ/dp"), (found["late"], "Ψ")):
+        assert not one.good and np.inf in one.relative
+        assert f"{name} or its error is not finite" in one.warnings[0]
+    with pytest.raises(ValueError, match="gradient by p is not finite"):
+        lg.differentiate(SPEED, falls, 2.0, certificate=True, **SLOPE)
+
+
 def test_a_criterion_of_a_batch_is_one_of_each():
     def run(tilt):
         body = lg.RigidBody(1.0, (0.1, 0.1, 0.1), velocity=jnp.array([0.0, 0.0, 1.0]) * tilt, free="z")
