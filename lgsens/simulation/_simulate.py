@@ -233,7 +233,9 @@ def outcome(scheme: AbstractScheme, begun: Begin, stats: Stats, faults: Faults, 
     newton = jnp.where(jnp.any(singular), RESULTS.singular_configuration, newton)
     failed = jnp.where(jnp.any(singular), jnp.argmax(singular), failed)
     for code, steps in ((RESULTS.angle_jumped, faults.jumped), (RESULTS.turn_not_resolved, faults.turned > jnp.pi)):
-        found = jnp.any(steps) & (newton != scheme.failure)  # which may look singular later
+        # what diverges turns as it likes; behind a jump a motion may diverge, or look singular, a hundred steps later
+        before = code == RESULTS.angle_jumped and jnp.argmax(steps) < failed
+        found = jnp.any(steps) & ((newton != scheme.failure) | before)
         newton = jnp.where(found, code, newton)
         failed = jnp.where(found, jnp.argmax(steps), failed)
     newton = jnp.where((newton != RESULTS.successful) & faults.jumping[failed], RESULTS.angle_jumped, newton)
