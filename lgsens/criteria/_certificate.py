@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
@@ -76,7 +77,7 @@ class Certificate(NamedTuple):
             said.append(f"the simulation failed: {RESULTS(int(self.result)).message}")
         known = {"Ψ": (self.value, self.value_error), "dΨ/dp": (self.gradient, self.gradient_error)}
         for name, numbers in known.items():
-            if not np.all(np.isfinite(ravel_pytree(numbers)[0])):
+            if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(numbers)):
                 said.append(f"{name} or its error is not finite: `differentiate` says where that comes from")
         single = np.asarray(self.value).dtype == np.float32
         lost = "round-off of single precision, which grows as 1/h²: take double, or fewer steps"

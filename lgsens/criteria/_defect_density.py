@@ -84,7 +84,7 @@ def defect_densities(
     along = jnp.sqrt(size / directions.shape[1]) * jnp.linalg.qr(directions)[0].T
     d_eta, d_values = jax.vmap(lambda direction: derivative(*motion.along(direction)))(along)
     norms = jnp.sqrt(jnp.sum(d_values**2, axis=0))
-    relative = lambda rows, to: rows / jnp.where(to > 0.0, to, 1.0)
+    relative = lambda rows, to: rows / jnp.where(to == 0.0, 1.0, to)  # NaN where a value or a gradient is
     of_values = relative(eta, jnp.abs(values)[:, None])[:, None]
     of_gradients = relative(jnp.moveaxis(d_eta, 0, 1), norms[:, None, None])
     return jnp.concatenate([of_values, of_gradients], axis=1), trajectory

@@ -136,6 +136,7 @@ def differentiate(
             f"`state0` must be a function of the parameters that returns a State, got a {type(state0).__name__}: "
             "lambda p: state0 for one that does not depend on them."
         )
+    names = tuple(f"Criterion {jax.tree_util.keystr(path)}".strip() for path, _ in paths)
     settings = {"t0": t0, "t1": t1, "integrator": integrator, "state0": state0}
     worth = lambda **own: certify(criteria, build, p, **settings | own) if certificate else None
     if accuracy is not None:
@@ -145,8 +146,16 @@ def differentiate(
         if certificate:
             check_certifiable(integrator, None, (p, t0, t1))
         integrator, num_steps = aligned(integrator, build(as_parameters(p)), t0, t1, num_steps)
-        own = settings | {"method": method, "integrator": integrator}
-        run = lambda n, throw: differentiate(criteria, build, p, num_steps=n, throw=throw, **own)
+        own, tried = settings | {"method": method, "integrator": integrator}, []
+
+        def run(n, throw):
+            tried.append(differentiate(criteria, build, p, num_steps=n, throw=throw, **own))
+            if len(tried) > 1 and int(tried[-1].result) == RESULTS.successful:  # steps may be too long for a logarithm
+                task = Task(leaves, build, state0, integrator, n, *interval(t0, t1))
+                each = [structure.flatten_up_to(tree) for tree in tried[-1][:2]]
+                require_finite(task, as_parameters(p), names, *each)
+            return tried[-1]
+
         found = differentiate_to(run, float(accuracy), integrator, num_steps, extrapolate=not certificate)
         about = {"num_steps": found.reached.num_steps, "integrator": integrator, "tolerance": float(accuracy)}
         return found._replace(certificate=worth(**about))
@@ -158,7 +167,6 @@ def differentiate(
     p = as_parameters(p)
     warn_of_single_precision(t0.dtype)
     size = sum(leaf.size for leaf in jax.tree.leaves(p))
-    names = tuple(f"Criterion {jax.tree_util.keystr(path)}".strip() for path, _ in paths)
     task = Task(leaves, build, state0, integrator, num_steps, t0, t1)
     if certificate and method is None:  # whose own value and gradient these are
         found = worth(num_steps=num_steps, throw=False)

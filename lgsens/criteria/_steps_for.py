@@ -136,8 +136,10 @@ def _expected(placed: Placed, count: int) -> tuple[Float[Array, " c"], Float[Arr
 
 def _check_resolved(rows, pilot: int) -> None:
     totals = np.sum(np.asarray(rows), axis=2)
-    found = max(np.abs(totals[:, 0]).max(), np.linalg.norm(totals[:, 1:], axis=1).max())
-    if not found <= _UNRESOLVED:  # NaN is not
+    found = np.maximum(np.abs(totals[:, 0]).max(), np.linalg.norm(totals[:, 1:], axis=1).max())  # of NaN as well
+    if np.isnan(found):
+        raise ValueError("`criteria`: a value or a gradient is not finite; `differentiate` says where that comes from.")
+    if found > _UNRESOLVED:
         raise ValueError(
             f"`pilot` = {pilot} equal steps do not resolve the criteria: their errors are estimated as {found:.1g} of "
             "the values and gradients, which says nothing of where they come from. Take more steps for the pilot "

@@ -83,4 +83,4 @@ def _quantities(found) -> list[Any]:
 
 def _change(coarse, fine) -> float:
     size, change = np.linalg.norm(fine), np.linalg.norm(np.asarray(fine) - np.asarray(coarse))
-    return float(change / size) if size > 0.0 else float(change > 0.0)
+    return float(change / size) if size > 0.0 else float(change != 0.0)  # NaN is no answer that is reached

@@ -313,6 +313,15 @@ def test_a_certificate_of_what_is_not_finite_is_not_good():
         lg.differentiate(SPEED, falls, 2.0, certificate=True, **SLOPE)
 
 
+@pytest.mark.slow  # programs of their own
+@pytest.mark.parametrize("criterion", [SPEED, LATE])
+def test_no_accuracy_is_reached_by_what_is_not_finite(criterion):
+    with pytest.raises(ValueError, match="is not finite at t = "):
+        lg.differentiate(criterion, falls, 2.0, t1=0.1, accuracy=1e-3)
+    with pytest.raises(ValueError, match="not finite; `differentiate` says where"):
+        lg.steps_for(criterion, falls, 2.0, t1=0.1, pilot=16, tolerance=1e-2)
+
+
 def test_a_criterion_of_a_batch_is_one_of_each():
     def run(tilt):
         body = lg.RigidBody(1.0, (0.1, 0.1, 0.1), velocity=jnp.array([0.0, 0.0, 1.0]) * tilt, free="z")
