@@ -26,11 +26,11 @@ def require_finite(task: Task, p, names: tuple[str, ...], values: tuple[Any, ...
     if not is_concrete(values, gradients, p, task.t0, task.t1):
         return
     for name, criterion, value, gradient in zip(names, task.criteria, values, gradients):
-        leaves = jax.tree_util.tree_leaves_with_path(gradient)
-        wrong = [leaf_name(path, "p") for path, leaf in leaves if not np.all(np.isfinite(leaf))]
-        if np.isfinite(value) and not wrong:
+        if all(map(_finite, jax.tree.leaves((value, gradient)))):
             continue
-        of_value = not np.isfinite(value)
+        of_value = not _finite(value)
+        leaves = jax.tree_util.tree_leaves_with_path(gradient)
+        wrong = [leaf_name(path, "p") for path, leaf in leaves if not _finite(leaf)]
         what = f"its value is {float(value)}" if of_value else f"its gradient by {', '.join(wrong)} is not finite"
         for part, times in _not_finite(task, p, criterion, derivatives=not of_value).items():
             if times.size:
@@ -39,9 +39,13 @@ def require_finite(task: Task, p, names: tuple[str, ...], values: tuple[Any, ...
                 raise ValueError(f"{name}: {what}, as {which} is not finite at t = {times[0]:.6g} s{advice}.")
         finite = "values" if of_value else "derivatives"
         raise ValueError(
-            f"{name}: {what}, though its integrand and terminal term have finite {finite}: it is from `build`, or from "
-            f"an element of one's own; {_ADVICE}."
+            f"{name}: {what}, though its integrand and terminal term have finite {finite} at the ends of all steps: it "
+            f"is from `build`, or from an element of one's own; {_ADVICE}."
         )
+
+
+def _finite(leaf) -> bool:
+    return bool(np.isfinite(np.asarray(leaf)).all())
 
 
 def _not_finite(task: Task, p, criterion: Any, derivatives: bool) -> dict[str, np.ndarray]:
