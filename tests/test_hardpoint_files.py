@@ -136,6 +136,9 @@ def test_hardpoint_file_that_cannot_be_read(tmp_path):
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ValueError, match=says("Hardpoint file", "binary.toml", "cannot be read", "utf-8")):
         QuarterCar.load(tmp_path / "binary.toml")
+    (tmp_path / "scene.py").write_text("import lgsens as lg\n", encoding="utf-8")
+    with pytest.raises(ValueError, match=says("scene.py", "is not valid TOML", "`lgsens doctor` take scenes in Python")):
+        QuarterCar.load(tmp_path / "scene.py")
 
 
 def test_shipped_hardpoint_file_reads_as_a_users_own(tmp_path):

@@ -255,7 +255,8 @@ def read(path: str | Path | None) -> tuple[dict, str]:
     try:
         document = load(text)
     except ValueError as error:  # of both
-        raise ValueError(f"Hardpoint file {name!r} is not valid {language}: {error}.") from error
+        scene = "; `lgsens tradeoff` and `lgsens doctor` take scenes in Python" if name.endswith(".py") else ""
+        raise ValueError(f"Hardpoint file {name!r} is not valid {language}: {error}{scene}.") from error
     if not isinstance(document, dict):
         raise ValueError(f"Hardpoint file {name!r} must hold tables, got a {type(document).__name__}.")
     return document, name
