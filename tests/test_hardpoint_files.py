@@ -137,7 +137,7 @@ def test_hardpoint_file_that_cannot_be_read(tmp_path):
     with pytest.raises(ValueError, match=says("Hardpoint file", "binary.toml", "cannot be read", "utf-8")):
         QuarterCar.load(tmp_path / "binary.toml")
     (tmp_path / "scene.py").write_text("import lgsens as lg\n", encoding="utf-8")
-    with pytest.raises(ValueError, match=says("scene.py", "is not valid TOML", "`lgsens doctor` take scenes in Python")):
+    with pytest.raises(ValueError, match=says("scene.py", "is not valid TOML", "`lgsens doctor` take scenes")):
         QuarterCar.load(tmp_path / "scene.py")
 
 
