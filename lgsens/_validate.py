@@ -93,6 +93,11 @@ def is_concrete(*values: Any) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in leaves) and all(isinstance(leaf, _NUMBERS) for leaf in leaves)
 
 
+def all_finite(tree: Any) -> bool:
+    """Whether all numbers of a pytree, which are known, are finite."""
+    return all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(tree))
+
+
 def require(condition: Callable[..., Any], message: str | Callable[[], str], *values: Any) -> None:
     """Raise `ValueError` with the message unless `condition(*values)` holds; skipped while `values` are traced.
 

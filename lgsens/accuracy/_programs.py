@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from lgsens._validate import as_float
+from lgsens._validate import all_finite, as_float
 from lgsens._xla import tracing
 from lgsens.accuracy._setting import Build, Function, Setting
 from lgsens.criteria import Criterion, Task, reverse_by_parts
@@ -77,7 +77,7 @@ class Evaluated(NamedTuple):
 
     @property
     def finite(self) -> bool:
-        return bool(np.isfinite(self.value) and np.isfinite(self.gradient).all())
+        return all_finite((self.value, self.gradient))
 
     def relative(self, other: "Evaluated") -> tuple[float, float]:
         """How far value and gradient are from the other's, relative to it.
@@ -167,7 +167,7 @@ class Program:
         flat = np.asarray(ravel_pytree(gradient)[0]) * self.study.scale
         failed = [int(run.result) for run in motions if int(run.result) != RESULTS.successful]
         failure = RESULTS(failed[0]).message if failed else ""
-        if not failure and not (np.isfinite(value) and np.isfinite(flat).all()):
+        if not failure and not all_finite((value, flat)):
             failure = "Ψ or its gradient is not finite."
         if failure:
             value, flat = np.nan, np.full_like(flat, np.nan)

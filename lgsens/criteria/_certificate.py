@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
+from lgsens._validate import all_finite
 from lgsens.criteria._kinks import Kink
 from lgsens.dynamics import RESULTS
 
@@ -77,7 +77,7 @@ class Certificate(NamedTuple):
             said.append(f"the simulation failed: {RESULTS(int(self.result)).message}")
         known = {"Ψ": (self.value, self.value_error), "dΨ/dp": (self.gradient, self.gradient_error)}
         for name, numbers in known.items():
-            if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(numbers)):
+            if not all_finite(numbers):
                 said.append(f"{name} or its error is not finite: `differentiate` says where that comes from")
         single = np.asarray(self.value).dtype == np.float32
         lost = "round-off of single precision, which grows as 1/h²: take double, or fewer steps"

@@ -137,6 +137,8 @@ def differentiate(
             "lambda p: state0 for one that does not depend on them."
         )
     names = tuple(f"Criterion {jax.tree_util.keystr(path)}".strip() for path, _ in paths)
+    t0, t1 = interval(t0, t1)
+    p = as_parameters(p)
     settings = {"t0": t0, "t1": t1, "integrator": integrator, "state0": state0}
     worth = lambda **own: certify(criteria, build, p, **settings | own) if certificate else None
     if accuracy is not None:
@@ -145,15 +147,14 @@ def differentiate(
         check_accuracy(accuracy, num_steps, integrator, (p, t0, t1))
         if certificate:
             check_certifiable(integrator, None, (p, t0, t1))
-        integrator, num_steps = aligned(integrator, build(as_parameters(p)), t0, t1, num_steps)
+        integrator, num_steps = aligned(integrator, build(p), t0, t1, num_steps)
         own, tried = settings | {"method": method, "integrator": integrator}, []
 
         def run(n, throw):
             tried.append(differentiate(criteria, build, p, num_steps=n, throw=throw, **own))
             if len(tried) > 1 and int(tried[-1].result) == RESULTS.successful:  # steps may be too long for a logarithm
-                task = Task(leaves, build, state0, integrator, n, *interval(t0, t1))
-                each = [structure.flatten_up_to(tree) for tree in tried[-1][:2]]
-                require_finite(task, as_parameters(p), names, *each)
+                each = (structure.flatten_up_to(tree) for tree in tried[-1][:2])
+                require_finite(Task(leaves, build, state0, integrator, n, t0, t1), p, names, *each)
             return tried[-1]
 
         found = differentiate_to(run, float(accuracy), integrator, num_steps, extrapolate=not certificate)
@@ -163,8 +164,6 @@ def differentiate(
     check_integrator(integrator, num_steps)
     if certificate:
         check_certifiable(integrator, num_steps, (p, t0, t1))
-    t0, t1 = interval(t0, t1)
-    p = as_parameters(p)
     warn_of_single_precision(t0.dtype)
     size = sum(leaf.size for leaf in jax.tree.leaves(p))
     task = Task(leaves, build, state0, integrator, num_steps, t0, t1)

@@ -9,7 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, PyTree
 
-from lgsens._validate import is_concrete, leaf_name
+from lgsens._validate import all_finite, is_concrete, leaf_name
 from lgsens.criteria._by_parts import Task
 from lgsens.sensitivity import DirectDifferentiation
 from lgsens.simulation import Trajectory
@@ -26,11 +26,11 @@ def require_finite(task: Task, p, names: tuple[str, ...], values: tuple[Any, ...
     if not is_concrete(values, gradients, p, task.t0, task.t1):
         return
     for name, criterion, value, gradient in zip(names, task.criteria, values, gradients):
-        if all(map(_finite, jax.tree.leaves((value, gradient)))):
+        if all_finite((value, gradient)):
             continue
-        of_value = not _finite(value)
+        of_value = not all_finite(value)
         leaves = jax.tree_util.tree_leaves_with_path(gradient)
-        wrong = [leaf_name(path, "p") for path, leaf in leaves if not _finite(leaf)]
+        wrong = [leaf_name(path, "p") for path, leaf in leaves if not all_finite(leaf)]
         what = f"its value is {float(value)}" if of_value else f"its gradient by {', '.join(wrong)} is not finite"
         for part, times in _not_finite(task, p, criterion, derivatives=not of_value).items():
             if times.size:
@@ -42,10 +42,6 @@ def require_finite(task: Task, p, names: tuple[str, ...], values: tuple[Any, ...
             f"{name}: {what}, though its integrand and terminal term have finite {finite} at the ends of all steps: it "
             f"is from `build`, or from an element of one's own; {_ADVICE}."
         )
-
-
-def _finite(leaf) -> bool:
-    return bool(np.isfinite(np.asarray(leaf)).all())
 
 
 def _not_finite(task: Task, p, criterion: Any, derivatives: bool) -> dict[str, np.ndarray]:

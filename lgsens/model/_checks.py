@@ -20,7 +20,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from lgsens._validate import as_float, is_concrete, is_float_array, leaf_name
+from lgsens._validate import all_finite, as_float, is_concrete, is_float_array, leaf_name
 from lgsens.model._free import ALL_FREE, single_rotation, vanish_but_for
 
 _ALIGNED = 1e-2  # rad: a turn about axes further apart is none about either
@@ -173,20 +173,16 @@ def invalid_numbers(system: Any) -> list[str]:
             "inertia": system.inertia[own],
             "pose": tuple(leaf[own] for leaf in system.pose),
         }
-        wrong = [part for part, numbers in parts.items() if not _finite(numbers)]
+        wrong = [part for part, numbers in parts.items() if not all_finite(numbers)]
         if not wrong:
             sound = _sound(system.mass[own], system.inertia[own], system.pose.orientation[own])
             parts = (f"mass {float(system.mass[i]):.6g} kg", "inertia", "orientation, far from a rotation")
             wrong = [part for part, right in zip(parts, sound) if not right[0]]
         found += [f"body {name!r}: {part}" for part in wrong]
-    if not _finite(system.velocity):
+    if not all_finite(system.velocity):
         found.append("a velocity, or a velocity, tilt or axis of what `free` leaves out of a body")
     for stack in (*system.constraints, *system.loads):
         for path, leaf in jax.tree_util.tree_leaves_with_path(stack.elements):
             bad = sorted({owner for owner, row in zip(stack.owners, np.asarray(leaf)) if not np.all(np.isfinite(row))})
             found += [f"{owner!r}: {leaf_name(path, type(stack.elements).__name__)}" for owner in bad]
     return found
-
-
-def _finite(numbers: Any) -> bool:
-    return all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(numbers))
