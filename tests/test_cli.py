@@ -13,6 +13,7 @@ import pytest
 
 from lgsens.cli import _optimize
 from lgsens.cli._main import main
+from lgsens.cli._search import table_lines
 
 PNG = b"\x89PNG\r\n\x1a\n"
 SHIPPED = (resources.files("lgsens.examples") / "data" / "five_link_suspension.toml").read_text(encoding="utf-8")
@@ -34,6 +35,17 @@ def optimized(tmp_path_factory):
     out = tmp_path_factory.mktemp("optimize") / "new" / "folder"
     status = main(["optimize", "quarter-car", "--out", str(out), "--dt", "5e-3", "--quiet"])
     return status, out, json.loads((out / "result.json").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize(
+    "ended, advice",
+    [("infeasible", "widen what is varied"), ("stalled", "begin elsewhere"), ("steps", "Try more --steps")],
+)
+def test_what_helps_where_no_design_satisfies_the_constraints(ended, advice):
+    found = {"gradient_check": {}, "seconds": {}, "feasible": False, "history": {"ended": ended}}
+    *_, last = table_lines(found, [("mass [kg]", 1.0, 2.0, "", 1)])
+    assert last.startswith("No design satisfied the constraints") and advice in last
+    assert ("--steps" in last) == (ended == "steps")
 
 
 @pytest.mark.slow

@@ -246,6 +246,13 @@ def point_row(name: str, before: float, after: float, lower: float, upper: float
     return f"{name} [mm]", before, after, limits + at_bound, 1
 
 
+# why no step is left, by why the search ended
+_UNSATISFIED = {
+    "infeasible": "No design near it does better: widen what is varied, free more of it, or relax a limit.",
+    "stalled": "The search found no step that helps: begin elsewhere, widen what is varied, or relax a limit.",
+}
+
+
 def table_lines(found: dict[str, Any], rows: list[tuple[str, float, float, str, int]]) -> list[str]:
     """A table of rows: name, before, after, a note and how many decimals; then the gradient check, seconds, advice."""
     width = max(NAMES, *(len(name) + 2 for name, *_ in rows))
@@ -257,5 +264,6 @@ def table_lines(found: dict[str, Any], rows: list[tuple[str, float, float, str, 
     seconds = (f"{name} {value:.2f} s" for name, value in found["seconds"].items())
     lines += [rule, f"gradient against central differences: relative error {', '.join(errors)}", ", ".join(seconds)]
     if not found["feasible"]:
-        lines.append("No design satisfied the constraints; this one violates them least. Try more --steps.")
+        advice = _UNSATISFIED.get(found["history"]["ended"], "Try more --steps.")
+        lines.append(f"No design satisfied the constraints; this one violates them least. {advice}")
     return lines

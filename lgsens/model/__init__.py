@@ -26,10 +26,10 @@ from lgsens.model._controls import (
     PIDController as PIDController,
 )
 from lgsens.model._coordinates import (
-    CoordinateCoupling as CoordinateCoupling,
     CoordinateForce as CoordinateForce,
     CoordinateMeasure as CoordinateMeasure,
 )
+from lgsens.model._coupling import CoordinateCoupling as CoordinateCoupling
 from lgsens.model._curves import CurveSpringDamper as CurveSpringDamper
 from lgsens.model._drivers import (
     Angle as Angle,
@@ -103,6 +103,7 @@ from lgsens.model._roads import (
     road_roughness as road_roughness,
 )
 from lgsens.model._rolling import Rolling as Rolling
+from lgsens.model._sampled import Sampled as Sampled
 from lgsens.model._screws import RackAndPinionJoint as RackAndPinionJoint, ScrewJoint as ScrewJoint
 from lgsens.model._se3_system import SE3System as SE3System, scene_of as scene_of
 from lgsens.model._shafts import ConstantVelocityJoint as ConstantVelocityJoint, GearJoint as GearJoint
@@ -113,7 +114,6 @@ from lgsens.model._signals import (
     Harmonic as Harmonic,
     Polynomial as Polynomial,
     Ramp as Ramp,
-    Sampled as Sampled,
 )
 from lgsens.model._sliders import (
     CylindricalJoint as CylindricalJoint,

@@ -17,7 +17,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from lgsens._validate import as_float, number_field, require, suggestion
-from lgsens.model._signals import AbstractSignal, samples
+from lgsens.model._sampled import samples
+from lgsens.model._signals import AbstractSignal
 
 # G_d(n_0) [m³] at n_0 = 0.1 cycles/m of each class of roads.
 ISO_8608 = {name: 16e-6 * 4.0**i for i, name in enumerate("ABCDEFGH")}

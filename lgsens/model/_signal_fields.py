@@ -43,15 +43,28 @@ def _a_number(name: str, signal: AbstractSignal) -> AbstractSignal:
     return signal
 
 
-def signal_field(name: str, **default: Any) -> Any:
-    """A keyword-only signal of an element."""
+def _followed(name: str, signal: AbstractSignal, driven: bool) -> AbstractSignal:
+    """The signal. Raises `ValueError` if positions follow it along straight lines, and as `_a_number`."""
+    if driven and signal.straight:
+        raise ValueError(
+            f"`{name}` follows straight lines between samples: at each the velocity would jump, and no force "
+            'is large enough for that. Give Sampled(…, kind="cubic"), or "monotone".'
+        )
+    return _a_number(name, signal)
 
-    def convert(value: Any) -> AbstractSignal:
+
+def signal_field(name: str, *, optional: bool = False, driven: bool = False, over: str = "time", **default: Any) -> Any:
+    """A keyword-only signal of an element, None by default if `optional`; the others as in `prescribed_field`."""
+
+    def convert(value: Any) -> AbstractSignal | None:
+        if optional and value is None:
+            return None
         if not isinstance(value, AbstractSignal):
             raise _no_signal(name, "a signal", value)
-        return _a_number(name, value)
+        return _followed(name, value, driven)
 
-    return eqx.field(converter=convert, kw_only=True, **default)
+    default = {"default": None} if optional else default
+    return eqx.field(converter=convert, kw_only=True, metadata={"over": over}, **default)
 
 
 def prescribed_field(name: str, *, positional: bool = False, driven: bool = False, over: str = "time") -> Any:
@@ -60,12 +73,7 @@ def prescribed_field(name: str, *, positional: bool = False, driven: bool = Fals
 
     def convert(value: Any) -> Prescribed | None:
         if isinstance(value, AbstractSignal):
-            if driven and value.straight:
-                raise ValueError(
-                    f"`{name}` follows straight lines between samples: at each the velocity would jump, and no force "
-                    'is large enough for that. Give Sampled(…, kind="cubic"), or "monotone".'
-                )
-            return _a_number(name, value)
+            return _followed(name, value, driven)
         if callable(value):
             raise _no_signal(name, "a number or a signal", value)
         return None if value is None else as_float(value, (), f"`{name}`")

@@ -9,8 +9,10 @@ and nothing but k depends on it: f(s_z, ṡ, t) and its derivatives are exact wh
 The second term takes out what a scheme loses in z over many turns, and makes z = s_z the equilibrium; τ = 1 s.
 """
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -63,6 +65,19 @@ def unless_whole(ratio: Array, teeth: int, angle: Array) -> Array:
     holds over any number of turns (`AbstractElement.branch`)."""
     turns = ratio * teeth
     return jnp.where(jnp.abs(turns - jnp.round(turns)) < 1e-6, 0.0, angle)
+
+
+def unless_closed(
+    of: Callable[[Array], Array], angle: Array, centre: Array | float = 0.0, turn: float | None = None
+) -> Array:
+    """An angle within half a turn of `centre` that something is a function of: 0 where value and slope of that are the
+    same after a turn, the value but for multiples of `turn`, so that it goes on over any number of turns
+    (`AbstractElement.branch`)."""
+    ends = [jax.value_and_grad(of)(jnp.asarray(centre + side * jnp.pi, angle.dtype)) for side in (1.0, -1.0)]
+    jump, bend = (one - other for one, other in zip(*ends))
+    jump = jump if turn is None else but_for_turns(jump, turn=turn)
+    size = sum(jnp.abs(number) for end in ends for number in end)
+    return jnp.where(jnp.maximum(jnp.abs(jump), jnp.abs(bend)) <= 1e-6 * size, 0.0, angle)
 
 
 def branch_of(load: AlongCoordinate, a: Frame, b: Frame) -> Float[Array, ""]:

@@ -152,8 +152,12 @@ def test_every_number():
     """DDM, AVM and differences of random sums of the state, with a curved coupling of hinge and rotor."""
 
     def asked(model):
-        # a body with one rotation has derivatives by turns about it only
-        model = eqx.tree_at(lambda model: model.bodies["rotor"].orientation, model, jnp.eye(3))
+        # a body with one rotation has derivatives by turns and speeds about it only
+        rotor = lambda model: model.bodies["rotor"]
+        held = rotor(model).angular_velocity * X
+        model = eqx.tree_at(lambda model: rotor(model).orientation, model, jnp.eye(3))
+        model = eqx.tree_at(lambda model: rotor(model).velocity, model, jnp.zeros(3))
+        model = eqx.tree_at(lambda model: rotor(model).angular_velocity, model, held)
         motion = lg.simulate(model, t1=0.1, num_steps=5)
         found = [motion.body(name) for name in ("bob", "rotor")]  # of the rotor, what its one freedom moves
         end = jnp.concatenate([jnp.ravel(part[-1]) for of in found for part in (of.orientation, of.angular_velocity)])

@@ -8,6 +8,7 @@ from helpers import says, some_quick
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
 import lgsens as lg
+from lgsens.dynamics import told_breaks
 from lgsens.model._signals import prepared
 
 TIMES, VALUES = np.array([-0.4, 0.1, 0.35, 1.0, 1.3]), np.array([0.2, -0.5, 0.3, 0.1, 0.6])
@@ -85,6 +86,61 @@ def test_monotone_cubic(values):
         np.testing.assert_allclose(slope, scipy(TIMES[end], 1), rtol=0, atol=1e-12)
         straight = values[end] + scipy(TIMES[end], 1) * (outside - TIMES[end])
         np.testing.assert_allclose(value, straight, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["linear", "cubic", "monotone"])
+@pytest.mark.parametrize("size", [7, pytest.param(3, marks=pytest.mark.slow)])
+def test_periods(kind, size):
+    """Value and slope of SciPy's through three periods of samples, within the middle one; the same after periods; and
+    value and rate by samples and times, those of the seam as well, against central differences."""
+    rng = np.random.default_rng(size)
+    times, values = np.cumsum(rng.uniform(0.2, 1.0, size)) - 0.4, rng.normal(size=size)
+    values[-1] = values[0]
+    period = times[-1] - times[0]
+    signal = lg.Sampled(times, values, kind, periodic=True)
+    t = np.concatenate([times, times[0] + period * rng.uniform(size=9)])
+    many = np.concatenate([times[:-1] - period, times[:-1], times[:-1] + period, times[-1:] + period])
+    over = np.tile(values[:-1], 3)
+    through = {
+        "linear": lambda: lambda t, order: np.interp(t, many, [*over, over[0]]),
+        "cubic": lambda: CubicSpline(times, values, bc_type="periodic"),
+        "monotone": lambda: PchipInterpolator(many, [*over, over[0]]),
+    }[kind]()
+    for shift in (0.0, -2.0, 5.0):
+        value, slope, bend = jet(signal, t + shift * period)
+        # round-off of the time and of some ten operations, times slopes of up to 50
+        np.testing.assert_allclose(value, through(t, 0), rtol=0, atol=1e-12)
+        if kind == "linear":
+            continue
+        inner = slice(size, None)  # at samples the time may be of either side, where slope or bend jumps or bends
+        np.testing.assert_allclose(slope[inner], through(t, 1)[inner], rtol=0, atol=1e-11)
+        np.testing.assert_allclose(bend[inner], through(t, 2)[inner], rtol=0, atol=1e-9)
+    assert told_breaks(signal).shape == (0,)
+
+    def numbers(x):
+        signal = lg.Sampled(x[0], x[1].at[-1].set(x[1, 0]), kind, periodic=True)
+        rate = lambda t: jax.jvp(signal, (t,), (jnp.ones_like(t),))[1]
+        return jax.vmap(lambda t: jnp.stack([signal(t), rate(t)]))(jnp.asarray(t[size:] + 2.0 * period))
+
+    x, h = np.stack([times, values]), 1e-6
+    forward, backward = (np.asarray(mode(numbers)(jnp.asarray(x))) for mode in (jax.jacfwd, jax.jacrev))
+    basis = np.eye(2 * size).reshape(-1, 2, size)
+    difference = [(numbers(jnp.asarray(x + h * e)) - numbers(jnp.asarray(x - h * e))) / (2 * h) for e in basis]
+    expected = np.moveaxis(np.asarray(difference), 0, -1).reshape(forward.shape)
+    # round-off ε/h of slopes of up to 50; h² times a third derivative, by a time of 3!/d³ of what is found, d > 0.2 s
+    np.testing.assert_allclose(forward, expected, rtol=1e-9, atol=1e-7)
+    np.testing.assert_allclose(backward, forward, rtol=0, atol=1e-10)
+
+
+def test_periods_that_do_not_close():
+    for values, message in (
+        ((0.1, 0.5, 0.3), "`values` of one period end as they begin, so that it closes; got 0.1 and 0.3"),
+        ((0.1, 0.1), "a period has three samples or more"),
+    ):
+        with pytest.raises(ValueError, match=says(message)):
+            lg.Sampled(np.arange(len(values)), values, "cubic", periodic=True)
+    with pytest.raises(ValueError, match=says("Sampled: `periodic` must be True or False, got 2.0")):
+        lg.Sampled((0.0, 1.0, 2.0), (0.0, 1.0, 0.0), periodic=2.0)
 
 
 def test_monotone_cubic_of_two_samples_is_a_line():
