@@ -16,7 +16,14 @@ from lgsens.dynamics._constraints import (
     prescribed_velocity,
     violation_of_all,
 )
-from lgsens.dynamics._matrices import ConstrainedMass, constraint_jacobian, factorized, for_once, mass_scale
+from lgsens.dynamics._matrices import (
+    ConstrainedMass,
+    constraint_jacobian,
+    factorized,
+    for_once,
+    mass_scale,
+    multiplier_jacobian,
+)
 from lgsens.dynamics._redundant import softness
 from lgsens.dynamics._results import RESULTS
 from lgsens.dynamics._system import AbstractSystem, State, finite
@@ -74,7 +81,8 @@ def accelerations(system: AbstractSystem, q, v, t, factors: Factors | None = Non
 
 def _implicit_accelerations(system: AbstractSystem, q, v, t):
     """The same where f depends on λ: r(q, v, v̇, λ, t) = 0 and J v̇ + γ = 0 by Newton's iteration, and its derivative."""
-    k, scale = v.shape[0], mass_scale(system.mass_matrix())  # of the equations of acceleration, and of λ
+    mass = system.mass_matrix()
+    k, scale = v.shape[0], mass_scale(mass)  # of the equations of acceleration, and of λ
     jacobian, drift = full_jacobian(system, q, t), fixed_velocity_rate(system, q, v, t)
 
     def equation(y):
@@ -84,7 +92,9 @@ def _implicit_accelerations(system: AbstractSystem, q, v, t):
     def newton(equation, y):
         def body(carry):
             y, _, iteration = carry
-            step = jnp.linalg.solve(jax.jacfwd(equation)(y), equation(y))
+            by_lam = multiplier_jacobian(system, jacobian, q, v, scale * y[k:], t)
+            none = jnp.zeros((jacobian.shape[0],) * 2, y.dtype)
+            step = jnp.linalg.solve(scale * jnp.block([[mass / scale, by_lam], [jacobian, none]]), equation(y))
             return y - step, jnp.max(jnp.abs(step)), iteration + 1
 
         def unfinished(carry):

@@ -297,15 +297,20 @@ def load_tangents(element: AbstractLoad | AbstractDynamicLoad, a: Frame, b: Fram
     """∂Q/∂q and ∂Q/∂v of one element; with states z, of Q and g by the coordinates of bodies and carriers."""
     if isinstance(element, AbstractClosedFormLoad):
         return element.tangents(a, b, va, vb, t)
-    force = lambda a, b, va, vb, *z: generalized_force(element, a, b, va, vb, t, *z)
-    zero = jnp.zeros(2 * BODY_DIM, a.position.dtype)
-    position = jax.jacfwd(lambda x: force(*tilted((a, b), x), va, vb, *z))(zero)
-    velocity = jax.jacfwd(lambda x: force(a, b, va + x[BODY_A], vb + x[BODY_B], *z))(zero)
+    count = num_states(element)
+
+    def force(x):
+        # one Jacobian by all: three of friction are three times as many operations to compile
+        x, speed, states = jnp.split(x, (2 * BODY_DIM, 4 * BODY_DIM))
+        changed = [of_z + jnp.zeros_like(of_z).at[:count].set(states) for of_z in z]
+        return generalized_force(element, *tilted((a, b), x), va + speed[BODY_A], vb + speed[BODY_B], t, *changed)
+
+    every = jax.jacfwd(force)(jnp.zeros(4 * BODY_DIM + count, a.position.dtype))
+    position, velocity, by_states = jnp.split(every, (2 * BODY_DIM, 4 * BODY_DIM), axis=1)
     if z:
-        wide = jnp.zeros((len(position), len(position)), zero.dtype)
+        wide = jnp.zeros((len(position), len(position)), every.dtype)
         position, velocity = (wide.at[:, : 2 * BODY_DIM].set(part) for part in (position, velocity))
-        if count := num_states(element):
-            by_states = jax.jacfwd(lambda z: force(a, b, va, vb, z))(*z)[:, :count]
+        if count:
             velocity = velocity.at[:, np.asarray(places_of_states(count))].set(by_states)
     return LoadTangents(position, velocity)
 
