@@ -29,13 +29,13 @@ from lgsens.dynamics._constraints import (
 from lgsens.dynamics._equilibrium import equilibrium as equilibrium
 from lgsens.dynamics._initial import (
     Initial as Initial,
-    acceleration_and_jerk as acceleration_and_jerk,
     accelerations as accelerations,
     assemble as assemble,
     consistent_velocity as consistent_velocity,
     given_way as given_way,
     initial_state as initial_state,
     is_redundant as is_redundant,
+    jerk as jerk,
     split_velocity as split_velocity,
 )
 from lgsens.dynamics._kinematics import (
@@ -54,7 +54,6 @@ from lgsens.dynamics._matrices import (
     kkt_solve as kkt_solve,
     mass_matrix as mass_matrix,
     mass_scale as mass_scale,
-    multiplier_jacobian as multiplier_jacobian,
     require_linear as require_linear,
     tangents as tangents,
     times_tangent_operator as times_tangent_operator,

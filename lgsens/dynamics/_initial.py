@@ -1,6 +1,5 @@
 """Consistent initial state, eqs. (18)–(19), and the accelerations and multipliers that go with it."""
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -10,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lgsens._xla import while_loop
 from lgsens.dynamics._constraints import (
+    constraint_jerk,
     fixed_velocity_rate,
     full_jacobian,
     of_position_level,
@@ -22,11 +22,10 @@ from lgsens.dynamics._matrices import (
     factorized,
     for_once,
     mass_scale,
-    multiplier_jacobian,
 )
 from lgsens.dynamics._redundant import softness
 from lgsens.dynamics._results import RESULTS
-from lgsens.dynamics._system import AbstractSystem, State, finite
+from lgsens.dynamics._system import AbstractSystem, State, by_multipliers, finite
 from lgsens.linear import Factors, Inverse, Matrix, SparseMatrix, diagonal
 
 _MAX_ITERATIONS = 30
@@ -81,8 +80,7 @@ def accelerations(system: AbstractSystem, q, v, t, factors: Factors | None = Non
 
 def _implicit_accelerations(system: AbstractSystem, q, v, t):
     """The same where f depends on λ: r(q, v, v̇, λ, t) = 0 and J v̇ + γ = 0 by Newton's iteration, and its derivative."""
-    mass = system.mass_matrix()
-    k, scale = v.shape[0], mass_scale(mass)  # of the equations of acceleration, and of λ
+    k, scale = v.shape[0], mass_scale(system.mass_matrix())  # of the equations of acceleration, and of λ
     jacobian, drift = full_jacobian(system, q, t), fixed_velocity_rate(system, q, v, t)
 
     def equation(y):
@@ -92,9 +90,7 @@ def _implicit_accelerations(system: AbstractSystem, q, v, t):
     def newton(equation, y):
         def body(carry):
             y, _, iteration = carry
-            by_lam = multiplier_jacobian(system, jacobian, q, v, scale * y[k:], t)
-            none = jnp.zeros((jacobian.shape[0],) * 2, y.dtype)
-            step = jnp.linalg.solve(scale * jnp.block([[mass / scale, by_lam], [jacobian, none]]), equation(y))
+            step = jnp.linalg.solve(_scaled_matrix(system, jacobian, q, v, scale * y[k:], t), equation(y))
             return y - step, jnp.max(jnp.abs(step)), iteration + 1
 
         def unfinished(carry):
@@ -110,11 +106,26 @@ def _implicit_accelerations(system: AbstractSystem, q, v, t):
     return y[:k], scale * y[k:]
 
 
-def acceleration_and_jerk(system: AbstractSystem, q, v, t):
-    """v̇, λ and v̈ of the motion through (q, v): v̈ is the derivative of `accelerations` along q ṽ, v̇ and 1."""
+def _scaled_matrix(system: AbstractSystem, jacobian, q, v, lam, t) -> Float[Array, "n n"]:
+    """[[M, σ ∂r/∂λ], [σ J, 0]], with σ the size of M: the derivative of r and σ (J v̇ + γ) by v̇ and λ/σ."""
+    mass, none = system.mass_matrix(), jnp.zeros((jacobian.shape[0],) * 2, v.dtype)
+    scale = mass_scale(mass)
+    return jnp.block([[mass, scale * by_multipliers(system, q, v, lam, t)], [scale * jacobian, none]])
 
-    (vdot, lam), derivative = jax.linearize(partial(accelerations, system), q, v, t)
-    return vdot, lam, derivative(system.group.to_ambient(q, v), vdot, jnp.ones_like(t))[0]
+
+def jerk(system: AbstractSystem, q, v, vdot, lam, t) -> Float[Array, " k"]:
+    """v̈ of the motion through (q, v) at t with v̇ and λ: with d/dt that at constant v̇ and λ,
+
+    M v̈ + ∂r/∂λ λ̇ = −dr/dt,     J v̈ = −d/dt (J v̇ + γ)
+    """
+    motion = system.group.to_ambient(q, v), vdot, jnp.ones_like(t)
+    _, force = jax.jvp(lambda q, v, t: system.residual(q, v, vdot, lam, t), (q, v, t), motion)
+    rate = constraint_jerk(system, q, v, vdot, t)
+    if not system.reads_multipliers:
+        return ConstrainedMass.of(system, q, t).solve(-force, -rate)[0]
+    matrix = _scaled_matrix(system, full_jacobian(system, q, t), q, v, lam, t)
+    missing = jnp.concatenate([force, mass_scale(system.mass_matrix()) * rate])
+    return -jnp.linalg.solve(matrix, missing)[: v.shape[0]]
 
 
 def assemble(system: AbstractSystem, t):

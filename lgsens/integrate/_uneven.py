@@ -41,7 +41,7 @@ from jaxtyping import Array, Bool, Float, Int
 from lgsens._brief import brief
 from lgsens._validate import require_setting
 from lgsens._xla import alike, in_any_lane, scan, while_loop
-from lgsens.dynamics import AbstractSystem, State, acceleration_and_jerk, unsteady_rate
+from lgsens.dynamics import AbstractSystem, State, jerk, unsteady_rate
 from lgsens.integrate._generalized_alpha import GeneralizedAlpha
 from lgsens.integrate._given import AbstractUnevenSteps, GivenSteps
 from lgsens.integrate._grid import Start, renewed
@@ -251,9 +251,9 @@ def _controlled_steps(
         carry = (progress, jnp.where(active, trial.h, size), proposed, error, elapsed)
         return carry, (h_taken, progress.state, trial.stats, trial.error * tolerance, trial.rejected)
 
-    q, v = first.state.q, first.state.v
-    jerk = acceleration_and_jerk(system, q, v, t0)[2]
-    expected = relative(scheme.first_error(system, v, first.state.vdot, jerk), h)
+    v, vdot = first.state.v, first.state.vdot
+    begun = jerk(system, first.state.q, v, vdot, first.state.lam, t0)
+    expected = relative(scheme.first_error(system, v, vdot, begun), h)
     guess = h * jnp.minimum(1.0, (_AIM / jnp.maximum(expected, _LEAST)) ** (1.0 / power))
     begun = first.at(system, guess)
     memory = scheme.memory(walk.shared, begun, Node(t0, t0 + guess, guess), uneven=True)

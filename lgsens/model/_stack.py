@@ -294,29 +294,25 @@ def square_blocks(matrices: Float[Array, "e n n"], places: np.ndarray) -> Float[
 
 
 def load_tangents(element: AbstractLoad | AbstractDynamicLoad, a: Frame, b: Frame, va, vb, t, *z) -> LoadTangents:
-    """∂Q/∂q and ∂Q/∂v of one element; with states z, of Q and g by the coordinates of bodies and carriers."""
+    """∂Q/∂q and ∂Q/∂v of one element; with states z, of Q and g by the coordinates of bodies and carriers, and by the
+    multipliers that follow the states in z."""
     if isinstance(element, AbstractClosedFormLoad):
         return element.tangents(a, b, va, vb, t)
     count = num_states(element)
 
     def force(x):
-        # one Jacobian by all: three of friction are three times as many operations to compile
-        x, speed, states = jnp.split(x, (2 * BODY_DIM, 4 * BODY_DIM))
-        changed = [of_z + jnp.zeros_like(of_z).at[:count].set(states) for of_z in z]
+        # one Jacobian by all: four of friction are four times as many operations to compile
+        x, speed, more = jnp.split(x, (2 * BODY_DIM, 4 * BODY_DIM))
+        changed = [of_z + more for of_z in z]
         return generalized_force(element, *tilted((a, b), x), va + speed[BODY_A], vb + speed[BODY_B], t, *changed)
 
-    every = jax.jacfwd(force)(jnp.zeros(4 * BODY_DIM + count, a.position.dtype))
-    position, velocity, by_states = jnp.split(every, (2 * BODY_DIM, 4 * BODY_DIM), axis=1)
+    size = 4 * BODY_DIM + sum(len(of_z) for of_z in z)
+    every = jax.jacfwd(force)(jnp.zeros(size, a.position.dtype))
+    ends = 2 * BODY_DIM, 4 * BODY_DIM, 4 * BODY_DIM + count
+    position, velocity, by_states, by_lam = jnp.split(every, ends, axis=1)
     if z:
         wide = jnp.zeros((len(position), len(position)), every.dtype)
         position, velocity = (wide.at[:, : 2 * BODY_DIM].set(part) for part in (position, velocity))
         if count:
             velocity = velocity.at[:, np.asarray(places_of_states(count))].set(by_states)
-    return LoadTangents(position, velocity)
-
-
-def load_by_multipliers(element: AbstractDynamicLoad, a: Frame, b: Frame, va, vb, t, z) -> Float[Array, "n r"]:
-    """∂Q/∂λ, and ∂g/∂λ, of one element that reads multipliers."""
-    states, lam = jnp.split(z, [num_states(element)])
-    at = lambda lam: generalized_force(element, a, b, va, vb, t, jnp.concatenate([states, lam]))
-    return jax.jacfwd(at)(lam)
+    return LoadTangents(position, velocity, by_lam if by_lam.shape[1] else None)
