@@ -103,7 +103,8 @@ class Certificate(NamedTuple):
             if kinks := [kink for kink in self.kinks if not kink.jump]:
                 said.append(
                     f"accelerations have a kink inside of a step: {_some(kinks)}. Estimates do not see it; let a step "
-                    "end there (`AlignedSteps` does at edges of a road), or make the force smooth over several steps"
+                    "end there (`AlignedSteps` does at edges of a road), or make the force, or the curve of a joint, "
+                    "smooth over several steps"
                 )
             if jumps := [kink for kink in self.kinks if kink.jump]:
                 said.append(

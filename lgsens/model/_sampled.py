@@ -96,7 +96,8 @@ def _check_period(values: Float[Array, " n"]) -> None:
     if values.size < 3:
         raise ValueError(f"Sampled: a period has three samples or more, the first once more at its end, got {values}.")
     require(
-        lambda values: abs(values[-1] - values[0]) <= 1e-6 * np.ptp(values),  # of single precision
+        # of single precision; what is not finite is said where a scene is looked at
+        lambda values: not abs(values[-1] - values[0]) > 1e-6 * np.ptp(values),
         "Sampled: `values` of one period end as they begin, so that it closes; got "
         f"{values[0]} and {values[-1]}. Add a sample at the end of the period, with the first value.",
         values,

@@ -298,21 +298,21 @@ def load_tangents(element: AbstractLoad | AbstractDynamicLoad, a: Frame, b: Fram
     multipliers that follow the states in z."""
     if isinstance(element, AbstractClosedFormLoad):
         return element.tangents(a, b, va, vb, t)
-    count = num_states(element)
+    bodies, count = 2 * BODY_DIM, num_states(element)
+    zero = jnp.zeros(bodies, a.position.dtype)
 
-    def force(x):
-        # one Jacobian by all: four of friction are four times as many operations to compile
-        x, speed, more = jnp.split(x, (2 * BODY_DIM, 4 * BODY_DIM))
+    def force(x, speed, more: Any = 0.0):
         changed = [of_z + more for of_z in z]
         return generalized_force(element, *tilted((a, b), x), va + speed[BODY_A], vb + speed[BODY_B], t, *changed)
 
-    size = 4 * BODY_DIM + sum(len(of_z) for of_z in z)
-    every = jax.jacfwd(force)(jnp.zeros(size, a.position.dtype))
-    ends = 2 * BODY_DIM, 4 * BODY_DIM, 4 * BODY_DIM + count
-    position, velocity, by_states, by_lam = jnp.split(every, ends, axis=1)
-    if z:
-        wide = jnp.zeros((len(position), len(position)), every.dtype)
-        position, velocity = (wide.at[:, : 2 * BODY_DIM].set(part) for part in (position, velocity))
-        if count:
-            velocity = velocity.at[:, np.asarray(places_of_states(count))].set(by_states)
+    if not z:  # a gradient of four torsion springs takes 7 % less time than with one Jacobian of both
+        return LoadTangents(*(jax.jacfwd(force, argnums=i)(zero, zero) for i in (0, 1)))
+    # one Jacobian: four of friction in a hinge take a third more time to compile
+    ends = bodies, 2 * bodies, 2 * bodies + count
+    every = jax.jacfwd(lambda x: force(*jnp.split(x, ends[:2])))(jnp.zeros(2 * bodies + len(z[0]), zero.dtype))
+    *of_bodies, by_states, by_lam = jnp.split(every, ends, axis=1)
+    wide = jnp.zeros((len(every), len(every)), every.dtype)
+    position, velocity = (wide.at[:, :bodies].set(part) for part in of_bodies)
+    if count:
+        velocity = velocity.at[:, np.asarray(places_of_states(count))].set(by_states)
     return LoadTangents(position, velocity, by_lam if by_lam.shape[1] else None)

@@ -23,6 +23,8 @@ from lgsens.model._frames import Frame
 from lgsens.model._loads import AbstractDynamicLoad
 from lgsens.model._relative import but_for_turns
 
+_AROUND = np.linspace(-1.0, 1.0, 9)  # half turns
+
 
 class AlongCoordinate(Protocol):
     """A load along a coordinate."""
@@ -72,12 +74,13 @@ def unless_closed(
 ) -> Array:
     """An angle within half a turn of `centre` that something is a function of: 0 where value and slope of that are the
     same after a turn, the value but for multiples of `turn`, so that it goes on over any number of turns
-    (`AbstractElement.branch`)."""
-    ends = [jax.value_and_grad(of)(jnp.asarray(centre + side * jnp.pi, angle.dtype)) for side in (1.0, -1.0)]
-    jump, bend = (one - other for one, other in zip(*ends))
+    (`AbstractElement.branch`). The same is to six digits of what it is around the turn, with what its samples lose."""
+    around = centre + jnp.pi * jnp.asarray(_AROUND, angle.dtype)
+    values, slopes = jax.vmap(jax.value_and_grad(of))(around)
+    jump, bend = values[-1] - values[0], slopes[-1] - slopes[0]
     jump = jump if turn is None else but_for_turns(jump, turn=turn)
-    size = sum(jnp.abs(number) for end in ends for number in end)
-    return jnp.where(jnp.maximum(jnp.abs(jump), jnp.abs(bend)) <= 1e-6 * size, 0.0, angle)
+    small = max(1e-6, float(jnp.finfo(angle.dtype).eps) ** 0.5) * jnp.max(jnp.abs(values) + jnp.abs(slopes))
+    return jnp.where((jnp.abs(jump) <= small) & (jnp.abs(bend) <= small), 0.0, angle)
 
 
 def branch_of(load: AlongCoordinate, a: Frame, b: Frame) -> Float[Array, ""]:

@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 import lgsens as lg
+from lgsens.model._turns import unless_closed
 from lgsens.testing import check_force, check_sensitivities
 
 ORIGIN, X, Y, Z = np.zeros(3), *np.eye(3)
@@ -124,6 +125,25 @@ def test_a_curve_that_does_not_close_has_failed_at_half_a_turn():
     model, _ = gears(lg.Polynomial((0.0, 1.0, 0.2)))
     with pytest.raises(lg.SimulationError, match="half a turn"):
         lg.simulate(model, t1=0.3, num_steps=60)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_what_closes_after_a_turn(dtype):
+    """Curves whose value and slope are zero, but for round-off, where the turn closes; and curves that do not close."""
+    angle = jnp.asarray(1.3, dtype)
+    for phase in np.linspace(0.0, TURN, 7):
+        shift = jnp.asarray(phase, dtype)
+        for closed in (
+            lambda t, shift=shift: 0.01 * (1.0 + jnp.cos(t - shift)),
+            lambda t, shift=shift: 0.01 * jnp.cos((t - shift) / 2.0) ** 4,
+            lambda t, shift=shift: 0.01 * jnp.maximum(jnp.cos(t - shift), 0.0) ** 3,
+        ):
+            assert unless_closed(closed, angle) == 0.0
+    geared = lambda t: 3.0 * t + 0.2 * jnp.sin(t)
+    assert unless_closed(geared, angle, turn=TURN) == 0.0
+    for open_ in (geared, lambda t: 0.1 * t**2, lambda t: 1.0 + 1e-3 * jnp.sin(t / 2.0)):
+        assert unless_closed(open_, angle) == angle
+    assert unless_closed(lambda t: 1.3 * t, angle, turn=TURN) == angle
 
 
 @pytest.mark.parametrize("turns", [pytest.param(False, marks=pytest.mark.slow), True])
