@@ -16,13 +16,7 @@ from lgsens.dynamics._constraints import (
     prescribed_velocity,
     violation_of_all,
 )
-from lgsens.dynamics._matrices import (
-    ConstrainedMass,
-    constraint_jacobian,
-    factorized,
-    for_once,
-    mass_scale,
-)
+from lgsens.dynamics._matrices import ConstrainedMass, constraint_jacobian, factorized, for_once, mass_scale
 from lgsens.dynamics._redundant import softness
 from lgsens.dynamics._results import RESULTS
 from lgsens.dynamics._system import AbstractSystem, State, by_multipliers, finite
@@ -114,9 +108,11 @@ def _scaled_matrix(system: AbstractSystem, jacobian, q, v, lam, t) -> Float[Arra
 
 
 def jerk(system: AbstractSystem, q, v, vdot, lam, t) -> Float[Array, " k"]:
-    """v̈ of the motion through (q, v) at t with v̇ and λ: with d/dt that at constant v̇ and λ,
+    """v̈ of the motion through (q, v) at t with v̇ and λ:
 
-    M v̈ + ∂r/∂λ λ̇ = −dr/dt,     J v̈ = −d/dt (J v̇ + γ)
+        M v̈ + ∂r/∂λ λ̇ = −dr/dt,     J v̈ = −d/dt (J v̇ + γ)
+
+    with d/dt of r and γ at constant v̇ and λ.
     """
     motion = system.group.to_ambient(q, v), vdot, jnp.ones_like(t)
     _, force = jax.jvp(lambda q, v, t: system.residual(q, v, vdot, lam, t), (q, v, t), motion)
