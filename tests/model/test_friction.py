@@ -8,6 +8,7 @@ import pytest
 from helpers import close, says, some_quick
 
 import lgsens as lg
+from lgsens.dynamics import accelerations, initial_state, jerk
 from lgsens.testing import check_force, check_sensitivities
 
 G, X, Y, Z, ORIGIN = 9.81, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
@@ -130,6 +131,27 @@ def test_forces_by_multipliers(names, solver):
     differences = (residual(lam[None] + steps) - residual(lam[None] - steps)).T / (2 * h)
     np.testing.assert_allclose(found, differences, atol=1e-9)
     assert np.abs(found - jacobian.T).max() > 0.1
+
+
+def test_jerk_with_forces_that_read_multipliers():
+    """v̈ of the start is the rate of `accelerations` along the motion, by central differences of fourth order."""
+    system = swing().system()
+    state = initial_state(system, jnp.zeros(())).state
+    h, q, v, vdot = 1e-4, state.q, state.v, state.vdot
+    found = jerk(system, q, v, vdot, state.lam, jnp.zeros(()))
+
+    def along(s):
+        """Accelerations where v̇ and v̈ bring the motion in s, but for O(s³) of the speed, of which a fourth-order formula
+        takes out what is cubic."""
+        x = s * v + s**2 / 2 * vdot + s**3 / 6 * found
+        return accelerations(system, system.group.retract(q, x), v + s * vdot + s**2 / 2 * found, s)[0]
+
+    ahead, behind, far, back = jax.jit(jax.vmap(along))(h * jnp.array([1.0, -1.0, 2.0, -2.0]))
+    differences = (8 * (ahead - behind) - (far - back)) / (12 * h)
+    size = np.abs(found).max()
+    assert size > 1.0
+    # what changes at rates of up to w = 100/s is off by (w h)⁴ = 1e-8 of itself
+    np.testing.assert_allclose(found, differences, rtol=0, atol=1e-8 * size)
 
 
 def swing(solver=None):
