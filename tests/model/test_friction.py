@@ -141,8 +141,8 @@ def test_jerk_with_forces_that_read_multipliers():
     found = jerk(system, q, v, vdot, state.lam, jnp.zeros(()))
 
     def along(s):
-        """Accelerations where v̇ and v̈ bring the motion in s, but for O(s³) of the speed, of which a fourth-order formula
-        takes out what is cubic."""
+        """Accelerations where v̇ and v̈ bring the motion in s, but for O(s³) of the speed, which the differences take
+        out."""
         x = s * v + s**2 / 2 * vdot + s**3 / 6 * found
         return accelerations(system, system.group.retract(q, x), v + s * vdot + s**2 / 2 * found, s)[0]
 
