@@ -16,9 +16,7 @@ from lgsens.model._joints import AbstractJoint
 from lgsens.model._relative import Coordinate, but_for_turns
 from lgsens.model._signal_fields import signal_field
 from lgsens.model._signals import AbstractSignal, Polynomial, prepared
-from lgsens.model._turns import (
-    unless_closed,
-)
+from lgsens.model._turns import unless_closed
 
 
 def _values(coordinates: Sequence[Coordinate], ends: Sequence[Frame], attached) -> list[Float[Array, ""]]:
