@@ -120,7 +120,7 @@ def state_space(
     k, f, g = *bases.position.shape, bases.velocity.shape[1]
     cuts = f, f + g, f + g + p, f + g + 2 * p  # of columns of x, ν, u, u̇, ü
     mass = system.mass_matrix()
-    stiffness, damping, jacobian, _ = system.tangents(state.q, state.v, state.vdot, state.lam, t)
+    stiffness, damping, jacobian = system.tangents(state.q, state.v, state.vdot, state.lam, t)
     forces = jax.jacfwd(lambda u: built(u).residual(state.q, state.v, state.vdot, state.lam, t))(none)
     gaps = jax.jacfwd(lambda u: built(u).constraint(state.q, t))(none)[..., 0]
     holonomic = jacobian[: gaps.shape[0]]

@@ -54,6 +54,7 @@ from lgsens.dynamics._matrices import (
     kkt_solve as kkt_solve,
     mass_matrix as mass_matrix,
     mass_scale as mass_scale,
+    multiplier_jacobian as multiplier_jacobian,
     require_linear as require_linear,
     tangents as tangents,
     times_tangent_operator as times_tangent_operator,

@@ -33,9 +33,17 @@ def constraint_jacobian(system: AbstractSystem, q, t) -> Matrix:
 
 
 def tangents(system: AbstractSystem, q, v, vdot, lam, t) -> Tangents:
-    """K_t, C_t and J, and ∂r/∂λ where forces depend on λ."""
+    """K_t, C_t and J."""
     sparse = in_blocks(system)
     return (system.tangents if sparse is None else sparse.sparse_tangents)(q, v, vdot, lam, t)
+
+
+def multiplier_jacobian(system: AbstractSystem, jacobian: Matrix, q, v, lam, t) -> Matrix:
+    """∂r/∂λ, of the kind of J: Jᵀ, unless forces depend on λ."""
+    if not system.reads_multipliers:
+        return jacobian.T
+    every = system.multiplier_jacobian(q, v, lam, t)
+    return every.dense() if isinstance(every, SparseMatrix) and not isinstance(jacobian, SparseMatrix) else every
 
 
 def require_linear(system: AbstractSystem, method: str) -> None:

@@ -43,18 +43,13 @@ class State(eqx.Module):
 class Tangents(NamedTuple):
     """The matrices of the linearized equations of motion, §3.1.
 
-    δr = K_t δq + C_t δv + M δv̇ + Bᵀ δλ  and  δΦ = B δq, at one state; ∂r/∂λ in place of Bᵀ where forces depend on λ.
+    δr = K_t δq + C_t δv + M δv̇ + Bᵀ δλ  and  δΦ = B δq, at one state; ∂r/∂λ of `multiplier_jacobian` in place of Bᵀ
+    where forces depend on λ.
     """
 
     stiffness: Matrix  # K_t, (k, k)
     damping: Matrix  # C_t, (k, k)
     constraint_jacobian: Matrix  # B, (m, k); with rows of velocity level [B; A]
-    read: Matrix | None = None  # ∂r/∂λ, (k, m), where forces depend on λ; else None
-
-    @property
-    def multiplier_jacobian(self) -> Matrix:
-        """∂r/∂λ."""
-        return self.constraint_jacobian.T if self.read is None else self.read
 
 
 class AbstractSystem(eqx.Module):
@@ -125,8 +120,7 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def tangents(self, q, v, vdot, lam, t) -> Tangents:
-        """The exact tangents K_t, C_t, J = [B; A] and, where forces depend on λ, ∂r/∂λ. `autodiff_tangents` is a ready
-        implementation."""
+        """The exact tangents K_t, C_t and J = [B; A]. `autodiff_tangents` is a ready implementation."""
 
     def is_valid(self) -> Bool[Array, ""]:
         """Whether all numbers are finite, and such as a system has; without derivative."""
@@ -177,9 +171,12 @@ class AbstractSystem(eqx.Module):
 
     @property
     def reads_multipliers(self) -> bool:
-        """Whether f depends on λ: ∂r/∂λ is not Jᵀ, but the `read` of `tangents`, and (v̇, λ) not the solution of linear
-        equations."""
+        """Whether f depends on λ: ∂r/∂λ is not Jᵀ, and (v̇, λ) not the solution of linear equations."""
         return False
+
+    def multiplier_jacobian(self, q, v, lam, t) -> Matrix:
+        """∂r/∂λ, shape (k, m); asked for where f depends on λ."""
+        return by_multipliers(self, q, v, lam, t)
 
     # States that obey ż = g(q, v, z, t): z is the velocity of a coordinate with unit mass, on which nothing depends.
 
@@ -213,8 +210,7 @@ class AbstractSparseSystem(AbstractSystem):
         return self.sparse_mass_matrix().dense()
 
     def tangents(self, q, v, vdot, lam, t):
-        every = self.sparse_tangents(q, v, vdot, lam, t)
-        return Tangents(*(None if matrix is None else matrix.dense() for matrix in every))
+        return Tangents(*(matrix.dense() for matrix in self.sparse_tangents(q, v, vdot, lam, t)))
 
     @property
     @abc.abstractmethod
@@ -231,7 +227,7 @@ class AbstractSparseSystem(AbstractSystem):
 
     @abc.abstractmethod
     def sparse_tangents(self, q, v, vdot, lam, t) -> Tangents:
-        """K_t, C_t and J, and ∂r/∂λ as in `Tangents`; the columns of K_t and J by bodies."""
+        """K_t, C_t and J; the columns of K_t and J by bodies."""
 
     @abc.abstractmethod
     def sparse_rate_stiffness(self, q, v, t) -> SparseMatrix:
@@ -262,7 +258,7 @@ def finite(*trees: Any) -> Bool[Array, ""]:
 
 
 def autodiff_tangents(system: AbstractSystem, q, v, vdot, lam, t) -> Tangents:
-    """K_t, C_t, J and ∂r/∂λ of a system by forward-mode autodiff of its residual and constraint.
+    """K_t, C_t and J of a system by forward-mode autodiff of its residual and constraint.
 
     K_t w = D_q r · (q w̃), the derivative of r(q exp(w̃ s)) at s = 0; C_t = ∂r/∂v.
     For systems without hand-derived tangents, and the reference for those that have them.
@@ -273,7 +269,7 @@ def autodiff_tangents(system: AbstractSystem, q, v, vdot, lam, t) -> Tangents:
     jacobian = autodiff_constraint_jacobian(system, q, t)
     if system.num_velocity_rows:
         jacobian = jnp.concatenate([jacobian, system.velocity_jacobian(q, t)])
-    return Tangents(k, c, jacobian, by_multipliers(system, q, v, lam, t) if system.reads_multipliers else None)
+    return Tangents(k, c, jacobian)
 
 
 def by_multipliers(system: AbstractSystem, q, v, lam, t) -> Float[Array, "k m"]:

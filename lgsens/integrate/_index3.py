@@ -66,6 +66,7 @@ from lgsens.dynamics import (
     factorized,
     mass_matrix,
     mass_scale,
+    multiplier_jacobian,
     softness,
     tangents,
     times_tangent_operator,
@@ -91,11 +92,17 @@ def factorize_iteration_matrix(
     x,
     h,
     kind: Any = LU,
+    upper: Matrix | None = None,
 ) -> Factors:
-    """The factors of S above: one LU, which serves Newton, the DDM, and transposed, the AVM. Or its `Inverse`."""
-    stiffness, lower = times_tangent_operator(system, x, (tangents.stiffness, tangents.constraint_jacobian))
+    """The factors of S above: one LU, which serves Newton, the DDM, and transposed, the AVM. Or its `Inverse`.
+
+    `upper`: ∂r/∂λ; None: Jᵀ."""
+    jacobian = tangents.constraint_jacobian
+    stiffness, lower = times_tangent_operator(system, x, (tangents.stiffness, jacobian))
     dynamic = scheme.inertia_factor * mass + (scheme.gamma * h) * tangents.damping + (scheme.beta * h**2) * stiffness
-    return factorized(system, dynamic, tangents.multiplier_jacobian, lower, mass_scale(mass), kind, softness(system))
+    return factorized(
+        system, dynamic, jacobian.T if upper is None else upper, lower, mass_scale(mass), kind, softness(system)
+    )
 
 
 class Index3Step(AbstractStep):
@@ -120,8 +127,11 @@ class Index3Step(AbstractStep):
     def factors(self, motion, lam, kind=LU):
         shared, (_, t, h) = self.shared, self.node
         at_state = tangents(shared.system, motion.q, motion.v, motion.vdot, lam, t)
-        factors = factorize_iteration_matrix(shared.scheme, shared.system, at_state, shared.mass, motion.x, h, kind)
-        return factors, margin_of(factors, at_state.constraint_jacobian, shared.scale)
+        jacobian = at_state.constraint_jacobian
+        upper = multiplier_jacobian(shared.system, jacobian, motion.q, motion.v, lam, t)
+        matrices = at_state, shared.mass
+        factors = factorize_iteration_matrix(shared.scheme, shared.system, *matrices, motion.x, h, kind, upper)
+        return factors, margin_of(factors, jacobian, shared.scale)
 
     def change(self, du, dlam):
         return jnp.abs(du)
@@ -148,7 +158,7 @@ class Index3LinearizedStep(AbstractAlphaLinearizedStep):
         return margin_of(self.factors, self.tangents.constraint_jacobian, scale)
 
     def forward(self, shared, node, previous, loads, row):
-        k_t, c_t, jacobian, _ = self.tangents
+        k_t, c_t, jacobian = self.tangents
         w, v, vdot = carried = self.carried(shared, node.h, previous, loads, row)
         u, lam = self.factors.solve(
             row.a - loads.residual - (shared.mass @ vdot + c_t @ v + k_t @ w),
@@ -157,7 +167,7 @@ class Index3LinearizedStep(AbstractAlphaLinearizedStep):
         return self.ended(shared, node.h, carried, u, lam)
 
     def backward(self, shared, node, c, loads):
-        k_t, c_t, jacobian, _ = self.tangents
+        k_t, c_t, jacobian = self.tangents
         mu_a, mu_lam = self.factors.solve(self.of_unknown(shared, node.h, c)[0], c.lam, transposed=True)
         mu_phi = mu_lam / (shared.scheme.beta * node.h**2)
         mu_w = c.w - mu_a @ k_t - mu_phi @ jacobian
@@ -208,5 +218,6 @@ class Index3(AbstractEquations):
         system, h = self.system, node.h
         x = increment(self.scheme, previous, state.a, h)
         at_state = tangents(system, state.q, state.v, state.vdot, state.lam, node.t)
-        factors = factorize_iteration_matrix(self.scheme, system, at_state, self.mass, x, h)
-        return Index3LinearizedStep(x, at_state._replace(read=None), factors)
+        upper = multiplier_jacobian(system, at_state.constraint_jacobian, state.q, state.v, state.lam, node.t)
+        factors = factorize_iteration_matrix(self.scheme, system, at_state, self.mass, x, h, upper=upper)
+        return Index3LinearizedStep(x, at_state, factors)

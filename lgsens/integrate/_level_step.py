@@ -42,7 +42,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgsens.dynamics import AbstractSystem, State, constraint_velocity, mass_scale
+from lgsens.dynamics import AbstractSystem, State, constraint_velocity, mass_scale, multiplier_jacobian
 from lgsens.integrate._alpha import AbstractAlpha, AbstractStep, advance
 from lgsens.integrate._level_sparse import SparseLevelFactors
 from lgsens.integrate._linearized import Node
@@ -146,12 +146,12 @@ class LevelStep(AbstractStep):
         system, counts = self.shared.system, self.shared.counts
         lam = lam[: counts.multipliers]
         if self.shared.plan is not None:
-            at_state, by_place = system.sparse_tangents(q, v, vdot, lam, t), system.sparse_rate_stiffness(q, v, t)
-        else:
-            at_state = system.tangents(q, v, vdot, lam, t)
-            by_place = by_configuration(system, lambda q: counts.rate(system, q, v, t), q)
-        k_t, c_t, jacobian, _ = at_state
-        return LevelTangents(k_t, c_t, jacobian, at_state.multiplier_jacobian, by_place)
+            k_t, c_t, jacobian = system.sparse_tangents(q, v, vdot, lam, t)
+            return LevelTangents(k_t, c_t, jacobian, jacobian.T, system.sparse_rate_stiffness(q, v, t))
+        k_t, c_t, jacobian = system.tangents(q, v, vdot, lam, t)
+        upper = multiplier_jacobian(system, jacobian, q, v, lam, t)
+        by_place = by_configuration(system, lambda q: counts.rate(system, q, v, t), q)
+        return LevelTangents(k_t, c_t, jacobian, upper, by_place)
 
     def factors(self, motion, lam, kind=LU):
         at_state = self.tangents(motion.q, motion.v, motion.vdot, lam, self.node.t)

@@ -117,7 +117,7 @@ def _matrices(system: AbstractSystem, q, x, v, found: RadauStages, t) -> StageMa
     group, mass = system.group, system.mass_matrix()
     along = jnp.concatenate([found.mu, jnp.zeros_like(found.lam[len(found.mu) :])])  # as λ of all rows
     at = lambda lam: system.tangents(q, v, found.v, lam, t)
-    (stiffness, damping, jacobian, _), (push, *_) = jax.jvp(at, (found.lam,), (along,))
+    (stiffness, damping, jacobian), (push, *_) = jax.jvp(at, (found.lam,), (along,))
     turned = by_configuration(system, lambda q: constraint_velocity(system, q, v, t), q)
     turn = lambda u: mass @ group.tangent_mv(x + group.tangent_inv_mv(x, u), found.x)
     turning = jax.jacfwd(turn)(jnp.zeros_like(x))

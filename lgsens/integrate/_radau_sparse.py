@@ -107,7 +107,7 @@ class SparseStageFactors(AbstractStageFactors):
         def stage(c, x, v, found: RadauStages):
             q, t = group.retract(previous.q, x), node.begin + c * h
             at = lambda lam: system.sparse_tangents(q, v, found.v, lam, t)
-            (stiffness, damping, jacobian, _), (push, *_) = jax.jvp(at, (found.lam,), (found.mu,))
+            (stiffness, damping, jacobian), (push, *_) = jax.jvp(at, (found.lam,), (found.mu,))
             turned = system.sparse_rate_stiffness(q, v, t)
             back = partial(group.tangent_inv_mv, x)
             by_place = lambda u: jax.jvp(lambda x: group.tangent_mv(x, found.x), (x,), (back(u),))[1]

@@ -13,7 +13,7 @@ a moment loads it like a force at the arm ℓ, half the distance of two ends of 
 
 and a force s(w, N) against w acts on b, along ẋ_i and at the radius r about ω_j. Its power is s·w.
 
-r depends on λ beyond Bᵀλ then, ∂r/∂λ = Bᵀ − ∂Q/∂λ (`Tangents.multiplier_jacobian`): that of the iteration matrix
+r depends on λ beyond Bᵀλ then, ∂r/∂λ = Bᵀ − ∂Q/∂λ (`AbstractSystem.multiplier_jacobian`): that of the iteration matrix
 and of both sweeps. Motion and derivatives stay exact; the start is the solution of equations that are not linear in λ.
 """
 

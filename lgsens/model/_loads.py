@@ -34,11 +34,10 @@ from lgsens.model._signals import AbstractSignal, constant_of
 
 
 class LoadTangents(NamedTuple):
-    """∂Q/∂q and ∂Q/∂v of a force element, each (12, 12), or None where it is identically zero; and ∂Q/∂λ."""
+    """∂Q/∂q and ∂Q/∂v of a force element, each (12, 12), or None where it is identically zero."""
 
     position: Float[Array, "12 12"] | None
     velocity: Float[Array, "12 12"] | None
-    multipliers: Float[Array, "12 r"] | None = None
 
 
 class AbstractLoad(AbstractElement):

@@ -27,6 +27,7 @@ from jaxtyping import Array, Float
 
 from lgsens.dynamics import AbstractSystem, State, Tangents
 from lgsens.liegroups import SE3, Power, RigidMotions, skew
+from lgsens.linear import SparseMatrix
 from lgsens.model._frames import ROTATION
 from lgsens.model._system import MultibodySystem
 
@@ -129,7 +130,7 @@ class SE3System(AbstractSystem):
         u, omega, mass = v[at], v[spin], self.bodies.mass[whole]
         rate = self._acceleration(v, vdot)
         of_bodies = self.to_bodies(q, v), self.to_bodies(q, rate)
-        stiffness, damping, jacobian, read = self.bodies.tangents(q, *of_bodies, lam, t)
+        stiffness, damping, jacobian = self.bodies.tangents(q, *of_bodies, lam, t)
         stiffness, damping = self._both(q, stiffness), self._both(q, damping)
         force = self._from_bodies(q, self.bodies.residual(q, *of_bodies, lam, t))[at]
 
@@ -141,8 +142,12 @@ class SE3System(AbstractSystem):
         stiffness = stiffness.at[corner].add(by_turning).at[:, spin].add(-carried)
         damping = damping.at[corner].add(-mass[:, None, None] * skews(u))
         damping = damping.at[at[:, :, None], at[:, None, :]].add(mass[:, None, None] * skews(omega))
-        read = None if read is None else self._from_bodies(q, read.T).T
-        return Tangents(stiffness, damping, self._from_bodies(q, jacobian), read)
+        return Tangents(stiffness, damping, self._from_bodies(q, jacobian))
+
+    def multiplier_jacobian(self, q, v, lam, t):
+        every = self.bodies.multiplier_jacobian(q, self.to_bodies(q, v), lam, t)
+        every = every.dense() if isinstance(every, SparseMatrix) else every
+        return self._from_bodies(q, every.T).T
 
 
 def scene_of(system: Any) -> MultibodySystem | None:

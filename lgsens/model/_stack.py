@@ -294,25 +294,31 @@ def square_blocks(matrices: Float[Array, "e n n"], places: np.ndarray) -> Float[
 
 
 def load_tangents(element: AbstractLoad | AbstractDynamicLoad, a: Frame, b: Frame, va, vb, t, *z) -> LoadTangents:
-    """∂Q/∂q and ∂Q/∂v of one element; with states z, of Q and g by the coordinates of bodies and carriers, and by the
-    multipliers that follow the states in z."""
+    """∂Q/∂q and ∂Q/∂v of one element; with states z, of Q and g by the coordinates of bodies and carriers."""
     if isinstance(element, AbstractClosedFormLoad):
         return element.tangents(a, b, va, vb, t)
     bodies, count = 2 * BODY_DIM, num_states(element)
     zero = jnp.zeros(bodies, a.position.dtype)
 
-    def force(x, speed, more: Any = 0.0):
-        changed = [of_z + more for of_z in z]
+    def force(x, speed, *states):
+        changed = [of_z.at[:count].add(states[0]) if states else of_z for of_z in z]
         return generalized_force(element, *tilted((a, b), x), va + speed[BODY_A], vb + speed[BODY_B], t, *changed)
 
     if not z:  # a gradient of four torsion springs takes 7 % less time than with one Jacobian of both
         return LoadTangents(*(jax.jacfwd(force, argnums=i)(zero, zero) for i in (0, 1)))
-    # one Jacobian: four of friction in a hinge take a third more time to compile
-    ends = bodies, 2 * bodies, 2 * bodies + count
-    every = jax.jacfwd(lambda x: force(*jnp.split(x, ends[:2])))(jnp.zeros(2 * bodies + len(z[0]), zero.dtype))
-    *of_bodies, by_states, by_lam = jnp.split(every, ends, axis=1)
+    # one Jacobian: three of friction in a hinge and a controller take a quarter more time to compile
+    ends = bodies, 2 * bodies
+    every = jax.jacfwd(lambda x: force(*jnp.split(x, ends)))(jnp.zeros(2 * bodies + count, zero.dtype))
+    *of_bodies, by_states = jnp.split(every, ends, axis=1)
     wide = jnp.zeros((len(every), len(every)), every.dtype)
     position, velocity = (wide.at[:, :bodies].set(part) for part in of_bodies)
     if count:
         velocity = velocity.at[:, np.asarray(places_of_states(count))].set(by_states)
-    return LoadTangents(position, velocity, by_lam if by_lam.shape[1] else None)
+    return LoadTangents(position, velocity)
+
+
+def load_by_multipliers(element: AbstractDynamicLoad, a: Frame, b: Frame, va, vb, t, z) -> Float[Array, "n r"]:
+    """∂Q/∂λ, and ∂g/∂λ, of one element that reads multipliers."""
+    states, lam = jnp.split(z, [num_states(element)])
+    at = lambda lam: generalized_force(element, a, b, va, vb, t, jnp.concatenate([states, lam]))
+    return jax.jacfwd(at)(lam)

@@ -31,6 +31,7 @@ from lgsens.model._stack import (
     constraint_force,
     constraint_jacobian,
     constraint_stiffness,
+    load_by_multipliers,
     load_tangents,
     position_values,
     rate_of,
@@ -314,30 +315,35 @@ class MultibodySystem(AbstractSparseSystem):
     @_traced_once
     def sparse_tangents(self, q, v, vdot, lam, t):
         q, twist, topology = self._placed(q), self.twists(v), self.topology
-        damping, stiffness, read = [], [], []
+        damping, stiffness = [], []
         if self._gyroscopic:
             spin = twist[:, ROTATION]
             momentum = jnp.einsum("nij,nj->ni", self.inertia, spin)
             gyroscopic = jax.vmap(skew)(spin) @ self.inertia - jax.vmap(skew)(momentum)
             damping.append(Blocks(gyroscopic, topology.gyroscopic))
-        loads = zip(topology.loads, topology.read)
-        for stack, ends, inputs, (pattern, of_read) in self._acting(q, twist, lam, t, loads):
+        for stack, ends, inputs, pattern in self._acting(q, twist, lam, t, topology.loads):
             own = stack.ends.own
-            position, velocity, by_lam = stack.map(load_tangents, ends, inputs)
+            position, velocity = stack.map(load_tangents, ends, inputs)
             if position is not None:
                 stiffness.append(Blocks(-square_blocks(position, own), pattern))
             if velocity is not None:
                 damping.append(Blocks(-square_blocks(velocity, own), pattern))
-            if by_lam is not None:
-                read.append(Blocks(-stack.acting(jnp.swapaxes(by_lam, 1, 2)), of_read))
         placed = zip(self.constraints, at_ends(self.constraints, q), topology.rows, topology.stiffness)
         for stack, ends, rows, coupled in placed:
             block = square_blocks(stack.map(constraint_stiffness, ends, (chosen(lam, rows), t)), stack.ends.own)
             stiffness.extend(Blocks(square_blocks(block, places), pattern) for places, pattern in coupled)
-        jacobian = self.sparse_constraint_jacobian(q, t)
-        by_lam = dataclasses.replace(jacobian, parts=(*jacobian.parts, *read)).T if read else None
-        return Tangents(self._square(stiffness), self._square(damping), jacobian, by_lam)
+        return Tangents(self._square(stiffness), self._square(damping), self.sparse_constraint_jacobian(q, t))
 
     @property
     def reads_multipliers(self):
         return any(read.rows.size for read in self.topology.read)
+
+    @_traced_once
+    def multiplier_jacobian(self, q, v, lam, t):
+        transposed, twist, topology = self.sparse_constraint_jacobian(q, t), self.twists(v), self.topology
+        for stack, ends, inputs, pattern in self._acting(self._placed(q), twist, lam, t, topology.read):
+            if pattern.rows.size:
+                columns = jnp.swapaxes(stack.map(load_by_multipliers, ends, inputs), 1, 2)
+                part = Blocks(-stack.acting(columns), pattern)
+                transposed = dataclasses.replace(transposed, parts=(*transposed.parts, part))
+        return transposed.T

@@ -83,7 +83,7 @@ def continuous_adjoint_sweep(
 
     def node(point: PathPoint) -> tuple[LinearNode, Any]:
         state, t = point.state, point.t
-        k_t, c_t, jacobian, _ = system.tangents(state.q, state.v, state.vdot, state.lam, t)
+        k_t, c_t, jacobian = system.tangents(state.q, state.v, state.vdot, state.lam, t)
         motion = (group.to_ambient(state.q, state.v), state.vdot, jnp.ones_like(t))
         damping = lambda q, v, t: system.tangents(q, v, state.vdot, state.lam, t).damping
         _, c_t_rate = jax.jvp(damping, (state.q, state.v, t), motion)

@@ -47,7 +47,7 @@ def continuous_direct_sweep(
 
     def node(state: State, place, d_place) -> LinearNode:
         t, d_t = grid.node(place).t, node_tangent(grid, d.grid, place, d_place).t
-        k_t, c_t, jacobian, _ = system.tangents(state.q, state.v, state.vdot, state.lam, t)
+        k_t, c_t, jacobian = system.tangents(state.q, state.v, state.vdot, state.lam, t)
         bracket = group.ad(state.v)
         residual = lambda system, t: system.residual(state.q, state.v, state.vdot, state.lam, t)
         loads = lambda system, t: (residual(system, t), system.constraint(state.q, t))

@@ -56,7 +56,7 @@ def first_order_adjoint_sweep(path: PathPoint, parameters: Parameters, functiona
     def equations(point: PathPoint):
         """K_tᵀ, C_tᵀ, B, ad(v)ᵀ and the gradients of F as columns."""
         state = point.state
-        k_t, c_t, jacobian, _ = system.tangents(state.q, state.v, state.vdot, state.lam, point.t)
+        k_t, c_t, jacobian = system.tangents(state.q, state.v, state.vdot, state.lam, point.t)
         f = gradients(lambda state: functional.rate(p, system, state, point.t), group, state)
         return k_t.T, c_t.T, jacobian, group.ad(state.v).T, jax.tree.map(jnp.transpose, f)
 

@@ -124,7 +124,7 @@ def _program(load: AbstractLoad, potential: Potential | None, free, part):
         v, zero = v + u, jnp.zeros_like(v)
         force = lambda y, v: load.force(*displaced(a, b, y), v[:6], v[6:], t)
         given = load_tangents(load, a, b, v[:6], v[6:], t)
-        position, velocity = (jnp.zeros((DIM, DIM), v.dtype) if part is None else part for part in given[:2])
+        position, velocity = (jnp.zeros((DIM, DIM), v.dtype) if part is None else part for part in given)
         q, resting = force(zero, v), force(zero, zero)
         found = {
             "Q": q,
