@@ -133,6 +133,7 @@ def test_forces_by_multipliers(names, solver):
     assert np.abs(found - jacobian.T).max() > 0.1
 
 
+@pytest.mark.slow  # small version: test_jerk_is_the_rate_of_the_accelerations
 def test_jerk_with_forces_that_read_multipliers():
     """v̈ of the start is the rate of `accelerations` along the motion, by central differences of fourth order."""
     system = swing().system()
