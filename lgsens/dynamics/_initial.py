@@ -16,10 +16,17 @@ from lgsens.dynamics._constraints import (
     prescribed_velocity,
     violation_of_all,
 )
-from lgsens.dynamics._matrices import ConstrainedMass, constraint_jacobian, factorized, for_once, mass_scale
+from lgsens.dynamics._matrices import (
+    ConstrainedMass,
+    constraint_jacobian,
+    factorized,
+    for_once,
+    mass_scale,
+    multiplier_jacobian,
+)
 from lgsens.dynamics._redundant import softness
 from lgsens.dynamics._results import RESULTS
-from lgsens.dynamics._system import AbstractSystem, State, by_multipliers, finite
+from lgsens.dynamics._system import AbstractSystem, State, finite
 from lgsens.linear import Factors, Inverse, Matrix, SparseMatrix, diagonal
 
 _MAX_ITERATIONS = 30
@@ -103,8 +110,8 @@ def _implicit_accelerations(system: AbstractSystem, q, v, t):
 def _scaled_matrix(system: AbstractSystem, jacobian, q, v, lam, t) -> Float[Array, "n n"]:
     """[[M, σ ∂r/∂λ], [σ J, 0]], with σ the size of M: the derivative of r and σ (J v̇ + γ) by v̇ and λ/σ."""
     mass, none = system.mass_matrix(), jnp.zeros((jacobian.shape[0],) * 2, v.dtype)
-    scale = mass_scale(mass)
-    return jnp.block([[mass, scale * by_multipliers(system, q, v, lam, t)], [scale * jacobian, none]])
+    scale, by_lam = mass_scale(mass), multiplier_jacobian(system, jacobian, q, v, lam, t)
+    return jnp.block([[mass, scale * by_lam], [scale * jacobian, none]])
 
 
 def jerk(system: AbstractSystem, q, v, vdot, lam, t) -> Float[Array, " k"]:

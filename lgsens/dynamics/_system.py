@@ -176,7 +176,7 @@ class AbstractSystem(eqx.Module):
 
     def multiplier_jacobian(self, q, v, lam, t) -> Matrix:
         """∂r/∂λ, shape (k, m); asked for where f depends on λ."""
-        return by_multipliers(self, q, v, lam, t)
+        return jax.jacfwd(lambda lam: self.residual(q, v, jnp.zeros_like(v), lam, t))(lam)
 
     # States that obey ż = g(q, v, z, t): z is the velocity of a coordinate with unit mass, on which nothing depends.
 
@@ -270,11 +270,6 @@ def autodiff_tangents(system: AbstractSystem, q, v, vdot, lam, t) -> Tangents:
     if system.num_velocity_rows:
         jacobian = jnp.concatenate([jacobian, system.velocity_jacobian(q, t)])
     return Tangents(k, c, jacobian)
-
-
-def by_multipliers(system: AbstractSystem, q, v, lam, t) -> Float[Array, "k m"]:
-    """∂r/∂λ by forward-mode autodiff."""
-    return jax.jacfwd(lambda lam: system.residual(q, v, jnp.zeros_like(v), lam, t))(lam)
 
 
 def autodiff_constraint_jacobian(system: AbstractSystem, q, t) -> Float[Array, "m_p k"]:
