@@ -19,6 +19,7 @@ from lgsens._validate import as_count
 from lgsens.criteria import grows_exponentially
 from lgsens.dynamics import (
     AbstractSystem,
+    ConstrainedMass,
     State,
     accelerations,
     consistent_velocity,
@@ -97,9 +98,10 @@ def _growth_jit(system: AbstractSystem, t0, t1, num_steps: int, integrator: Abst
 
     def motion(x, y):
         q = group.retract(q0, x)
-        v = consistent_velocity(system, q, v0 + y, t0)
-        vdot, lam = accelerations(system, q, v, t0)
-        moved = initial._replace(state=State(q=q, v=v, vdot=vdot, lam=lam, a=vdot))
+        kkt = ConstrainedMass.of(system, q, t0)
+        v = consistent_velocity(system, q, v0 + y, t0, kkt)
+        vdot, lam = accelerations(system, q, v, t0, kkt)
+        moved = initial._replace(state=State(q=q, v=v, vdot=vdot, lam=lam, a=vdot), kkt=kkt)
         start = begin(integrator.scheme, system, t0, None, moved)
         trajectory, details = run(system, start, t0, t1, num_steps, integrator, DirectDifferentiation())
         return trajectory.states.q, (trajectory.t, trajectory.result, details)

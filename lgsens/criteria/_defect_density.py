@@ -65,11 +65,14 @@ def defect_densities(
                 "AlignedSteps end at breaks, and AdaptiveSteps has steps for the motion by any scheme."
             )
 
-        def better(b):
-            run = corrected(trajectory, error_by_defects(scheme, trajectory.states, parameters, b, known.linear))
+        def without(error):
+            run = corrected(trajectory, error)
             return jnp.stack([criterion(run, p) for criterion in criteria])
 
-        z = jax.jacrev(better)(b)
+        error = lambda b: error_by_defects(scheme, trajectory.states, parameters, b, known.linear)
+        none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(error, b))
+        to_defects = jax.linear_transpose(error, b)
+        z = jax.vmap(lambda row: to_defects(row)[0])(jax.jacrev(without)(none))
         products = jax.tree.map(lambda z, b: jnp.sum(z * b[None], axis=2), z, b)
         of_motion = jnp.sum(jnp.stack(jax.tree.leaves(products)), axis=0)
         of_motion = of_motion[:, 1:].at[:, 0].add(of_motion[:, 0])  # what the start misses goes with the first step

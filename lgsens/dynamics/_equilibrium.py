@@ -30,7 +30,7 @@ from jaxtyping import Array, Bool, Float, Int
 from lgsens._xla import while_loop
 from lgsens.dynamics._constraints import depends_on_time, violation_of_all
 from lgsens.dynamics._initial import Initial, accelerations, consistent_velocity, is_redundant
-from lgsens.dynamics._matrices import constraint_jacobian, mass_scale
+from lgsens.dynamics._matrices import ConstrainedMass, mass_scale
 from lgsens.dynamics._redundant import softness
 from lgsens.dynamics._results import RESULTS
 from lgsens.dynamics._system import AbstractSystem, State
@@ -161,10 +161,11 @@ def equilibrium(system: AbstractSystem, t) -> Initial:
     rests = balanced(z, jnp.concatenate([equation(z), system.velocity_constraint(q, v, t)]), stiff)
     result = jnp.where(rests, RESULTS.successful, RESULTS.equilibrium_failed).astype(jnp.int32)
     if depends_on_time(system, q, v, t):
-        v = consistent_velocity(system, q, v, t)
-        vdot, lam = accelerations(system, q, v, t)
+        kkt = ConstrainedMass.of(system, q, t)
+        v = consistent_velocity(system, q, v, t, kkt)
+        vdot, lam = accelerations(system, q, v, t, kkt)
         if softness(system) is None:
-            redundant = (result == RESULTS.successful) & is_redundant(system, constraint_jacobian(system, q, t))
+            redundant = (result == RESULTS.successful) & is_redundant(system, kkt.jacobian)
             result = jnp.where(redundant, RESULTS.redundant_constraints, result).astype(jnp.int32)
     violation = violation_of_all(system, q, t, system.constraint(q, t))
     apart = jnp.any(violation[m:] != 0.0) & (result == RESULTS.successful)

@@ -18,7 +18,6 @@ from lgsens.dynamics._constraints import (
 )
 from lgsens.dynamics._matrices import (
     ConstrainedMass,
-    constraint_jacobian,
     factorized,
     for_once,
     mass_scale,
@@ -27,7 +26,7 @@ from lgsens.dynamics._matrices import (
 from lgsens.dynamics._redundant import softness
 from lgsens.dynamics._results import RESULTS
 from lgsens.dynamics._system import AbstractSystem, State, finite
-from lgsens.linear import Factors, Inverse, Matrix, SparseMatrix, diagonal
+from lgsens.linear import Inverse, Matrix, SparseMatrix, diagonal
 
 _MAX_ITERATIONS = 30
 
@@ -38,7 +37,7 @@ class Initial(NamedTuple):
     state: State
     result: Int[Array, ""]  # a value of RESULTS
     violation: Float[Array, " m+r"]  # after assembly, that of all equations (`violation_of_all`)
-    factors: Factors | None = None  # of `ConstrainedMass` there
+    kkt: ConstrainedMass | None = None  # there; None: not known
 
 
 def split_velocity(system: AbstractSystem, q, v, t) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
@@ -51,9 +50,12 @@ def split_velocity(system: AbstractSystem, q, v, t) -> tuple[Float[Array, " k"],
     return tangential, v - tangential
 
 
-def consistent_velocity(system: AbstractSystem, q, v, t, factors: Factors | None = None) -> Float[Array, " k"]:
-    """What an impulse through the joints and drivers makes of v: M (x − v) + Jᵀμ = 0, J x + c(q, 0, t) = 0."""
-    kkt = ConstrainedMass.of(system, q, t, factors)
+def consistent_velocity(system: AbstractSystem, q, v, t, kkt: ConstrainedMass | None = None) -> Float[Array, " k"]:
+    """What an impulse through the joints and drivers makes of v: M (x − v) + Jᵀμ = 0, J x + c(q, 0, t) = 0.
+
+    `kkt`: that at q, if it is known, as in `accelerations`: M and J that several of them share are differentiated once.
+    """
+    kkt = ConstrainedMass.of(system, q, t) if kkt is None else kkt
     return kkt.solve(kkt.mass @ v, -prescribed_velocity(system, q, t))[0]
 
 
@@ -66,14 +68,14 @@ def given_way(system: AbstractSystem, q, lam, t) -> Float[Array, " k"] | None:
     return ConstrainedMass.of(system, q, t).solve(jnp.zeros(system.group.dim, lam.dtype), gap)[0]
 
 
-def accelerations(system: AbstractSystem, q, v, t, factors: Factors | None = None):
+def accelerations(system: AbstractSystem, q, v, t, kkt: ConstrainedMass | None = None):
     """v̇ and λ of the motion through (q, v) at time t, eq. (41).
 
     M v̇ + Jᵀλ = ad(v)ᵀ M v − f(q, v, t),     J v̇ = −γ(q, v, t)
     """
     if system.reads_multipliers:
         return _implicit_accelerations(system, q, v, t)
-    kkt = ConstrainedMass.of(system, q, t, factors)
+    kkt = ConstrainedMass.of(system, q, t) if kkt is None else kkt
     zero, lam_zero = jnp.zeros_like(v), jnp.zeros(kkt.jacobian.shape[0], v.dtype)
     force = -system.residual(q, v, zero, lam_zero, t)
     return kkt.solve(force, -fixed_velocity_rate(system, q, v, t))
@@ -221,15 +223,15 @@ def initial_state(system: AbstractSystem, t) -> Initial:
     q, violation = assemble(system, t)
     violation = violation_of_all(system, q, t, violation)
     _, v_ref = system.reference()
-    factors = ConstrainedMass.of(system, q, t).factors
-    v = system.settled(q, consistent_velocity(system, q, v_ref, t, factors), t)
-    vdot, lam = accelerations(system, q, v, t, factors)
+    kkt = ConstrainedMass.of(system, q, t)
+    v = system.settled(q, consistent_velocity(system, q, v_ref, t, kkt), t)
+    vdot, lam = accelerations(system, q, v, t, kkt)
     state = State(q=q, v=v, vdot=vdot, lam=lam, a=vdot)
-    redundant = softness(system) is None and is_redundant(system, constraint_jacobian(system, q, t))
+    redundant = softness(system) is None and is_redundant(system, kkt.jacobian)
     largest = jnp.max(jnp.abs(violation), initial=0.0)
     assembled = largest <= system.constraint_round_off()  # NaN is not assembled
     result = jnp.where(finite(state), RESULTS.successful, RESULTS.invalid_numbers)
     result = jnp.where(redundant, RESULTS.redundant_constraints, result)
     result = jnp.where(assembled | (jnp.isnan(largest) & redundant), result, RESULTS.assembly_failed)
     result = jnp.where(system.is_valid(), result, RESULTS.invalid_numbers).astype(jnp.int32)
-    return Initial(state, result, violation, factors)
+    return Initial(state, result, violation, kkt)

@@ -37,12 +37,12 @@ class AbstractAlphaBegin(AbstractAlpha):
         state = self.complete(system, initial.state)
         if not (self.second_order_start and system.constraint_names):
             return Start(state)
-        a_1, v_2 = self.offsets(system, state, t0, initial.factors)
+        a_1, v_2 = self.offsets(system, state, t0, initial.kkt)
         if self.stabilized:
             return Start(state, a_1=a_1)
         return Start(state, q_2=given_way(system, state.q, self.beta * state.lam, t0), v_2=v_2, a_1=a_1)
 
-    def offsets(self, system, state, t, factors=None):
+    def offsets(self, system, state, t, kkt=None):
         """(a − v̇)/h and (v − v_exact)/h² along the constraint directions once the scheme is under way: Δ N v̈, and the
         least x, in the metric of M, with B x = B c; A x = 0 of rows that are kept at velocity level.
 
@@ -51,7 +51,7 @@ class AbstractAlphaBegin(AbstractAlpha):
         q, v, vdot = state.q, state.v, state.vdot
         turning = self.missed_increment(system, v, vdot, jnp.zeros_like(v))
         asked = -constraint_jerk(system, q, v, vdot, t)
-        kkt = ConstrainedMass.of(system, q, t, factors)
+        kkt = ConstrainedMass.of(system, q, t) if kkt is None else kkt
         off = of_position_level(system, self.jerk_share * asked + kkt.jacobian @ turning)
         return jax.vmap(lambda row: kkt.solve(jnp.zeros_like(v), row)[0])(jnp.stack([self.delta * asked, off]))
 
@@ -94,7 +94,7 @@ class AbstractAlphaBegin(AbstractAlpha):
             return line
         if factors is None:
             factors = self.resizing_factors(system, state, t)
-        v = consistent_velocity(system, state.q, state.v, t, factors)
+        v = consistent_velocity(system, state.q, state.v, t, ConstrainedMass.of(system, state.q, t, factors))
         return line._replace(state=dataclasses.replace(line.state, v=v), v_2=state.v - v)
 
     def restarts(self, system):

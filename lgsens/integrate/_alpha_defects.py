@@ -104,9 +104,9 @@ def alpha_defects(scheme: AbstractAlphaBegin, system: AbstractSystem, grid: Abst
     at_start = lambda f: 1.5 * f[0] - 0.5 * f[1]
     first, t0 = jax.tree.map(lambda leaf: leaf[0], states), grid.times()[0]
     kkt = ConstrainedMass.of(system, first.q, t0)
-    v_0 = consistent_velocity(system, first.q, first.v, t0, kkt.factors)
-    vdot_0, lam_0 = accelerations(system, first.q, v_0, t0, kkt.factors)
-    a_1, v_2 = scheme.offsets(system, State(first.q, v_0, vdot_0, lam_0, vdot_0), t0, kkt.factors)
+    v_0 = consistent_velocity(system, first.q, first.v, t0, kkt)
+    vdot_0, lam_0 = accelerations(system, first.q, v_0, t0, kkt)
+    a_1, v_2 = scheme.offsets(system, State(first.q, v_0, vdot_0, lam_0, vdot_0), t0, kkt)
     seen = missed_x - 0.5 * h * missed_v + scheme.delta**3 / 4.0 * h * snap
     off = of_position_level(system, kkt.jacobian @ at_start(seen))
     rows = jnp.stack([off, kkt.jacobian @ at_start(jerk)])

@@ -78,7 +78,7 @@ def equilibrium(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) ->
 
 @eqx.filter_jit
 def _initial_jit(system, t0) -> Initial:
-    return _initial(system, t0)._replace(factors=None)
+    return _initial(system, t0)._replace(kkt=None)
 
 
 @eqx.filter_jit
@@ -240,5 +240,6 @@ def begin(
     initial = _initial(system, t0) if initial is None else initial
     usable = initial.result == RESULTS.successful
     start = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), scheme.start(system, initial, t0))
-    jacobian = constraint_jacobian(system, initial.state.q, t0)
+    kkt = initial.kkt
+    jacobian = constraint_jacobian(system, initial.state.q, t0) if kkt is None else kkt.jacobian
     return Begin(start, initial.state.v, initial.result, initial.violation, jacobian)
