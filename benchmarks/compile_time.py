@@ -7,8 +7,8 @@ Each program is traced and compiled in a process of its own, as a session meets 
 fills, then again with what the first has left. The gradient is that of Ψ, the integral of the square of an
 acceleration, by all numbers of the model. Processor time stands beside wall time: other load on the machine changes it
 least. "trace" is what no cache saves: Python that makes the program. With jaxlib 0.10 a third process
-compiles without the options that lgsens gives XLA (`lgsens._xla`), as JAX comes. "runs" is the median of 20 runs of 100
-steps.
+compiles without the options that lgsens gives XLA (`lgsens._xla`), as JAX comes. The last one compiles for few calls,
+without most of XLA's optimizations (`jax_disable_most_optimizations`). "runs" is the median of 20 runs of 100 steps.
 
 "anew" is the processor time of a second call in one process, outside of `jit`, with one thing changed, relative to the
 first: another criterion, number of steps, tolerance or ρ∞, for `jax.value_and_grad` and for `differentiate`. Writes
@@ -81,6 +81,7 @@ def compile_once(scene: str, program: str) -> dict:
     return found | {"run_seconds": statistics.median(times.cpu), "run_wall_seconds": statistics.median(times.wall)}
 
 
+OTHERS = {"for_few_calls": "for few calls", "as_jax_comes": "as JAX comes"}
 CALLS = ("value_and_grad", "differentiate")
 CHANGES = {
     "criterion": {"criterion": "velocity"},
@@ -127,7 +128,7 @@ def itself(model):
 
 
 def measure(scene: str) -> dict:
-    """The programs of a scene, each in two processes that share a cache, and in one as JAX comes."""
+    """The programs of a scene, each in two processes that share a cache, in one as JAX comes, in one for few calls."""
     found = {}
     for program in PROGRAMS:
 
@@ -144,11 +145,12 @@ def measure(scene: str) -> dict:
             }
             runs = [run(settings) for _ in range(2)]
             size = sum(path.stat().st_size for path in Path(cache).rglob("*") if path.is_file())
+        runs.append(run({"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}))
         if importlib.metadata.version("jaxlib").startswith("0.10."):
             runs.append(run({"XLA_FLAGS": f"{SINGLE_THREAD['XLA_FLAGS']} {AS_JAX_COMES}"}))
         first, again, *other = (json.loads(text.splitlines()[-1]) for text in runs)
         found[program] = {"first": first, "again": again, "cache_bytes": size}
-        found[program] |= dict(zip(("as_jax_comes",), other))
+        found[program] |= dict(zip(OTHERS, other))
         print(f"{scene}, {program}: {first['seconds']:.1f} s, again {again['seconds']:.1f} s", flush=True)
     return found
 
@@ -168,18 +170,12 @@ def measure_anew(scene: str) -> dict:
 
 
 def markdown(document: dict) -> str:
-    kinds = {"as_jax_comes": "as JAX comes", "lean": "without fusion emitters"}  # the latter in older results
-    third = next((key for key in kinds for found in document["scenes"].values() if key in found[PROGRAMS[0]]), "none")
-    lines = [
-        circumstances(document["environment"]),
-        "",
-        "| scene | program | compile [s] (CPU) | of it trace [s] | cached [s] (CPU) | ratio | cache [MB] "
-        f"| runs [ms] | {kinds.get(third, '–')}: compile [s] (CPU) | runs [ms] |",
-        "|---" * 10 + "|",
-    ]
+    head = ("scene", "program", "compile [s] (CPU)", "of it trace [s]", "cached [s] (CPU)", "ratio", "cache [MB]")
+    head = (*head, "runs [ms]", *(text for kind in OTHERS.values() for text in (f"{kind} [s] (CPU)", "runs [ms]")))
+    lines = [circumstances(document["environment"]), "", f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for scene, programs in document["scenes"].items():
         for program, found in programs.items():
-            first, again, other = found["first"], found["again"], found.get(third)
+            first, again = found["first"], found["again"]
             cells = (
                 scene,
                 program,
@@ -189,9 +185,13 @@ def markdown(document: dict) -> str:
                 f"{first['seconds'] / again['seconds']:.1f}",
                 f"{found['cache_bytes'] / 1e6:.1f}",
                 f"{1e3 * first['run_seconds']:.2f}",
-                f"{other['seconds']:.1f} ({other['cpu_seconds']:.1f})" if other else "–",
-                f"{1e3 * other['run_seconds']:.2f}" if other else "–",
             )
+            for kind in OTHERS:
+                if other := found.get(kind):
+                    took = f"{other['seconds']:.1f} ({other['cpu_seconds']:.1f})"
+                    cells = (*cells, took, f"{1e3 * other['run_seconds']:.2f}")
+                else:
+                    cells = (*cells, "–", "–")
             lines.append("| " + " | ".join(cells) + " |")
     lines += [
         "",
