@@ -18,6 +18,7 @@ from lgsens.dynamics._constraints import (
 )
 from lgsens.dynamics._matrices import (
     ConstrainedMass,
+    dense,
     factorized,
     for_once,
     mass_scale,
@@ -74,17 +75,18 @@ def accelerations(system: AbstractSystem, q, v, t, kkt: ConstrainedMass | None =
     M v̇ + Jᵀλ = ad(v)ᵀ M v − f(q, v, t),     J v̇ = −γ(q, v, t)
     """
     if system.reads_multipliers:
-        return _implicit_accelerations(system, q, v, t)
+        jacobian = full_jacobian(system, q, t) if kkt is None else kkt.jacobian
+        return _implicit_accelerations(system, q, v, t, dense(jacobian))
     kkt = ConstrainedMass.of(system, q, t) if kkt is None else kkt
     zero, lam_zero = jnp.zeros_like(v), jnp.zeros(kkt.jacobian.shape[0], v.dtype)
     force = -system.residual(q, v, zero, lam_zero, t)
     return kkt.solve(force, -fixed_velocity_rate(system, q, v, t))
 
 
-def _implicit_accelerations(system: AbstractSystem, q, v, t):
+def _implicit_accelerations(system: AbstractSystem, q, v, t, jacobian):
     """The same where f depends on λ: r(q, v, v̇, λ, t) = 0 and J v̇ + γ = 0 by Newton's iteration, and its derivative."""
     k, scale = v.shape[0], mass_scale(system.mass_matrix())  # of the equations of acceleration, and of λ
-    jacobian, drift = full_jacobian(system, q, t), fixed_velocity_rate(system, q, v, t)
+    drift = fixed_velocity_rate(system, q, v, t)
 
     def equation(y):
         residual = system.residual(q, v, y[:k], scale * y[k:], t)

@@ -43,7 +43,7 @@ def multiplier_jacobian(system: AbstractSystem, jacobian: Matrix, q, v, lam, t) 
     if not system.reads_multipliers:
         return jacobian.T
     every = system.multiplier_jacobian(q, v, lam, t)
-    return every.dense() if isinstance(every, SparseMatrix) and not isinstance(jacobian, SparseMatrix) else every
+    return every if isinstance(jacobian, SparseMatrix) else dense(every)
 
 
 def require_linear(system: AbstractSystem, method: str) -> None:
@@ -106,7 +106,12 @@ def factorized(
 def for_once(*matrices: Matrix) -> tuple[Matrix, ...]:
     """Matrices that are factorized once in a run, as arrays where that takes less than the blocks take to compile."""
     few = sum(matrix.shape[0] for matrix in matrices) <= tuned.DENSE_ONCE
-    return tuple(m.dense() if few and isinstance(m, SparseMatrix) else m for m in matrices)
+    return tuple(map(dense, matrices)) if few else matrices
+
+
+def dense(matrix: Matrix) -> Array:
+    """The matrix as an array."""
+    return matrix.dense() if isinstance(matrix, SparseMatrix) else matrix
 
 
 def kkt_solve(mass, jacobian, force, rate) -> tuple[Float[Array, " k"], Float[Array, " m"]]:

@@ -70,10 +70,10 @@ _MESSAGES = {
     ),
     RESULTS.angle_jumped: (
         "An angle passes half a turn, which poses do not tell from the other half, and what depends on it jumped. Let "
-        "a spring count whole turns (`TorsionSpringDamper` or `CoordinateForce` with turns=True), divide a beam into "
-        "more elements; give gears and couplings `teeth` of which the ratio makes an integer, or None where there are "
-        "none (`GearJoint`); couple an angle to a displacement, not that to the angle, or by a curve that closes after "
-        "a turn (`CoordinateCoupling`)."
+        "a spring, or a curve of two turns, count them (`TorsionSpringDamper` or `CoordinateForce` with turns=True), "
+        "divide a beam into more elements; give gears and couplings `teeth` of which the ratio makes an integer, or "
+        "None where there are none (`GearJoint`); couple an angle to a displacement, not that to the angle, or by a "
+        "curve that closes after one turn, as of a cam over the angle of its own shaft (`CoordinateCoupling`)."
     ),
     RESULTS.joints_apart: (
         "Equations of joints that redundant='remove' left out do not hold any more. Others imply them for lengths and "

@@ -144,7 +144,8 @@ class CoordinateForce(AbstractForce):
         curve: F [N or N m] over s, a signal of it in place of time: a torque over the angle of a crank. None: none.
         turns: whether an angle is counted over whole turns, by a state "angle" (`Trajectory.states_of`), static. Else
             it is within half a turn of s₀, where the force of a spring jumps; a motion that comes there has failed.
-            Without a spring, and with a curve that closes after a turn (`Sampled(…, periodic=True)`), none jumps.
+            Without a spring, and with a curve whose period is one turn (`Sampled(…, periodic=True)`), none jumps; one
+            of two turns, as the torque of a four-stroke engine, is counted.
 
     `Trajectory.force` gives the coordinate, its rate, and f. Raises `ValueError` for a joint without the coordinate,
     a larger `free`, `turns` of one that is no angle, a curve that is no signal, and wrong shapes. Source: in minimal

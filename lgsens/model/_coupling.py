@@ -104,10 +104,10 @@ class CoordinateCoupling(AbstractJoint):
             half a turn, where a run has failed otherwise, and so it does for the derivative by c₁.
         curve: f over s₂, a signal of it in place of time; then there are no coefficients. Over an angle it is that of a
             cam, and this turns any number of times, if f closes after a turn: `Sampled(angles, lifts, "cubic",
-            periodic=True)`, with angles from 0 to 2π; or if it closes but for whole turns of s₁, itself an angle.
-            Derivatives by its period are none then. Unless f(0) = 0 the mechanism is assembled before it moves. Where
-            f″ jumps (a "monotone" one) accelerations do; where f‴ does (a "cubic" one, at samples), derivatives of
-            forces are of first order.
+            periodic=True)`, with angles from 0 to 2π (a cam at half the speed of a crank has a shaft of its own); or if
+            it closes but for whole turns of s₁, itself an angle. Derivatives by its period are none then. Unless
+            f(0) = 0 the mechanism is assembled before it moves. Where f″ jumps (a "monotone" one) accelerations do;
+            where f‴ does (a "cubic" one, at samples), derivatives of forces are of first order.
 
     The multiplier is the generalized force that the coupling takes from s₁ [N or N m]: of ropes over pulleys the
     tension of the first one, −c₁ times which the second one has. Raises `ValueError` for joints

@@ -23,7 +23,7 @@ from lgsens.model._frames import Frame
 from lgsens.model._loads import AbstractDynamicLoad
 from lgsens.model._relative import but_for_turns
 
-_AROUND = np.linspace(-1.0, 1.0, 9)  # half turns
+_AROUND = np.linspace(-1.0, 1.0, 61) + np.array([[0.0], [2.0]])  # half turns, once around and once more
 
 
 class AlongCoordinate(Protocol):
@@ -73,14 +73,16 @@ def unless_closed(
     of: Callable[[Array], Array], angle: Array, centre: Array | float = 0.0, turn: float | None = None
 ) -> Array:
     """An angle within half a turn of `centre` that something is a function of: 0 where value and slope of that are the
-    same after a turn, the value but for multiples of `turn`, so that it goes on over any number of turns
-    (`AbstractElement.branch`). The same is to six digits of what it is around the turn, with what its samples lose."""
+    same a turn later, wherever that began, the value but for multiples of `turn`, so that it goes on over any number of
+    turns (`AbstractElement.branch`). The same is to six digits of what it is in these turns, with what its samples
+    lose."""
     around = centre + jnp.pi * jnp.asarray(_AROUND, angle.dtype)
-    values, slopes = jax.vmap(jax.value_and_grad(of))(around)
-    jump, bend = values[-1] - values[0], slopes[-1] - slopes[0]
+    values, slopes = jax.vmap(jax.vmap(jax.value_and_grad(of)))(around)
+    jump, bend = values[1] - values[0], slopes[1] - slopes[0]
     jump = jump if turn is None else but_for_turns(jump, turn=turn)
     small = max(1e-6, float(jnp.finfo(angle.dtype).eps) ** 0.5) * jnp.max(jnp.abs(values) + jnp.abs(slopes))
-    return jnp.where((jnp.abs(jump) <= small) & (jnp.abs(bend) <= small), 0.0, angle)
+    closed = jnp.all((jnp.abs(jump) <= small) & (jnp.abs(bend) <= small))
+    return jnp.where(closed, 0.0, angle)
 
 
 def branch_of(load: AlongCoordinate, a: Frame, b: Frame) -> Float[Array, ""]:

@@ -141,7 +141,8 @@ def test_what_closes_after_a_turn(dtype):
             assert unless_closed(closed, angle) == 0.0
     geared = lambda t: 3.0 * t + 0.2 * jnp.sin(t)
     assert unless_closed(geared, angle, turn=TURN) == 0.0
-    for open_ in (geared, lambda t: 0.1 * t**2, lambda t: 1.0 + 1e-3 * jnp.sin(t / 2.0)):
+    pulse = lambda t: jnp.exp(-((jnp.mod(t, 2.0 * TURN) - 0.6) ** 2) / 0.1)  # of two turns, nothing where one closes
+    for open_ in (geared, lambda t: 0.1 * t**2, lambda t: 1.0 + 1e-3 * jnp.sin(t / 2.0), pulse):
         assert unless_closed(open_, angle) == angle
     assert unless_closed(lambda t: 1.3 * t, angle, turn=TURN) == angle
 
