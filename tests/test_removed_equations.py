@@ -74,7 +74,40 @@ def test_what_is_left_out_of_hinges():
     assert sorted(kept) == ["lower"] * 3 + ["upper"] * 2
 
 
+SUN, PLANET, RING = 24, 18, 60  # teeth
+
+
+@functools.cache
+def planetary():
+    """Three planets between sun and ring; two of their six meshes repeat others."""
+    arm, held = 1e-3 * (SUN + PLANET), {"mass": 1.0, "inertia": (1e-3, 1e-3, 1e-3)}
+    bodies = {name: lg.RigidBody(**held, free="rz") for name in ("sun", "carrier")}
+    joints = {"motor": lg.RotationDriver(None, "sun", axis=Z, value=lg.Polynomial((0.0, 1.0)))}
+    for i, angle in enumerate(np.arange(3) * 2.0 * np.pi / 3.0):
+        at = arm * np.array([np.cos(angle), np.sin(angle), 0.0])
+        name, axes = f"planet {i}", {"at_a": np.zeros(3), "at_b": at, "axis_a": Z, "axis_b": Z, "teeth": PLANET}
+        bodies[name] = lg.RigidBody(**held, position=at, free="x y rz")
+        joints[f"pin {i}"] = lg.RevoluteJoint("carrier", name, at=at, axis=Z)
+        joints[f"mesh {i}"] = lg.GearJoint("sun", name, ratio=-SUN / PLANET, **axes)
+        joints[f"teeth {i}"] = lg.GearJoint(None, name, ratio=RING / PLANET, **axes)
+    return lg.Model(bodies, joints, redundant="remove")
+
+
+def test_teeth_are_left_out_before_a_component_of_a_pin():
+    """A pin that holds in one direction only, with the teeth for the other one, lets go where the carrier turns on."""
+    assert len(planetary().removed) == 2
+    assert not any(name.startswith("pin") for name, *_ in planetary().removed)
+
+
 SLOW = pytest.mark.slow  # programs of their own
+
+
+@SLOW
+def test_planets_turn_their_carrier():
+    """By Willis's equation, over one turn of it."""
+    found = lg.kinematics(planetary(), t=np.linspace(0.0, 2.0 * np.pi * (SUN + RING) / SUN, 29))
+    rate = found.body("carrier").angular_velocity[:, 2]
+    np.testing.assert_allclose(rate, SUN / (SUN + RING), rtol=1e-9)  # positions to 1e-12
 
 
 @pytest.mark.slow

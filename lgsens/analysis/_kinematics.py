@@ -122,7 +122,8 @@ def kinematics(
                 "Drive more coordinates, hold bodies by `free`, or lock joints."
                 if unknowns > equations
                 else "Drive fewer coordinates; or joints say the same twice, as hinges of a planar mechanism do: give "
-                "its bodies free='x y rz', or Model(…, redundant='remove')."
+                "its bodies free='x y rz', leave out a joint that the `free` coordinates of its bodies satisfy anyway, "
+                "or take Model(…, redundant='remove')."
             )
         )
     where = drivers(system)

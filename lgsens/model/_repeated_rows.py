@@ -2,8 +2,10 @@
 
 Which ones can be left out, and which of them leave equations that are far from singular wherever the mechanism goes,
 `dynamics.repeated_rows` says. Among these, weights prefer what holds directions to what holds points, as pins carry
-forces before moments; of what is alike, the joints that are last by name. What drives is never left out: where it
-repeats others, they determine already what it prescribes.
+forces before moments; and conditions of one equation, the teeth of a gear or a rod, to one component of a point, which
+holds it in another direction when its body has turned, and not at all what the others hold by then; of what is alike,
+the joints that are last by name. What drives is never left out: where it repeats others, they determine already what it
+prescribes.
 """
 
 import dataclasses
@@ -28,7 +30,7 @@ from lgsens.model._system import MultibodySystem
 Equations = tuple[tuple[str, int, int], ...]
 # Singular values of unit rows that would repeat others but for as much; beside a dead centre there are such, too.
 _NEARLY, _NEARLY_IF_IT_MOVES = 1e-3, 1e-5
-_POINT, _FIRST = 0.1, 0.9  # of a direction, and of the last joint, 1
+_POINT, _ALONE, _FIRST = 0.1, 0.3, 0.9  # of a direction, and of the last joint, 1
 _REDUNDANT = ("refuse", "minimum_norm", "remove")
 
 
@@ -72,9 +74,11 @@ def repeated_equations(system: MultibodySystem) -> Equations:
     if found.near == len(found.jacobian):
         return ()
     equations: dict[int, tuple[str, int, int]] = {}
+    alone = np.zeros(len(found.jacobian), bool)
     for stack, rows in zip(system.constraints, system.topology.rows):
         for owner, place, own in zip(stack.owners, stack.places, rows):
             equations |= {int(row): (owner, place, i) for i, row in enumerate(own) if row >= 0}
+            alone[own[own >= 0]] = len(own) == 1
     repeating = redundant_names(found.jacobian, system.constraint_names)
     prescribing = {name for name, of in zip(system.constraint_names, driven) if of}
     if conflicts := [name for name in repeating if name in prescribing]:
@@ -86,7 +90,8 @@ def repeated_equations(system: MultibodySystem) -> Equations:
     translations = system.index[:, : ROTATION.start]
     directions = ~np.any(jacobians[..., translations[translations >= 0]] != 0.0, axis=(0, 2))
     order = np.argsort(sorted(equations, key=equations.__getitem__))
-    weights = np.where(directions, 1.0, _POINT) * (_FIRST + (1.0 - _FIRST) * order / len(order))
+    weights = np.where(directions, 1.0, np.where(alone, _ALONE, _POINT))
+    weights = weights * (_FIRST + (1.0 - _FIRST) * order / len(order))
     return tuple(sorted(equations[row] for row in repeated_rows(jacobians, weights)))
 
 
