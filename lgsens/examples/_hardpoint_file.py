@@ -17,6 +17,7 @@ from lgsens.model import RigidBody
 DATA = resources.files("lgsens.examples") / "data"
 DEFAULT = "quarter-car"  # what the car that ships with lgsens is called, and its file
 DEFAULT_FILE = "five_link_suspension"
+FORMAT = f"see lgsens/examples/data/{DEFAULT_FILE}.toml for the format."
 
 
 MOST_GYRATION = 5.0  # m
@@ -59,7 +60,7 @@ class Reader:
 
     def _get(self, key: str, holds: Callable[[Any], bool], what: str) -> Any:
         if key not in self._table:
-            raise self.fail(key, f"is missing; see lgsens/examples/data/{DEFAULT_FILE}.toml for the format.")
+            raise self.fail(key, f"is missing; {FORMAT}")
         value = self._table[key]
         if not holds(value):
             raise self.fail(key, f"must be {what}, got {value!r}.")

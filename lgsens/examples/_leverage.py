@@ -54,6 +54,7 @@ def motion_ratios(
             f"{name}, key 'links': the wheel has {free} degrees of freedom to the chassis, and needs "
             f"one, its travel, got the links {sorted(links)} and the joints {sorted(joints)}. A link with two ball "
             "joints takes one from the knuckle's six, one with a hinge on the chassis and a ball joint takes two."
+            + "".join(f" {link!r} holds on to one body alone." for link in _loose(links, every))
         )
     matrix = np.concatenate([rows, velocities.moving("chassis", "knuckle", np.eye(3)[2:], centre)])
     condition = np.linalg.cond(matrix)
@@ -63,6 +64,15 @@ def motion_ratios(
             f"(condition {condition:.0e}); move a hardpoint, or check the line of a hinge."
         )
     return strut_ratios(name, velocities, np.linalg.solve(matrix, np.append(np.zeros(len(rows)), 1.0)), struts)
+
+
+def _loose(links: Collection[str], connections: Iterable[tuple[str, Connection]]) -> list[str]:
+    """The links of which all ends are on one body."""
+    beside: dict[str, set[str]] = {link: set() for link in links}
+    for _, (a, b) in ((key, connection.between) for key, connection in connections):
+        for link, other in ((a, b), (b, a)):
+            beside.get(link, set()).add(other)
+    return sorted(link for link, others in beside.items() if len(others) < 2)
 
 
 def strut_ratios(

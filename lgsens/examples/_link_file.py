@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from lgsens.examples._hardpoint_file import Reader
+from lgsens.examples._hardpoint_file import FORMAT, Reader
 from lgsens.examples._link_beam import read_beam
 from lgsens.examples._suspension_parts import Link
 
@@ -31,7 +31,8 @@ def read_link(name: str, table: Reader, bodies: tuple[str, ...], kilogram: float
         raise table.fail("beam", f"goes between two ends, got {sorted(ends)}; leave it out, the link is rigid.")
     own = "centre_of_mass" in table or "inertia" in table
     if len(ends) < 2 and not own:  # one end makes no bar
-        table.point(next(body for body in bodies if body not in ends))
+        missing, *others = [body for body in bodies if body not in (*ends, name)]
+        raise table.fail(missing, f"is missing, or a point on another one of {others}; {FORMAT}")
     if len(ends) > 2 and not own:
         table.point("centre_of_mass")
     mass, inertia = table.mass_and_moments(kilogram) if own else (None, None)

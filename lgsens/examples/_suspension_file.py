@@ -76,6 +76,7 @@ subframe and rack, joints that of bushings, and there is no anti-roll bar. What 
 along y, about which both sides turn alike; half of a solid axle slides in a plane upright to y.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +93,7 @@ from lgsens.examples._hardpoint_file import Reader
 from lgsens.examples._leaf_pack import SHACKLE, TABLE as LEAF, LeafPack, read_leaf_spring
 from lgsens.examples._link_file import CARRIERS, OF_LINK, carried, read_link
 from lgsens.examples._solid_axle import BODY
-from lgsens.examples._suspension_parts import ALONG_A_LINE, AT_A_POINT, Connection, Part, Strut
+from lgsens.examples._suspension_parts import ALONG_A_LINE, AT_A_POINT, Connection, Link, Part, Strut
 from lgsens.examples._wheel import Wheel
 from lgsens.model import Sampled
 
@@ -104,6 +105,7 @@ OF_TABLES = {"tyre": ("stiffness",), "bump": ("height", "duration"), "link_secti
 RATES = {"spring": "stiffness", "damper": "damping"}
 ANGLES = {"camber_deg": 20.0, "toe_deg": 5.0}  # how large they may be [degree]
 MOST_OFF_AXIS = 0.01  # m; a bearing of a wheel thought upright is as far off where it leans
+MOST_OFF_WHEEL = 5.0  # m; no point of a suspension is as far from its wheel
 STOPS = ("bump_stop", "rebound_stop")
 OF_MODEL = ("hub", "heave", "travel")  # joints that there are beside those of the file
 
@@ -165,6 +167,8 @@ def members(document: dict, path: str) -> dict[str, Any]:
     struts = {key: _strut(key, root.table(key), bodies, rate, carriers) for key, rate in of_corner.items()}
     root.only((*TABLES, *OF_AXLE))  # after what is missing: a table that is spelled wrong is both
     stops = {key: stop(root.table(key), key, bodies, struts["damper"], carriers) for key in STOPS if key in root}
+    if solid is None:
+        _check_points(root, wheel, links, joints, {**struts, **stops})
     bushings = mounts(root, links, {**joints, **of_leaf}, carriers, solid)
     held = {"links": links, "joints": joints, "mounts": bushings}
     if solid is not None:
@@ -205,6 +209,32 @@ def _wheel(root: Reader, part: Part) -> Wheel:
             f"{np.asarray(wheel.spin_axis).round(6).tolist()} [m]; the wheel would turn about another axis.",
         )
     return wheel
+
+
+def _check_points(
+    root: Reader, wheel: Wheel, links: Mapping[str, Link], joints: Mapping[str, Connection], struts: Mapping[str, Any]
+) -> None:
+    """Raise `ValueError` for points in another unit than the wheel's, and for a wheel on the other side of the car."""
+    held = {f"links.{name}": list(link.ends.values()) for name, link in links.items()}
+    held |= {f"joints.{name}": [joint.at] for name, joint in joints.items()}
+    centre = np.asarray(wheel.centre)
+    for key, points in (held | {name: list(strut.ends.values()) for name, strut in struts.items()}).items():
+        points = np.concatenate([np.atleast_2d(point) for point in points])
+        distances = np.linalg.norm(points - centre, axis=1)
+        if not distances.max() <= MOST_OFF_WHEEL:
+            furthest = points[np.argmax(distances)] + np.array([0.0, 0.0, root.metres_of_road])
+            raise root.fail(
+                key,
+                f"has the point {furthest.tolist()} m, {distances.max():.4g} m from the wheel's centre, and none of a "
+                f"suspension is further than {MOST_OFF_WHEEL:g} m; is it in another unit than 'units.length' says?",
+            )
+    across = float(np.concatenate([np.atleast_2d(point)[:, 1] for points in held.values() for point in points]).mean())
+    if across * np.sign(centre[1]) < -0.3 * abs(centre[1]):  # a hinge may lie a little beyond the middle of the car
+        raise root.table("wheel").fail(
+            "centre",
+            f"is at y = {centre[1]:.4g} m, and links and joints are at {across:.4g} m in the mean, on the other side "
+            "of the car; turn the sign of its y, and of its bearing's.",
+        )
 
 
 def _leaf_spring(root: Reader, kilogram: float) -> LeafPack | None:
