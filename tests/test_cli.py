@@ -280,6 +280,8 @@ def test_an_interrupted_command_writes_what_there_is_and_goes_on(tmp_path):
     assert status == 130 and "--resume goes on" in said and "Traceback" not in said
     assert optimum("stopped")["history"]["ended"] == "interrupted"
     assert {"response.png", "search.npz"} <= {path.name for path in (tmp_path / "stopped").iterdir()}
+    status, said = ended(command("stopped", "--resume", "--speed", "33"))  # at once
+    assert status == 2 and "argument --speed: what --resume goes on with has its default, not 33.0" in said
     assert ended(command("stopped", "--resume"))[0] in (0, 1)
     assert not (tmp_path / "stopped" / "search.npz").exists()
     for name in ("design", "objective", "history"):

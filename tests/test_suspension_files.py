@@ -307,7 +307,23 @@ MISTAKES = {
     "link with one end": (
         "double_wishbone",
         {"links.tie_rod.chassis": None},
-        ("key 'links.tie_rod.chassis'", "is missing", FORMAT),
+        ("key 'links.tie_rod.chassis'", "is missing, or a point on another one of [", FORMAT),
+    ),
+    "wheel on the other side": (
+        "push_rod",
+        {"wheel.centre": [-0.04, -0.91, -0.026], "wheel.bearing": [-0.04, -0.91, -0.026]},
+        ("key 'wheel.centre'", "is at y = -0.91 m", "on the other side of the car", "turn the sign"),
+    ),
+    "point in millimetres": (
+        "double_wishbone",
+        {"links.tie_rod.chassis": [118.0, 412.0, 51.0]},
+        ("key 'links.tie_rod'", "[118.0, 412.0, 51.0] m", "from the wheel's centre", "'units.length'"),
+    ),
+    "arm that swings": (
+        "double_wishbone",
+        {"links.upper_wishbone.knuckle": None, "links.upper_wishbone.inertia": [0.01, 0.01, 0.01]}
+        | {"links.upper_wishbone.centre_of_mass": [-0.1, 0.6, 0.2]},
+        ("degrees of freedom", "'upper_wishbone' holds on to one body alone"),
     ),
     "link with three ends": (
         "push_rod",

@@ -5,7 +5,15 @@ import argparse
 from lgsens import plotting
 from lgsens.cli._optimize_axle import AxleJob
 from lgsens.cli._optimize_quarter_car import QuarterCarJob
-from lgsens.cli._report import interrupted, output_folder, suspension_file, unfinished, write_json, written
+from lgsens.cli._report import (
+    interrupted,
+    output_folder,
+    require_same,
+    suspension_file,
+    unfinished,
+    write_json,
+    written,
+)
 from lgsens.cli._search import TOLERANCE, at_accuracy, search, search_document
 from lgsens.examples import suspension_document
 
@@ -15,8 +23,10 @@ def run(arguments: argparse.Namespace) -> int:
     with output_folder(arguments.out, arguments.overwrite or arguments.resume) as out:
         plotting.figure()  # asks for matplotlib now, not after minutes
         checkpoint = unfinished(out, "search.npz", arguments.resume)
-        job = (AxleJob if arguments.vary else QuarterCarJob).of(arguments)
         settings = {name: value for name, value in vars(arguments).items() if name not in ("run", "command", "resume")}
+        if arguments.resume:
+            require_same(settings, out / "result.json")
+        job = (AxleJob if arguments.vary else QuarterCarJob).of(arguments)
         if arguments.accuracy is not None:
             job, reached = at_accuracy(job, arguments.accuracy, progress=not arguments.quiet)
             settings |= {"dt": arguments.t1 / reached.num_steps, "error": reached.error}

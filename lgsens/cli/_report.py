@@ -63,10 +63,32 @@ def unfinished(out: Path, name: str, resume: bool) -> Path:
     """The file in a folder from which an interrupted command goes on. Raises `ValueError` where that has none."""
     path = out / name
     if resume and not path.is_file():
-        raise ValueError(f"--resume: {str(path)!r}, from which to go on, is not there; leave --resume out")
+        raise ValueError(
+            f"--resume: {str(path)!r}, from which to go on, is not there, as the command has come to its end or never "
+            "began there; leave --resume out, and give --overwrite to begin anew in a folder that exists"
+        )
     if not resume:
         path.unlink(missing_ok=True)
     return path
+
+
+_MAY_CHANGE = "out", "overwrite", "quiet", "steps"
+
+
+def require_same(options: Mapping[str, Any], result: Path) -> None:
+    """Raise `ValueError` for options that the command which goes on had not when it was interrupted and wrote this."""
+    kept = json.loads(result.read_text(encoding="utf-8")) if result.is_file() else {}
+    if kept.get("history", {}).get("ended") != "interrupted":
+        return
+    for name, now in json.loads(json.dumps(options, default=str)).items():
+        before = kept["settings"].get(name, now)
+        chosen = name == "dt" and options.get("accuracy") is not None  # by that
+        if before != now and not chosen and name not in _MAY_CHANGE:
+            had, has = ("its default" if value is None else repr(value) for value in (before, now))
+            raise ValueError(
+                f"argument --{name.replace('_', '-')}: what --resume goes on with has {had}, not {has}; give "
+                "the same options, or --overwrite in place of --resume to begin anew"
+            )
 
 
 INTERRUPTED = 130  # the exit status that shells have for it
