@@ -25,6 +25,7 @@ from lgsens.cli._report import (
     write_json,
     written,
 )
+from lgsens.dynamics import RESULTS
 from lgsens.examples import Axle
 
 # By unit of a sweep's number the factor and the unit shown.
@@ -55,9 +56,14 @@ def run(arguments: argparse.Namespace) -> int:
         model = axle.model(links="rods", compliant=not arguments.rigid)
         # the options are those of `standard_sweeps`
         own = {"parallel": "travel", "single": "travel", "opposite": "roll", "steering": "rack"}
-        most = {own.get(name, name.removesuffix("_opposed")): sweep.amplitude for name, sweep in sweeps.items()}
-        with asking_for(most), compiling("the equilibria of the axle", not arguments.quiet):
-            test = rigs.kc(model, axle.wheel_centres, sweeps, points=arguments.points, vehicle=vehicle)
+        options = {name: own.get(name, name.removesuffix("_opposed")) for name in sweeps}
+        settings = {"sweeps": sweeps, "points": arguments.points, "vehicle": vehicle}
+        with compiling("the equilibria of the axle", not arguments.quiet):
+            test = rigs.kc(model, axle.wheel_centres, **settings, throw=False)
+        if int(test.result) != RESULTS.successful:  # which raises, and names the options of the sweeps that failed
+            failed = [name for name, found in test.sweeps.items() if not np.isfinite(found.wheels.travel).all()]
+            with asking_for({options[name]: sweeps[name].amplitude for name in failed or sweeps}):
+                rigs.kc(model, axle.wheel_centres, **settings)
         numbers = {name: float(value) for name, value in rigs.characteristics(test).items()}
         gradients = {}
         if arguments.gradient == "all":
