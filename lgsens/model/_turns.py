@@ -23,7 +23,9 @@ from lgsens.model._frames import Frame
 from lgsens.model._loads import AbstractDynamicLoad
 from lgsens.model._relative import but_for_turns
 
-_AROUND = np.linspace(-1.0, 1.0, 61) + np.array([[0.0], [2.0]])  # half turns, once around and once more
+# Half turns, once around and once more; by a part that keeps off the angles at which curves have samples, where slopes
+# jump, and round-off decides on which side one is.
+_AROUND = (np.arange(60) + 0.618034) / 30.0 - 1.0 + np.array([[0.0], [2.0]])
 
 
 class AlongCoordinate(Protocol):

@@ -139,6 +139,10 @@ def test_what_closes_after_a_turn(dtype):
             lambda t, shift=shift: 0.01 * jnp.maximum(jnp.cos(t - shift), 0.0) ** 3,
         ):
             assert unless_closed(closed, angle) == 0.0
+    for kind in ("linear", "cubic", "monotone"):  # slopes jump at samples, every 30 degrees
+        torques = [0.0, 3.0, 8.0, 5.0, 2.0, 0.0, -1.0, -2.0, -1.0, 0.0, 0.0, 1.0, 0.0]
+        samples = lg.Sampled(np.linspace(-np.pi, np.pi, 13), torques, kind, periodic=True).prepared()
+        assert unless_closed(jax.tree.map(lambda leaf: leaf.astype(dtype), samples), angle) == 0.0
     geared = lambda t: 3.0 * t + 0.2 * jnp.sin(t)
     assert unless_closed(geared, angle, turn=TURN) == 0.0
     pulse = lambda t: jnp.exp(-((jnp.mod(t, 2.0 * TURN) - 0.6) ** 2) / 0.1)  # of two turns, nothing where one closes
