@@ -186,12 +186,9 @@ def markdown(document: dict) -> str:
                 f"{found['cache_bytes'] / 1e6:.1f}",
                 f"{1e3 * first['run_seconds']:.2f}",
             )
-            for kind in OTHERS:
-                if other := found.get(kind):
-                    took = f"{other['seconds']:.1f} ({other['cpu_seconds']:.1f})"
-                    cells = (*cells, took, f"{1e3 * other['run_seconds']:.2f}")
-                else:
-                    cells = (*cells, "–", "–")
+            for other in map(found.get, OTHERS):
+                took = f"{other['seconds']:.1f} ({other['cpu_seconds']:.1f})" if other else "–"
+                cells = (*cells, took, f"{1e3 * other['run_seconds']:.2f}" if other else "–")
             lines.append("| " + " | ".join(cells) + " |")
     lines += [
         "",

@@ -69,9 +69,9 @@ def motion_ratios(
 def _loose(links: Collection[str], connections: Iterable[tuple[str, Connection]]) -> list[str]:
     """The links of which all ends are on one body."""
     beside: dict[str, set[str]] = {link: set() for link in links}
-    for _, (a, b) in ((key, connection.between) for key, connection in connections):
-        for link, other in ((a, b), (b, a)):
-            beside.get(link, set()).add(other)
+    for _, connection in connections:
+        for link in beside.keys() & {*connection.between}:
+            beside[link] |= {*connection.between} - {link}
     return sorted(link for link, others in beside.items() if len(others) < 2)
 
 

@@ -215,11 +215,11 @@ def _check_points(
     root: Reader, wheel: Wheel, links: Mapping[str, Link], joints: Mapping[str, Connection], struts: Mapping[str, Any]
 ) -> None:
     """Raise `ValueError` for points in another unit than the wheel's, and for a wheel on the other side of the car."""
-    held = {f"links.{name}": list(link.ends.values()) for name, link in links.items()}
-    held |= {f"joints.{name}": [joint.at] for name, joint in joints.items()}
+    stacked = lambda points: np.concatenate([np.atleast_2d(point) for point in points])
+    held = {f"links.{name}": stacked(link.ends.values()) for name, link in links.items()}
+    held |= {f"joints.{name}": stacked([joint.at]) for name, joint in joints.items()}
     centre = np.asarray(wheel.centre)
-    for key, points in (held | {name: list(strut.ends.values()) for name, strut in struts.items()}).items():
-        points = np.concatenate([np.atleast_2d(point) for point in points])
+    for key, points in (held | {name: stacked(strut.ends.values()) for name, strut in struts.items()}).items():
         distances = np.linalg.norm(points - centre, axis=1)
         if not distances.max() <= MOST_OFF_WHEEL:
             furthest = points[np.argmax(distances)] + np.array([0.0, 0.0, root.metres_of_road])
@@ -228,7 +228,7 @@ def _check_points(
                 f"has the point {furthest.tolist()} m, {distances.max():.4g} m from the wheel's centre, and none of a "
                 f"suspension is further than {MOST_OFF_WHEEL:g} m; is it in another unit than 'units.length' says?",
             )
-    across = float(np.concatenate([np.atleast_2d(point)[:, 1] for points in held.values() for point in points]).mean())
+    across = float(stacked(held.values())[:, 1].mean())
     if across * np.sign(centre[1]) < -0.3 * abs(centre[1]):  # a hinge may lie a little beyond the middle of the car
         raise root.table("wheel").fail(
             "centre",

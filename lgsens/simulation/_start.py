@@ -240,6 +240,5 @@ def begin(
     initial = _initial(system, t0) if initial is None else initial
     usable = initial.result == RESULTS.successful
     start = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), scheme.start(system, initial, t0))
-    kkt = initial.kkt
-    jacobian = constraint_jacobian(system, initial.state.q, t0) if kkt is None else kkt.jacobian
-    return Begin(start, initial.state.v, initial.result, initial.violation, jacobian)
+    assert initial.kkt is not None  # an equilibrium, which may have none, is a `state0`
+    return Begin(start, initial.state.v, initial.result, initial.violation, initial.kkt.jacobian)
