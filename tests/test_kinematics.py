@@ -284,6 +284,30 @@ def test_out_of_reach():
     close(found.body("coupler").position[:first, :2], Linkage(angles[:first], a=0.7).coupler, 1000, scale=1.0)
 
 
+@pytest.mark.parametrize("derivative", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev])
+@pytest.mark.parametrize("begin", [0.0, 1.5])  # at 1.5 rad a crank of 0.7 m and the rocker are too far apart at once
+def test_what_is_asked_of_positions_that_there_are_not_has_no_derivative(begin, derivative):
+    """Nor is it zero where all rows are NaN; of a batch the others have theirs, by what all of them share."""
+    angles = jnp.asarray(begin + np.linspace(0.0, 2.0, 3))
+
+    def swing(a, rocker):
+        found = lg.kinematics(driven_four_bar(a=a, c=0.7 * rocker), {"motor": angles}, throw=False)
+        return jnp.sum(found.body("rocker").position), found.result == lg.RESULTS.successful
+
+    def masked(a, rocker):
+        value, known = swing(a, rocker)
+        return jnp.where(known, value, 0.0)
+
+    cranks = jnp.array([0.3, 0.7])
+    of_each = jax.vmap(derivative(swing, argnums=1, has_aux=True), (0, None))
+    of_all = derivative(lambda rocker: jnp.sum(jax.vmap(masked, (0, None))(cranks, rocker)))
+    (slopes, known), together = jax.jit(lambda rocker: (of_each(cranks, rocker), of_all(rocker)))(1.0)
+    np.testing.assert_array_equal(known, [True, False])
+    np.testing.assert_array_equal(np.isnan(slopes), [False, True])
+    close(together, slopes[0], ULPS)
+    assert abs(slopes[0]) > 0.01
+
+
 def test_a_singular_position_is_named():
     """At ℓ = 1.5 m the bar stands upright above the cylinder: dφ/dℓ = 2ℓ/cos φ is infinite. With cos φ = 2e-4 it is
     not, the force is still m g 2ℓ; cos φ comes from 1 − sin φ, round-off over 2e-8."""

@@ -546,6 +546,13 @@ def test_what_is_refused(car):
     with pytest.raises(ValueError, match=says("`linear` must settle")):
         lg.random_road(unstable, roughness=1e-6, speed=1.0)
 
+    def travel(sense):
+        turned = dataclasses.replace(car, A=sense * car.A, eigenvalues=sense * car.eigenvalues)
+        return lg.random_road(turned, roughness=1e-6, speed=1.0)[car.outputs[0]]
+
+    of = jax.jit(jax.value_and_grad(travel))
+    assert np.isfinite(of(1.0)).all() and np.isnan(of(-1.0)).all()  # neither a number nor a derivative
+
 
 @pytest.mark.slow  # `test_kinematics` and `test_equilibrium` have such places in the quick run
 def test_far_from_the_origin():

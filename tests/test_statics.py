@@ -1,5 +1,7 @@
 """Equilibria along a path against closed forms and SciPy on hand-written equations, their derivatives, bad input."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -155,6 +157,24 @@ def test_out_of_reach():
     found = lg.statics(driven, way, throw=False)
     assert found.result == lg.RESULTS.statics_failed
     assert np.isfinite(found.states.lam[:2]).all() and np.isnan(found.states.lam[2]).all()
+
+
+def test_out_of_reach_there_is_no_derivative():
+    """Of a sum with NaN: it had that of the others."""
+    driver = lg.TranslationDriver(None, "bar", at=(1.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    model = lever()
+
+    def force(end, mass):
+        bodies = {"bar": dataclasses.replace(model.bodies["bar"], mass=mass)}
+        driven = lg.Model(bodies, model.joints | {"driver": driver}, model.forces)
+        found = lg.statics(driven, {"driver": end * jnp.array([0.0, 1.0])}, throw=False)
+        return jnp.sum(found.multiplier("driver")), found.result == lg.RESULTS.successful
+
+    of_each = jax.vmap(jax.grad(force, argnums=1, has_aux=True), (0, None))
+    slopes, known = jax.jit(of_each)(jnp.array([0.5, 1.5]), 2.0)
+    np.testing.assert_array_equal(known, [True, False])
+    np.testing.assert_allclose(slopes[0], -9.81, rtol=1e-12)  # half of the weight at either place: −g per mass
+    assert np.isnan(slopes[1])
 
 
 @pytest.mark.parametrize(

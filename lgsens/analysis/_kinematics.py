@@ -25,6 +25,7 @@ from lgsens.analysis._driven import (
 )
 from lgsens.analysis._rank import cause_of_failure
 from lgsens.dynamics import RESULTS, State, forces_of_motion, names_of_all, positions
+from lgsens.linear import lost
 from lgsens.model import Model, MultibodySystem
 from lgsens.simulation import AbstractRun, throw_if_failed
 
@@ -147,7 +148,7 @@ def kinematics(
 @eqx.filter_jit
 def _kinematics_jit(drive: Drive, driven, rates):
     found = positions(drive, *driven)
-    states = jax.vmap(lambda *args: forces_of_motion(drive, *args))(found.q, driven, rates)
+    states = lost(~found.found, jax.vmap(lambda *args: forces_of_motion(drive, *args))(found.q, driven, rates))
     sound = found.found & jnp.all(jnp.isfinite(jnp.hstack([states.v, states.vdot, states.lam])), axis=1)
     first = jnp.argmin(sound)  # the first that was not found or has no rates, 0 if all have
     failed = jnp.where(found.singular[first], RESULTS.singular_configuration, RESULTS.position_failed)

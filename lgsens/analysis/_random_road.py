@@ -36,7 +36,7 @@ from lgsens._validate import require
 from lgsens._xla import while_loop
 from lgsens.analysis._linearize import Linearization
 from lgsens.analysis._weighting import FrequencyWeighting
-from lgsens.linear import LinearEquations, linear_solve
+from lgsens.linear import LinearEquations, linear_solve, lost
 from lgsens.model import rate_intensity
 
 _TURNS = 64  # 29 for frequencies from 0.3 to 1e7 rad/s
@@ -93,7 +93,7 @@ def _deviations(linear: Linearization, intensity, weightings: tuple[FrequencyWei
     none = square <= 0.0
     deviation = jnp.where(none, 0.0, jnp.sqrt(jnp.where(none, 1.0, square)))
     settles = jnp.max(jnp.real(linear.eigenvalues)) < 0.0
-    return jnp.where(settles, jnp.where(infinite, jnp.inf, deviation), jnp.nan)
+    return lost(jnp.broadcast_to(~settles, infinite.shape), jnp.where(infinite, jnp.inf, deviation))
 
 
 def random_road(

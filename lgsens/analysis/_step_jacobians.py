@@ -16,6 +16,7 @@ paper, "direct differentiation"), not of an ODE: what they say of a rollout in t
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -36,6 +37,7 @@ from lgsens.dynamics import (
     require_independent,
 )
 from lgsens.integrate import AbstractScheme, RadauIIA
+from lgsens.linear import lost
 from lgsens.model import Model
 from lgsens.simulation import as_system, simulate
 
@@ -147,7 +149,7 @@ def step_jacobians(
         return found
     failed = found.result != RESULTS.successful
     if isinstance(failed, Tracer):
-        unless_failed = lambda leaf: jnp.where(jnp.any(failed), jnp.nan, leaf)
+        unless_failed = partial(lost, jnp.broadcast_to(jnp.any(failed), failed.shape))
         return eqx.tree_at(lambda f: (f.A, f.B, f.gap), found, replace_fn=unless_failed)
     if np.any(failed):  # the step once more, for what there is to say of it
         i = int(np.argmax(failed))

@@ -67,6 +67,7 @@ from lgsens._xla import while_loop
 from lgsens.dynamics._constraints import violation_of_all
 from lgsens.dynamics._matrices import require_linear
 from lgsens.dynamics._system import AbstractSystem, State
+from lgsens.linear import sound
 
 _MAX_ITERATIONS = 40
 _AT_ONCE = 0.2  # rad, or of the scene: of an iteration that looks for the first position
@@ -100,7 +101,7 @@ class AbstractDrive(eqx.Module):
 class Positions(NamedTuple):
     """The configurations for n sets of values."""
 
-    q: Any  # stacked along a leading axis n
+    q: Any  # stacked along a leading axis n, `sound` where none was found
     found: Bool[Array, " n"]  # whether Newton's iteration converged to one that is not singular
     singular: Bool[Array, " n"]  # whether it did to one that is
     violation: Float[Array, "n m"]  # Φ there
@@ -302,13 +303,13 @@ def _configurations_jvp(primals, tangents):
         w = -_solved(drive.at(row[0]).constraint_jacobian(q, row[1]), violation_dot)
         return drive.system.group.to_ambient(q, w)
 
-    q_dot = jax.vmap(tangent)(q, given, list(tangents[1:]))
+    there = sound(singular | ~_small(size), q, lax.stop_gradient(drive.system.reference()[0]))
+    q_dot = jax.vmap(tangent)(there, given, list(tangents[1:]))
     return (q, size, singular), (q_dot, jnp.zeros_like(size), np.zeros(singular.shape, jax.dtypes.float0))
 
 
 def positions(drive: AbstractDrive, values: Float[Array, "n d"], t: Float[Array, " n"]) -> Positions:
-    """The configurations for each row of driven values and times, differentiable by the rule above; NaN where none was
-    found, or a singular one.
+    """The configurations for each row of driven values and times, differentiable by the rule above.
 
     Equations that were left out hold, too: without them there may be ways to assemble the mechanism at which they do
     not, to which a long step leads.
@@ -318,8 +319,8 @@ def positions(drive: AbstractDrive, values: Float[Array, "n d"], t: Float[Array,
     violation = jax.vmap(lambda q, s, t: at(drive.at(s), q, t))(q, values, t)
     satisfied = jnp.max(jnp.abs(violation), axis=1) <= drive.system.constraint_round_off()  # NaN is not
     found = _small(size) & satisfied & ~singular
-    poison = lambda leaf: jnp.where(found.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.nan)
-    return Positions(jax.tree.map(poison, q), found, satisfied & singular, violation)
+    q = sound(~found, q, lax.stop_gradient(drive.system.reference()[0]))
+    return Positions(q, found, satisfied & singular, violation)
 
 
 def forces_of_motion(

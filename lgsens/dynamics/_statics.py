@@ -52,7 +52,7 @@ from jaxtyping import Array, Bool, Float
 from lgsens._xla import in_any_lane, scan, while_loop
 from lgsens.dynamics._constraints import missing
 from lgsens.dynamics._kinematics import AbstractDrive
-from lgsens.linear import LU, Inverse, LinearEquations, linear_solve
+from lgsens.linear import LU, Inverse, LinearEquations, linear_solve, lost
 
 _MAX_ITERATIONS = 60
 _SOFT = 1e-3  # of the largest stiffness, where there is none
@@ -316,6 +316,5 @@ def static_path(
     apart = jax.vmap(lambda q, s: jnp.any(missing(drive.at(s), q, t) != 0.0))(q, values)
     done = done & ~apart
     held = done & ~free
-    poison = lambda leaf: jnp.where(held.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.nan)
-    q, lam, w, lam_rate = jax.tree.map(poison, (q, lam, w, lam_rate))
+    q, lam, w, lam_rate = lost(~held, (q, lam, w, lam_rate))
     return StaticPath(q, lam, w, lam_rate, held, free, held & stable, held & snapped)

@@ -9,6 +9,7 @@ from lgsens.linear._linear_solve import (
     linear_solve as linear_solve,
     programs_in as programs_in,
 )
+from lgsens.linear._lost import asked as asked, lost as lost, sound as sound
 from lgsens.linear._ordering import Graph as Graph, Joint as Joint
 from lgsens.linear._solvers import (
     AbstractLinearSolver as AbstractLinearSolver,
