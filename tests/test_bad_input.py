@@ -399,6 +399,9 @@ def test_a_state_that_is_no_configuration():
         with pytest.raises(ValueError, match=says("`state0` is no configuration", "not a rotation matrix")):
             run(wrong)
         assert jax.jit(run)(wrong).result == lg.RESULTS.invalid_numbers
+    lost = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), mean)
+    with pytest.raises(ValueError, match=says("`state0` is not finite", "from the step on at which a run fails")):
+        run(lost)
 
 
 def test_steps_of_a_run_that_failed():

@@ -16,7 +16,7 @@ import numpy as np
 
 from lgsens._validate import is_concrete, require
 from lgsens.criteria._refined_run import refined_error, require_order
-from lgsens.dynamics import AbstractSystem, State
+from lgsens.dynamics import RESULTS, AbstractSystem, State
 from lgsens.integrate import (
     AbstractGrid,
     AbstractIntegrator,
@@ -53,9 +53,9 @@ def error_estimate(trajectory: Trajectory, integrator: AbstractIntegrator = Gene
     step with which the scheme does not resolve the motion at all. Where sizes of steps are no smooth function of time,
     errors of v̇ and λ of index 3 are told in part only. The configuration and the velocity at t0 count as exact.
 
-    Returns a `StateError` on the times of the trajectory; `corrected` adds it. Raises `ValueError` for a trajectory by
-    another integrator, in unequal steps where the integrator has equal ones, or with too few steps, and for a scheme
-    that does not say its `convergence_order`; under a trace the first two give NaN. `IndexReducedODE` with `rtol` has
+    Returns a `StateError` on the times of the trajectory; `corrected` adds it. Raises `ValueError` for a trajectory
+    that has failed, is by another integrator, in unequal steps where the integrator has equal ones, or with too few
+    steps, and for a scheme that does not say its `convergence_order`; under a trace the first three give NaN. `IndexReducedODE` with `rtol` has
     steps inside those of the trajectory, which are not known.
     """
     if trajectory.error is not None:
@@ -69,6 +69,12 @@ def error_estimate(trajectory: Trajectory, integrator: AbstractIntegrator = Gene
     require_order(integrator.scheme)
     if num_steps < _LEAST_STEPS:
         raise ValueError(f"`error_estimate` needs at least {_LEAST_STEPS} steps, got {num_steps}.")
+    require(
+        lambda result: result == RESULTS.successful,
+        "`error_estimate`: the trajectory has failed (its `result` is not 0), and what it has is NaN from there on; "
+        "`lg.raise_if_failed(trajectory)` says why.",
+        trajectory.result,
+    )
     valid = _is_by(integrator, trajectory)
     require(
         bool,

@@ -115,6 +115,11 @@ def check_state0(
         return
     off = jax.tree.map(np.asarray, _off_jit(known[0], known[1], known[2], exactly))
     time = f"t0 = {float(known[2]):.6g} s"
+    if not finite(known[1]):
+        raise ValueError(
+            f"`{name}` is not finite, as states are from the step on at which a run fails: `result` says of that one "
+            "whether and why it did."
+        )
     if not off.known:
         raise ValueError(
             f"`{name}` is no configuration: the orientation of a body is not a rotation matrix, as a mean of several "

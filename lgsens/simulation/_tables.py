@@ -42,16 +42,22 @@ class Quantity(NamedTuple):
             yield "".join(f".{label}" for label in labels), self.values[(slice(None), *index)]
 
 
-def quantities(run: Any, what: str) -> dict[str, Quantity]:
-    """Everything of a motion by name, "top.position"; `what` asks, for messages."""
+def one_motion(run: Any, what: str) -> tuple[Any, Any, Any]:
+    """`run.of_bodies()` of a motion that is written or drawn; `what` asks, for messages."""
     system, states, t = run.of_bodies()
     if not is_concrete(t, states):
-        raise ValueError(f"`{what}`: the motion is traced; return it from `jit`, `grad` or `vmap`, and write it there.")
+        raise ValueError(f"`{what}`: the motion is traced; return it from `jit`, `grad` or `vmap`, and ask there.")
     if t.ndim != 1:
         raise ValueError(
-            f"`{what}`: this is a batch of motions, of shape {t.shape[:-1]}; write each of them: "
+            f"`{what}`: this is a batch of motions, of shape {t.shape[:-1]}; ask each of them: "
             "jax.tree.map(lambda leaf: leaf[i], trajectories)."
         )
+    return system, states, t
+
+
+def quantities(run: Any, what: str) -> dict[str, Quantity]:
+    """Everything of a motion by name, "top.position"; `what` asks, for messages."""
+    system = one_motion(run, what)[0]
     whole = system.whole
     found: dict[str, Quantity] = {}
     vector: Axes = {"axis": _AXES}

@@ -1,5 +1,6 @@
 """The error of one run, estimated from that run, against errors that are known otherwise."""
 
+import dataclasses
 import functools
 import json
 from pathlib import Path
@@ -201,6 +202,9 @@ def test_bad_input():
         error_estimate(trajectory, lg.IndexReducedODE(rtol=1e-6))
     with pytest.raises(ValueError, match="at least 3 steps, got 2"):
         error_estimate(lg.simulate(build(P), t1=T1, num_steps=2))
+    failed = dataclasses.replace(trajectory, result=jnp.asarray(lg.RESULTS.newton_failed))
+    with pytest.raises(ValueError, match=r"`error_estimate`: the trajectory has failed"):
+        error_estimate(failed, lg.GeneralizedAlpha(0.5))
 
 
 def in_steps(*sizes):

@@ -238,3 +238,10 @@ def test_a_failed_motion_is_refused(linkage, tmp_path):
     lost = eqx.tree_at(lambda run: run.states.q.position, failed, replace_fn=lambda x: x.at[-1].set(jnp.nan))
     with pytest.raises(ValueError, match="`models`: a motion failed"):
         plotting.mechanism(lost)
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), linkage)
+    for draw, name in (
+        (lambda run: plotting.animate(run, tmp_path / "a.html"), "motion"),
+        (plotting.mechanism, "models"),
+    ):
+        with pytest.raises(ValueError, match=rf"`{name}`: this is a batch of motions, of shape \(2,\)"):
+            draw(batch)
