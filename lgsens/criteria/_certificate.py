@@ -14,6 +14,7 @@ from lgsens.dynamics import RESULTS
 _DUALITY = 1e-6  # round-off of long runs is far below
 _NEAR = 1e-3  # margins to singular configurations, relative to the largest
 _UNRESOLVED = 0.1  # of the steps
+_BEGIN = 0.9  # of the largest accelerations, in one step: by exp(−λh) = 1/10 of it what is fast goes on
 _COARSE = 0.1  # relative errors of which estimates know the size, not the order that they fall with
 
 
@@ -43,6 +44,7 @@ class Certificate(NamedTuple):
         jumps: the ends of steps in which the integrand of a `Criterion` jumps [s], likewise: an angle that comes round.
         coincident: where two breaks coincide that depend on p in different ways, and accelerations jump [s].
         unresolved: the share of steps in which accelerations change as much as they are large, shape ().
+        begin: by how much of their largest value they change in the first step, shape ().
         result: a value of `RESULTS`, shape (), int32.
     """
 
@@ -60,6 +62,7 @@ class Certificate(NamedTuple):
     jumps: tuple[float, ...]
     coincident: tuple[float, ...]
     unresolved: Float[Array, ""]
+    begin: Float[Array, ""]
     result: Int[Array, ""]
 
     @property
@@ -100,6 +103,13 @@ class Certificate(NamedTuple):
                 "stiff spring as rigid, a short ramp as a longer one"
             )
         else:
+            if self.begin > _BEGIN:
+                said.append(
+                    f"in the first step accelerations change by {100 * float(self.begin):.0f} % of their largest: what "
+                    "is that fast, a stiff damper or clutch whose bodies begin apart in speed, a stiff spring apart in "
+                    "place, is not resolved, and the motion may keep what one step made of it. Begin in agreement (an "
+                    "`equilibrium`, velocities), or take many more steps (`accuracy=` of `differentiate` does)"
+                )
             if kinks := [kink for kink in self.kinks if not kink.jump]:
                 said.append(
                     f"accelerations have a kink inside of a step: {_some(kinks)}. Estimates do not see it; let a step "

@@ -207,6 +207,7 @@ def _certified(criteria, motion, p, integrator: AbstractIntegrator) -> tuple[lis
         "exponential": grows_exponentially(grown),
         "margin": margin,
         "unresolved": rough.unresolved,
+        "begin": rough.begin,
         "result": trajectory.result,
         "coincident": breaks_apart(trajectory, tangents[1]),
     }

@@ -55,8 +55,8 @@ def error_estimate(trajectory: Trajectory, integrator: AbstractIntegrator = Gene
 
     Returns a `StateError` on the times of the trajectory; `corrected` adds it. Raises `ValueError` for a trajectory
     that has failed, is by another integrator, in unequal steps where the integrator has equal ones, or with too few
-    steps, and for a scheme that does not say its `convergence_order`; under a trace the first three give NaN. `IndexReducedODE` with `rtol` has
-    steps inside those of the trajectory, which are not known.
+    steps, and for a scheme that does not say its `convergence_order`; under a trace the first three give NaN.
+    `IndexReducedODE` with `rtol` has steps inside those of the trajectory, which are not known.
     """
     if trajectory.error is not None:
         return trajectory.error

@@ -52,11 +52,13 @@ class Kink(NamedTuple):
 
 class Roughness(NamedTuple):
     """Whether there is a kink, or a jump, in the step that ends at each time, of each body and of each force element,
-    and the share of steps whose accelerations are not resolved."""
+    the share of steps whose accelerations are not resolved, and by how much of their largest they change in the first.
+    """
 
     bodies: Bool[Array, "2 n+1 bodies"]
     forces: Bool[Array, "2 n+1 forces"]
     unresolved: Float[Array, ""]
+    begin: Float[Array, ""]
 
 
 def _accelerations(trajectory: Trajectory) -> Float[Array, "n+1 items parts"]:
@@ -79,11 +81,13 @@ def roughness(trajectory: Trajectory, told: Float[Array, " n"] | None = None) ->
     size = jnp.max(jnp.abs(a), axis=(0, 2))
     h = (trajectory.t[-1] - trajectory.t[0]) / (trajectory.t.shape[0] - 1)
     seen = jnp.maximum(size, _ROUND_OFF * jnp.finfo(size.dtype).eps / h**2)  # a uniform motion has none but that
+    begin = jnp.max(jnp.abs(a[1] - a[0]) / seen[None].T)
     turns = jnp.any(jnp.max(jnp.abs(jnp.diff(a, 2, axis=0)), axis=2) > _AS_LARGE * seen[None], axis=1)
     none = jnp.zeros((2, a.shape[0], 0), bool)
     others = _beside_none(told, a.shape[0])
     seen_of = lambda rough: rough & others[None, :, None]
-    return Roughness(seen_of(_rough(a, size)), seen_of(jnp.concatenate([none, *forces], axis=2)), jnp.mean(turns))
+    forces = seen_of(jnp.concatenate([none, *forces], axis=2))
+    return Roughness(seen_of(_rough(a, size)), forces, jnp.mean(turns), begin)
 
 
 def jumps_of(values: Float[Array, " n+1"], told: Float[Array, " n"] | None = None) -> Bool[Array, " n+1"]:

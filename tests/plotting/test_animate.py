@@ -239,9 +239,7 @@ def test_a_failed_motion_is_refused(linkage, tmp_path):
     with pytest.raises(ValueError, match="`models`: a motion failed"):
         plotting.mechanism(lost)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), linkage)
-    for draw, name in (
-        (lambda run: plotting.animate(run, tmp_path / "a.html"), "motion"),
-        (plotting.mechanism, "models"),
-    ):
+    film = lambda run: plotting.animate(run, tmp_path / "a.html")
+    for draw, name in ((film, "motion"), (plotting.mechanism, "models")):
         with pytest.raises(ValueError, match=rf"`{name}`: this is a batch of motions, of shape \(2,\)"):
             draw(batch)
