@@ -32,7 +32,8 @@ class LeastSquaresResult(NamedTuple):
         covariance: (JᵀJ)⁻¹ [products of units of x], shape (n, n): for r in units of the noise, the bound of Cramér and
             Rao. Not finite where the data leave a combination of the parameters undetermined.
         deviation: the roots of its diagonal, a pytree as x.
-        converged: whether the last step was below the tolerances.
+        converged: whether the last step was below the tolerances; where not, x is no optimum, and covariance and
+            deviation say nothing of how far it is from one.
         steps: number of Jacobians.
     """
 
@@ -81,7 +82,9 @@ def least_squares(
             that of x.
         x0: where to start, a pytree of arrays.
         parametrization: what is searched by, as of `variables`: `Log()` for masses and rates, `Interval(a, b)` for
-            points; None: x over its size.
+            points that must not leave it on the way; None: x over its size. Where the optimum lies on the end of an
+            interval Gauss–Newton creeps towards it, in steps that soon say nothing of the other parameters: hold that
+            parameter there, or use `minimize`, which has bounds.
         solver: of optimistix, in the variables of the parametrization; None: `LineSearchGaussNewton()`;
             `optimistix.LevenbergMarquardt(rtol, atol)` where data determine the parameters badly.
         max_steps: the most steps, of which rejected ones are some: close to the optimum they drown in the round-off of
