@@ -95,8 +95,8 @@ _MESSAGES = {
     RESULTS.not_steady: (
         "The motion is not steady: the equations of small motions about it change with time. Linearize at an "
         "equilibrium of all forces (constant ones accelerate a state of rest: an input that is none at rest has "
-        "`signal=lg.Constant(0.0)`), or name the `rotation` of axes in which it does not change (a body that turns about another axis "
-        "than that of its symmetry has none)."
+        "`signal=lg.Constant(0.0)`), or name the `rotation` of axes in which it does not change (a body that turns "
+        "about another axis than that of its symmetry has none)."
     ),
     RESULTS.outputs_not_steady: (
         "The motion is steady, but outputs of it change with time: take them in axes in which they do not, not in "
