@@ -69,6 +69,7 @@ def test_mirror_image_of_masses_and_moments():
     np.testing.assert_array_equal(reflected(ends).ends["spring_3"], FLIP @ force)
 
 
+@pytest.mark.slow  # `test_twice_mirrored_is_what_it_was` is in the quick run
 def test_mirror_image_of_curves(tmp_path):
     """Forces and moments of bushings with all curves in a mirrored motion are mirrored: S f, −S m; on tilted axes."""
     keys = [f"{kind}_{i}" for kind in ("spring", "damper", "rotational_spring", "rotational_damper") for i in (1, 2, 3)]

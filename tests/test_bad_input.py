@@ -432,6 +432,7 @@ def test_drivers_that_contradict_each_other():
         lg.simulate(model, t1=0.1, num_steps=1)
 
 
+@pytest.mark.slow
 def test_a_state_in_single_precision():
     """It is taken in that of the model."""
     model = pendulum(velocity=(0.5, 0.0, 0.0))

@@ -290,6 +290,7 @@ def test_a_leaf_spring_and_a_twist_beam_axle():
     np.testing.assert_allclose(moved[1, 2], c * 2 * (2 * arm / roll), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_lightest_tube_that_bears_a_load():
     """A cantilever of one element, its mass least under a limit of stress: the thinnest wall, and the diameter with
     which F L/2, the moment in the middle of the element, over the section's modulus is at the limit."""

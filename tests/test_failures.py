@@ -402,6 +402,7 @@ def test_double_precision_does_not_warn():
         fail(0.0)
 
 
+@pytest.mark.slow
 def test_times_far_from_zero_are_warned_of():
     """Seconds since 1970 are known to 2e-7 s, and a driver's acceleration at steps of 10 ms to nothing."""
     driver = lg.TranslationDriver(

@@ -230,6 +230,7 @@ def test_breaks_at_the_ends_and_outside():
     np.testing.assert_allclose(integrate(p, breaks=breaks).gradient, jax.jacfwd(formulas)(p), rtol=1e-13, atol=1e-16)
 
 
+@pytest.mark.slow
 def test_inside_jit_and_vmap():
     batch = jnp.array([[2e3, 5e3, 0.4, 2.0], [1e3, 2e3, 0.1, 3.0]])
     found = jax.jit(jax.vmap(lambda p: integrate(p, breaks=[JUMP]).gradient))(batch)

@@ -26,6 +26,7 @@ def load(name):
     return json.loads((Path(__file__).parent / "data" / f"{name}.json").read_text())
 
 
+@pytest.mark.slow  # `test_top` is in the quick run
 @pytest.mark.parametrize("blocks", some_quick([True, False]))
 def test_hand_derived_rule_on_every_joint_and_force(blocks):
     """Value, derivative and transpose against JAX's derivative of the plain solve, in every number, q, v and t.

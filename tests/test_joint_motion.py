@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import EPS, GRAVITY, central_difference, random_body, random_point, random_rotation, says
+from helpers import EPS, GRAVITY, central_difference, random_body, random_point, random_rotation, says, some_quick
 from scipy.spatial.transform import Rotation
 
 import lgsens as lg
@@ -418,7 +418,7 @@ def test_joints_of_an_instant():
         run.instant(1.5)
 
 
-@pytest.mark.parametrize("bodies", [(None, "bob"), ("bob", None)])
+@pytest.mark.parametrize("bodies", some_quick([((None, "bob"),), (("bob", None),)]))
 def test_the_force_along_a_rod_turns_with_it(bodies):
     """Of a swinging bob, −(m v²/l − m g z/l), whichever end is a, and as many N as there are in the force."""
     at = dict(zip(("at_a", "at_b"), [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)][:: 1 if bodies[0] is None else -1]))

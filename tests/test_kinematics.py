@@ -325,6 +325,7 @@ def test_a_singular_position_is_named():
     np.testing.assert_allclose(slope, 2 * near / np.sqrt(1 - (1 - 2e-8) ** 2), rtol=ULPS * 2.3e-16 / 2e-8)
 
 
+@pytest.mark.slow  # `test_a_singular_position_is_named` is in the quick run
 def test_a_reference_that_is_singular_is_named():
     """Nothing says which way an upright bar falls when the cylinder becomes shorter."""
     bar = lg.RigidBody(mass=3.0, inertia=(0.01, 1.0, 1.0), position=(0.0, 0.0, 1.0), free="x z ry")
@@ -434,6 +435,7 @@ def test_redundant_hinges_are_refused_unless_asked_for():
         lg.kinematics(refusing, {"motor": [0.1]})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", [1e4, pytest.param(1e5, marks=pytest.mark.slow)])
 def test_far_from_the_origin(offset):
     """A quick return whose bodies turn about fixed points: the rate of its lever in closed form."""

@@ -289,6 +289,7 @@ def test_rotor_on_springs():
 # Constraints, drivers, states.
 
 
+@pytest.mark.slow  # `test_precessing_top` is in the quick run
 def test_pendulum_on_a_driven_pivot():
     """A pivot driven to u: J φ'' + m g l φ = −m l u'', whose multipliers and accelerations see u''.
 

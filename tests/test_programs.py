@@ -118,6 +118,7 @@ def test_designs_over_a_mesh(derivative, f):
         np.testing.assert_allclose(found, expected, rtol=1e-9)  # two programs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", some_quick([jax.grad, jax.jacfwd]))
 def test_controlled_steps_over_a_mesh_are_lowered(derivative):
     """What varies is checked there; compiled above."""

@@ -230,6 +230,7 @@ def test_gradients_of_bricard():
     check_gradients(lambda p: bricard(p["mass"], p["size"]), p, ("rod 2", "hinge 3"), 1e-6, both_modes=True)
 
 
+@pytest.mark.slow  # `test_what_fails_for_redundant_constraints_says_so` is in the quick run
 def test_what_cannot_take_redundant_constraints_says_so():
     with pytest.raises(ValueError, match=says("`redundant` must be one of", "'maybe'")):
         door(DOOR, redundant="maybe")
@@ -345,6 +346,7 @@ def test_without_joints_nothing_is_singular(factor_every):
     assert lg.simulate(stone, t1=0.1, num_steps=10, integrator=scheme).result == 0
 
 
+@pytest.mark.slow
 def test_friction_that_sticks_is_no_singular_configuration():
     """Where a driven slider turns round, the slope of its friction adds γ h μN/w₀ = 25 kg to the 0.1 kg of the matrix.
 

@@ -237,6 +237,7 @@ def others(values, expected):
     return np.array(left)
 
 
+@pytest.mark.slow  # `test_rolling_disc_is_that_of_its_ode` is in the quick run
 def test_small_motions_of_a_disc_that_rolls_straight():
     """(A + m ρ²) λ² = m g ρ − C (C + m ρ²) Ω²/A: it falls where it is slow (Neimark & Fufaev, ch. 2). Else λ = 0, of
     places, of headings with their rates, and of the speed."""

@@ -143,6 +143,7 @@ def driven(x, solver=None):
     return lg.Model(bodies, joints, forces, linear_solver=solver)
 
 
+@pytest.mark.slow  # `test_iteration_matrix` is in the quick run
 @pytest.mark.parametrize("scene", some_quick([lambda: driven(jnp.ones(2)), everything]))
 def test_blocks_are_those_of_the_iteration_matrix(scene):
     """The derivative of the defect, in both directions, where steps are long beside the stiffness, and short."""
@@ -323,6 +324,7 @@ def test_a_budget_that_is_too_small():
     assert 1e-6 < float(allowed.stats.increment.max()) < 1e-2
 
 
+@pytest.mark.slow  # `test_fixed_budget` is in the quick run
 def test_a_budget_has_no_loop_that_waits():
     """No `while` in the program of full Newton; of modified Newton one, whose predicate a batch does not share."""
 

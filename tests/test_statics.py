@@ -335,7 +335,7 @@ def truss_load(z):
     return 2.0 * RATE * (np.hypot(HALF, RISE) - length) * z / length
 
 
-@pytest.mark.parametrize("points", [3, 5, 20])
+@pytest.mark.parametrize("points", some_quick([5, 3, 20]))
 def test_a_truss_snaps_through_and_back_where_its_load_has_its_extremes(points):
     """Whatever the number of points, and it is said of the point behind the limit."""
     peak = minimize_scalar(lambda z: -truss_load(z), bounds=(0.0, RISE), method="bounded", options={"xatol": 1e-12})
@@ -353,6 +353,7 @@ def test_a_truss_snaps_through_and_back_where_its_load_has_its_extremes(points):
     assert found.stable.all()
 
 
+@pytest.mark.slow  # `test_a_truss_snaps_through_and_back_where_its_load_has_its_extremes` is in the quick run
 def test_a_snap_is_said_however_loads_are_spaced():
     """Close to the limit the tangent has no bound, and may point past the other branch, or by chance right at it."""
     limit = -minimize_scalar(lambda z: -truss_load(z), bounds=(0.0, RISE), method="bounded").fun

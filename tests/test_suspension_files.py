@@ -193,6 +193,7 @@ def test_curves_of_spring_and_damper(load):
     assert float(car.spring.push()) == pytest.approx(15000.0, rel=1e-9)
 
 
+@pytest.mark.slow  # preloads of axles are in the quick run
 def test_preloads_of_rods_and_curves(load):
     """Bars as bodies or as rods on other bodies, springs with and without curves, carry the same weights."""
     scene = document("push_rod")

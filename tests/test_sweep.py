@@ -50,6 +50,7 @@ def finish(process, code=0):
     assert process.returncode == code, output
 
 
+@pytest.mark.slow
 @on_a_cpu  # one batch of as many elsewhere
 def test_thousands_of_designs_are_single_runs_in_one_compilation(single):
     compilations, traces = [], []
@@ -203,6 +204,7 @@ def test_trajectories_say_whether_they_succeeded():
     assert found.values.states.v.shape == (4, 4, 2)
 
 
+@pytest.mark.slow  # `test_failed_designs_are_marked_and_the_others_kept` is in the quick run
 @pytest.mark.parametrize("save", some_quick([None, lambda s: s.body("top").position[2]]), ids=["trajectory", "saved"])
 def test_what_was_not_looked_at_in_a_run_is_no_failure(save):
     """Modified Newton makes no matrix in most steps, and knows no margin there."""

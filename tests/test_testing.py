@@ -90,6 +90,7 @@ WRONG_CONSTRAINTS = {
 }
 
 
+@pytest.mark.slow  # `test_wrong_joint` is in the quick run
 @pytest.mark.parametrize("mistake", some_quick(WRONG_CONSTRAINTS))
 def test_wrong_rule_of_a_constraint(mistake):
     kind, methods, names, note = WRONG_CONSTRAINTS[mistake]
@@ -236,7 +237,7 @@ WRONG_LOADS = {
 }
 
 
-@pytest.mark.parametrize("rule", some_quick(WRONG_LOADS, 3))
+@pytest.mark.parametrize("rule", some_quick(WRONG_LOADS, 2))
 def test_wrong_load(rule):
     no_energy = lambda load, a, b, t: 0.0 * t
     assert failed(check_force(Kite(jnp.asarray(0.3), rule), potential=no_energy)) == WRONG_LOADS[rule]
@@ -250,6 +251,7 @@ class Level(Weight):
         return (6, 7)
 
 
+@pytest.mark.slow  # `test_wrong_load` is in the quick run
 def test_wrong_potential():
     spring = SpringDamperLoad(*map(jnp.asarray, (POINT, AXIS, 3.0, 0.2, 0.4, 1.0)))
 

@@ -256,6 +256,7 @@ def test_forward_mode_and_the_explicit_adjoint_agree():
         np.testing.assert_allclose(other, slopes, rtol=1e-10)  # other order of round-off
 
 
+@pytest.mark.slow  # `test_each_lane_has_its_own_steps` is in the quick run
 def test_lanes_have_grids_of_their_own():
     stiff, soft = jnp.array(P).at[2].set(100.0), jnp.array(P)
     (values, runs), slopes = jax.jit(jax.vmap(differentiated))(jnp.stack([stiff, soft]))

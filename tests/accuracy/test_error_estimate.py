@@ -109,6 +109,7 @@ def on_a_rod(x, v, t):
     return np.array([[*rate(y[:3], y[3:]), WEIGHT * (y[3:] @ y[3:] + G @ y[:3]) / np.sqrt(x @ x)] for y in found])
 
 
+@pytest.mark.slow  # `test_a_linear_oscillator` is in the quick run
 @pytest.mark.parametrize(
     ("case", "rho_inf"), some_quick([("run", 0.9), ("run", 0.3), ("continued", 0.9), ("first order", 0.9)])
 )

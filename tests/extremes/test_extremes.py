@@ -36,6 +36,7 @@ def test_error_of_the_linear_oscillation_is_of_second_order(rho):
 rotations = st.lists(st.floats(-40.0, 40.0), min_size=3, max_size=3).map(np.array)
 
 
+@pytest.mark.slow  # `test_extreme` is in the quick run
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(spin=rotations, start=rotations)
 def test_any_rotation_per_step_from_any_orientation(spin, start):

@@ -83,6 +83,7 @@ def compare(model, data, imported, tolerance=1e-9):
 SLOW = pytest.mark.slow  # ten seconds of processor each
 
 
+@pytest.mark.slow  # `test_accelerations_of_an_arm_in_urdf` is in the quick run
 @pytest.mark.parametrize("name", ["cart", pytest.param("arm", marks=SLOW), pytest.param("figure", marks=SLOW)])
 def test_accelerations_of_trees(name):
     """Hinges, slides, balls and a free base; several joints on one body; springs, dampers, armature, motors, servos."""

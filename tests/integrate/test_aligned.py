@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from differences import central
-from helpers import says
+from helpers import says, some_quick
 
 import lgsens as lg
 from lgsens.dynamics import breaks_of
@@ -237,7 +237,7 @@ CONTROLLED = {
 }
 
 
-@pytest.mark.parametrize("name", CONTROLLED)
+@pytest.mark.parametrize("name", some_quick(CONTROLLED))
 def test_error_control_sees_what_comes(name):
     """A bump of 20 ms in 10 s, before which nothing moves: no step of its own would look at it."""
     integrator, num_steps, tolerance = CONTROLLED[name]
@@ -251,6 +251,7 @@ def test_error_control_sees_what_comes(name):
             assert np.abs(np.asarray(run.t) - edge).min() < 1e-12
 
 
+@pytest.mark.slow
 def test_tables_of_many_samples_are_left_to_the_error_control():
     n = MANY + 10
     road = lg.SampledRoad(np.linspace(0.0, 1.0, n), 1e-3 * np.sin(np.linspace(0.0, 6.0, n)))

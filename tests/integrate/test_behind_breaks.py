@@ -63,6 +63,7 @@ def test_forces_on_a_ramp_are_of_second_order(integrator):
         assert coarse.max() < 1.5e-2
 
 
+@pytest.mark.slow  # `test_behind_samples_forces_are_exact` is in the quick run
 def test_a_ramp_may_begin_at_t0():
     off, within = errors("ramp from t0", "equal", 75)
     assert off[~within].max() < 1.5e-2  # first order: 0.2

@@ -179,6 +179,7 @@ def test_a_matrix_serves_as_long_as_that_is_cheapest(unknowns):
     assert best <= n <= best + 1  # the next step is taken to be like the last one
 
 
+@pytest.mark.slow  # `test_orders_on_the_heavy_top` is in the quick run
 @pytest.mark.parametrize("scene", ["shaft", pytest.param("hinge on SE(3)", marks=pytest.mark.slow)])
 def test_multipliers_converge_where_the_motion_does_not_see_them(scene):
     """A driven shaft, and a hinge on SE(3), whose centres of mass turn by 2 rad in twenty steps: increments of modified

@@ -178,7 +178,7 @@ LINEARIZED = [
 ]
 
 
-@pytest.mark.parametrize("solver, scene", some_quick(LINEARIZED, 2))
+@pytest.mark.parametrize("solver, scene", some_quick(LINEARIZED))
 def test_factors_are_those_of_the_equations(solver, scene):
     """Anywhere, with μ of the size of λ: F_z times the solution, and F_n, by forward-mode autodiff of the equations."""
     model, rng = scene(), np.random.default_rng(0)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import equations
+from helpers import equations, some_quick
 
 import lgsens as lg
 from lgsens.dynamics import initial_state, is_redundant, tangents, times_tangent_operator
@@ -131,7 +131,7 @@ def test_levels_grow_with_the_logarithm():
     assert all(len(plan.rest) < 130 for plan in plans.values())
 
 
-@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("first", some_quick([0, 1]))
 @pytest.mark.parametrize("kind", [LU, Inverse])
 def test_levels_in_a_loop(first, kind):
     """The same solutions, of S and its transpose, whether levels are split and filled up for a loop or not."""

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import EPS, says
+from helpers import EPS, says, some_quick
 
 import lgsens as lg
 from lgsens.dynamics import mass_matrix, tangents
@@ -65,7 +65,7 @@ def test_single_precision_is_as_it_was():
     assert isinstance(factors_of(matrix, LU, mixed=True), LU)
 
 
-@pytest.mark.parametrize("solver", [lg.DenseLU, lg.BlockSparse])
+@pytest.mark.parametrize("solver", some_quick([lg.BlockSparse, lg.DenseLU]))
 def test_iteration_matrix_and_its_transpose(solver):
     """Of a chain, dense and by blocks: LU refined, the inverse as it is."""
     rng = np.random.default_rng(3)

@@ -107,6 +107,7 @@ def gears(curve, speed=30.0):
     return lg.Model(bodies, {"mesh": lg.CoordinateCoupling(hinges["one"], hinges["two"], curve=curve)}), hinges
 
 
+@pytest.mark.slow  # `test_a_driven_cam_over_turns` is in the quick run
 def test_gears_that_are_not_round():
     """θ₁ = θ₂ + e sin 2θ₂ over turns, and ½ (J₂ + J₁ (1 + 2e cos 2θ₂)²) θ̇₂² is kept."""
     swell, steps = 0.2, 200
@@ -151,6 +152,7 @@ def test_what_closes_after_a_turn(dtype):
     assert unless_closed(lambda t: 1.3 * t, angle, turn=TURN) == angle
 
 
+@pytest.mark.slow  # `test_what_closes_after_a_turn` is in the quick run
 @pytest.mark.parametrize("turns", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_torque_over_the_angle_of_a_crank(turns):
     """J θ̈ = F(θ) − c θ̇ of period 2π, and with counted turns of 4π as of a four-stroke engine, against SciPy."""

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import says
+from helpers import says, some_quick
 
 import lgsens as lg
 from lgsens.testing import check_force, check_sensitivities
@@ -128,7 +128,7 @@ def test_planetary_gear_on_a_carrier():
     assert abs(sun) * t[-1] > 8 * 2 * np.pi
 
 
-@pytest.mark.parametrize("c", [-1.0, -0.5])
+@pytest.mark.parametrize("c", some_quick([-0.5, -1.0]))
 def test_rope_over_a_pulley(c):
     """Atwood's machine, and a block and tackle, on ropes of different lengths: s̈₂ = g (m₁ c + m₂)/(m₁ c² + m₂)."""
     masses, lengths = (1.0, 3.0), (1.0, 2.0)

@@ -65,6 +65,7 @@ def test_tangents_equal_autodiff(system, seed):
     jax.tree.map(lambda x, y: close(x, y, ULPS), tangents, expected)
 
 
+@pytest.mark.slow  # `test_tangents_equal_autodiff` is in the quick run
 def test_equations_are_those_of_six_coordinates_restricted(system):
     """r = Eᵀ r₆, M = Eᵀ M₆ E, B = B₆ E where the bodies can violate the equation and 0 elsewhere."""
     full = with_all_freedoms(MIXED).system()

@@ -170,7 +170,7 @@ REDUCED = {
 }
 
 
-@pytest.mark.parametrize("case", some_quick(REDUCED, 3))
+@pytest.mark.parametrize("case", some_quick(REDUCED))
 def test_reduced_bodies(case):
     """The freedoms of the one that has fewer; velocities, accelerations and forces are those of the separate bodies."""
     first, second, free, pivot = REDUCED[case]

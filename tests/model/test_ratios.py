@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import close, moved, random_rotation, says
+from helpers import close, moved, random_rotation, says, some_quick
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
@@ -301,7 +301,7 @@ JUMPING = {
 }
 
 
-@pytest.mark.parametrize("name", TURNING)
+@pytest.mark.parametrize("name", some_quick(TURNING))
 def test_couplings_over_whole_turns(name):
     build, joint, ratio = TURNING[name]
     found = lg.kinematics(build(), t=TIMES).joint(joint)

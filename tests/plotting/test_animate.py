@@ -93,6 +93,7 @@ def test_a_top_is_a_bar_with_a_box(tmp_path):
     assert data["clock"][-1] == 0.4 and data["values"][-1] == 0.2  # at half speed
 
 
+@pytest.mark.slow  # `test_elements_of_a_beam_have_their_stress` is in the quick run
 def test_elements_of_a_beam_are_bent_as_they_are(swinging, tmp_path):
     """Each on the helix between its sections, to 2e-3 of its length where it turns by less than a quarter."""
     data = Page(plotting.animate(swinging, tmp_path / "a.html")).data

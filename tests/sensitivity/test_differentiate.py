@@ -72,6 +72,7 @@ def test_structures_and_explicit_parameters(method, by_jax):
             )
 
 
+@pytest.mark.slow  # README does it in the quick run
 def test_with_respect_to_a_whole_model():
     """p may be a Model; the gradient is again one."""
     model = spinning_top(jnp.asarray(0.7))
