@@ -564,6 +564,19 @@ MISTAKES = {
         {"anti_roll_bar.knuckle": [-0.2, 0.8, -0.13]},
         ("key 'anti_roll_bar.lever'", "goes along it", "cannot turn it"),
     ),
+    "drop link at the hinge of an arm": (
+        "mcpherson",
+        {
+            "anti_roll_bar.knuckle": None,
+            "anti_roll_bar.control_arm": [0.03, 0.515, -0.148],
+            "anti_roll_bar.lever": [0.03, 0.6, 0.1],
+        },
+        (
+            "key 'anti_roll_bar'",
+            "the end of the drop link on 'control_arm' moves by",
+            "does not twist as the car rolls",
+        ),
+    ),
     "stop on one": (
         "semi_trailing_arm",
         {"bump_stop.knuckle": [0.3, 0.8, 0.1]},

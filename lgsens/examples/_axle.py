@@ -80,8 +80,6 @@ class Axle(eqx.Module):
         with jax.ensure_compile_time_eval():
             corner, name = QuarterCar._read(path)
             root, kilogram = reader(*read(path))
-            if BODY not in root:
-                check_corner(corner, f"Hardpoint file {name!r}")
             if not abs(float(corner.wheel.centre[1])) > LEAST_TRACK / 2:
                 raise root.table("wheel").fail(
                     "centre",
@@ -89,6 +87,8 @@ class Axle(eqx.Module):
                     f"of an axle is its mirror image there; no car has a track of less than {LEAST_TRACK} m.",
                 )
             between = axle_members(root, kilogram, corner)
+            if BODY not in root:
+                check_corner(corner, f"Hardpoint file {name!r}", between.get("bar"))
             left, solid = between.pop("left"), between.get("solid_axle")
             axle = Axle(with_nodes(left, between["bar"].ends) if "bar" in between else left, **between)
             if solid is not None:

@@ -12,8 +12,9 @@ GRAVITY = 9.81  # m/s²
 MOST_COMPRESSION = {"spring": 2.0, "leaf": 0.6, "tyre": 0.2}
 
 
-def check_corner(car: Any, name: str) -> None:
-    """Raise `ValueError` for a suspension, called `name`, that does not move as one, or springs that cannot bear it.
+def check_corner(car: Any, name: str, bar: Any = None) -> None:
+    """Raise `ValueError` for a suspension, called `name`, that does not move as one, springs that cannot bear it, or an
+    anti-roll `bar` that does nothing.
 
     What leaf springs guide moves as they bend; of it, springs are looked at.
     """
@@ -21,7 +22,7 @@ def check_corner(car: Any, name: str) -> None:
         return check_springs(car, name, 1.0)
     struts = {"spring": car.spring, "damper": car.damper}
     with jax.ensure_compile_time_eval():  # of numbers that are known, inside `jit` too
-        ratios = motion_ratios(name, car.wheel.centre, car.links, car.joints, struts)
+        ratios = motion_ratios(name, car.wheel.centre, car.links, car.joints, struts, bar)
     if ratios:
         check_springs(car, name, ratios["spring"])
 

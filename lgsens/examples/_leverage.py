@@ -18,6 +18,7 @@ from lgsens._validate import is_concrete
 from lgsens.examples._suspension_parts import PLANAR, Connection, Link, Strut, itself
 
 RATIOS = (0.1, 3.0)  # motion ratios that cars have; racing cars' rockers reach some 0.4 to 1.5
+LEAST_OF_BAR = 0.05  # travel of the end of a drop link along it, per wheel travel: on control arms 0.3 to 0.6
 LEAST_ANGLE = math.radians(10.0)  # of a link to the plane of its universal joint's arms, where it would be singular
 SINGULAR = 1e8  # condition of the rows, at least
 
@@ -28,13 +29,15 @@ def motion_ratios(
     links: Mapping[str, Link],
     joints: Mapping[str, Connection],
     struts: Mapping[str, Strut],
+    bar: Any = None,
 ) -> dict[str, float]:
-    """The motion ratios of spring and damper; {}: numbers are traced and not looked at.
+    """The motion ratios of spring and damper; {}: numbers are traced and not looked at. And whether an anti-roll `bar`
+    does anything.
 
     Raises `ValueError`, naming key, value and remedy, for a suspension that does not move up and down, for universal
     joints that are nearly singular, and for motion ratios that no car has.
     """
-    if not is_concrete(centre, links, joints, struts):
+    if not is_concrete(centre, links, joints, struts, bar):
         return {}
     every = [*joints.items(), *((f"links.{key}", c) for key, link in links.items() for c in link.connections(key))]
     for key, connection in every:
@@ -63,7 +66,23 @@ def motion_ratios(
             f"{name}, key 'links': joints repeat each other, or leave the wheel no travel at the design position "
             f"(condition {condition:.0e}); move a hardpoint, or check the line of a hinge."
         )
-    return strut_ratios(name, velocities, np.linalg.solve(matrix, np.append(np.zeros(len(rows)), 1.0)), struts)
+    twists = np.linalg.solve(matrix, np.append(np.zeros(len(rows)), 1.0))
+    if bar is not None:
+        check_bar(name, velocities, twists, bar)
+    return strut_ratios(name, velocities, twists, struts)
+
+
+def check_bar(name: str, velocities: "Velocities", twists: np.ndarray, bar: Any) -> None:
+    """Its drop link moves along itself, by twists per wheel travel."""
+    end = bar.ends[bar.link]
+    line = np.asarray(end - bar.lever)
+    ratio = (velocities.moving("chassis", bar.link, line[None], end) @ twists).item() / np.linalg.norm(line)
+    if not abs(ratio) >= LEAST_OF_BAR:
+        raise ValueError(
+            f"{name}, key 'anti_roll_bar': the end of the drop link on {bar.link!r} moves by {ratio:.3g} m along the "
+            "link per m of wheel travel, so the bar does not twist as the car rolls. Hold it on to what travels with "
+            "the wheel, or turn the drop link towards the way of its end."
+        )
 
 
 def _loose(links: Collection[str], connections: Iterable[tuple[str, Connection]]) -> list[str]:
