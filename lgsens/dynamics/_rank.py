@@ -35,7 +35,7 @@ def rank_near_reference(system: AbstractSystem, t: Float[Array, ""], driven: Boo
     """
     q, _ = _assembled(system, t)
     at = best = _Place(q, _evaluated(system, q, t)[1])
-    scale = np.asarray(system.coordinate_scale())
+    scale, _ = _sizes(system)
     reference = rank = left_null_space(at.jacobian * scale)[1]
     for direction in np.random.default_rng(0).normal(size=(_DIRECTIONS, at.jacobian.shape[1])):
         there, _ = _moved(system, at, t, direction, _DISTANCE, driven)
@@ -48,7 +48,7 @@ def jacobians_on_the_way(
     system: AbstractSystem, found: Rank, t: Float[Array, ""], driven: Bool[np.ndarray, " m"]
 ) -> list[Float[np.ndarray, "m k"]]:
     """J in configurations that the mechanism reaches, where it has the rank that was found; `driven` as above."""
-    every, k, scale = [found.jacobian], found.jacobian.shape[1], np.asarray(system.coordinate_scale())
+    (scale, _), every, k = _sizes(system), [found.jacobian], found.jacobian.shape[1]
     for way in np.random.default_rng(1).normal(size=(_WAYS, k)):
         for direction in (way, -way):
             place: _Place | None = _Place(found.q, found.jacobian)
@@ -112,14 +112,14 @@ class _Place(NamedTuple):
 def _moved(system: AbstractSystem, place: _Place, t, direction, distance: float, driven):
     """The place at a distance from another one along a direction, None if there is none; and the direction there.
     `driven`: equations that need not hold."""
-    (q, jacobian), scale, held = place, np.asarray(system.coordinate_scale()), ~driven
+    (q, jacobian), (scale, tolerance), held = place, _sizes(system), ~driven
     # the part of the direction that the constraints allow, in comparable coordinates
     rows = jacobian[held] * scale
     x = direction - np.linalg.lstsq(rows, rows @ direction, rcond=None)[0]
     size = np.abs(x).max(initial=0.0)
     if size < 1e-6:  # no freedom
         return None, x
-    begun, tolerance = _retracted(system, q, distance * scale * x / size), float(system.constraint_round_off())
+    begun = _retracted(system, q, distance * scale * x / size)
     # Singular values that the distance does not explain belong to redundant equations. Those of a branch that begins in
     # a singular reference, to which a direction between two of them leads, may be as small.
     for least in (1e-2 * distance, 1e-4 * distance):
@@ -135,6 +135,17 @@ def _moved(system: AbstractSystem, place: _Place, t, direction, distance: float,
 
 
 _assembled = eqx.filter_jit(assemble)
+
+
+def _sizes(system) -> tuple[np.ndarray, np.ndarray]:
+    """Those of coordinates, and what counts as none of Φ."""
+    scale, round_off = _scale_and_round_off(system)
+    return np.asarray(scale), np.asarray(round_off)
+
+
+@eqx.filter_jit
+def _scale_and_round_off(system):
+    return system.coordinate_scale(), system.constraint_round_off()
 
 
 def _evaluated(system, q, t) -> tuple[np.ndarray, np.ndarray]:
