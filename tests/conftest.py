@@ -9,7 +9,6 @@ compiled once in a run: JAX keeps them in a folder that ends with it.
 """
 
 import gc
-import itertools
 import json
 import logging
 import os
@@ -49,19 +48,14 @@ def pytest_configure(config):
 
 
 def _forget_programs():
-    """Compiled programs hold memory, and maps of it, of which a process has only so many."""
+    """Compiled programs hold memory maps, of which a process has only so many; hardly any serves two modules."""
     jax.clear_caches()
 
 
-_modules = itertools.count(1)
-
-
 @pytest.fixture(autouse=True, scope="module")
-def forget_programs_of_modules():
-    """Of each third one: large programs serve one only, but thousands of single operations all of them."""
+def forget_programs_of_a_module():
     yield
-    if next(_modules) % 3 == 0:
-        _forget_programs()
+    _forget_programs()
 
 
 @pytest.fixture(autouse=True)
