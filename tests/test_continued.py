@@ -96,6 +96,7 @@ def test_a_step_that_is_not_there():
         half().continued(41)
 
 
+@pytest.mark.slow  # `test_from_any_step_and_of_a_batch` is in the quick run
 @pytest.mark.parametrize("both", some_quick([False, True]), ids=["reverse", "forward too"])
 def test_derivatives_through_it_are_exact(both):
     """By a length, and by the time at which the size of the steps changes."""

@@ -253,6 +253,7 @@ def test_a_masked_run_that_did_not_begin_has_no_derivative(bad, result):
     assert slope > 0.0 and found == lg.RESULTS.successful
 
 
+@pytest.mark.slow
 def test_first_failure_of_a_batch_is_raised():
     trajectories = jax.jit(jax.vmap(fail))(jnp.asarray([0.0, 30.0]))
     positions = trajectories.body("bob").position
@@ -274,6 +275,7 @@ def test_callbacks_raise_inside_jit():
         assert np.all(np.isfinite(every(jnp.zeros(2))))
 
 
+@pytest.mark.slow  # `test_newton_failure_inside_jit` is in the quick run
 def test_newton_failure_under_differentiation():
     """Where the model is traced but its values are known the error is the library's own."""
     with pytest.raises(lg.SimulationError, match=FAILURE):

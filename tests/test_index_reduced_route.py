@@ -289,6 +289,7 @@ def test_too_few_steps_for_the_tolerance():
         swing(9.81, 4, lg.IndexReducedODE(rtol=1e-10, max_steps=2))
 
 
+@pytest.mark.slow
 def test_mechanism_that_cannot_be_assembled():
     bob = lg.RigidBody(2.0, (0.1, 0.2, 0.3), position=(0.0, 0.0, -1.0))
     rod = lg.DistanceJoint(None, "bob", at_a=(1.0, 0.0, -1.0), at_b=(0.0, 0.0, -1.0), length=5.0)

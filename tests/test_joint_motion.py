@@ -178,6 +178,7 @@ PLANAR = {"free": "x z ry"}
 SLOW = [pytest.param(options, marks=pytest.mark.slow) for options in ({"merge_fixed": True}, PLANAR)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [*SLOW, PLANAR | {"merge_fixed": True}])
 def test_of_merged_and_freed_bodies(options):
     model = two_parts(**options)

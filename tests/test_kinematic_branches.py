@@ -82,6 +82,7 @@ def test_no_other_way_to_assemble_it_is_taken(count):
     check(random_designs(count), planar=True)
 
 
+@pytest.mark.slow  # `test_no_other_way_to_assemble_it_is_taken` is in the quick run
 def test_nor_where_two_loops_could_change_over_at_once():
     """Bars on cylinders side by side, which come within 0.1 rad of their dead centres: signs of determinants change
     twice. φ is the angle at the pin of a triangle whose third side is the cylinder."""

@@ -221,6 +221,7 @@ def test_forces_of_a_cylinder_are_those_of_its_length():
         close(run.joint("cylinder").force[:, 1] + run.joint("pin").force[:, 1], np.full(3, weight), ULPS, scale=200.0)
 
 
+@pytest.mark.slow
 def test_two_drivers_move_a_body_as_they_say():
     """A slide along an axis of a tilted body, and a turn beyond a whole one about another: the products of both."""
     rng = np.random.default_rng(5)

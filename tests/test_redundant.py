@@ -199,6 +199,7 @@ def test_a_four_bar_of_revolute_joints_is_the_planar_one():
         np.testing.assert_allclose(found[name][:2], plain[name][:2], rtol=1e-5, atol=1e-5, err_msg=name)
 
 
+@pytest.mark.slow
 def test_rank_of_bricard_and_door():
     found = lg.constraint_rank(bricard())
     assert (found.coordinates, found.equations, found.rank, found.reference_rank) == (30, 30, 29, 29)

@@ -93,6 +93,7 @@ def rigid():
     return rigs.kc(*small_axle(compliant=False), {name: STANDARD[name] for name in names}, points=5)
 
 
+@pytest.mark.slow  # `lgsens kc` asks rigs in the quick run
 def test_steering_axis_is_the_line_of_the_ball_joints(rigid):
     lower, upper, centre = (np.array(POINTS[name]) for name in ("lower_ball", "upper_ball", "centre"))
     axis = upper - lower

@@ -138,6 +138,7 @@ def test_one_factorization_for_all_parameters():
     assert factorizations(backward) == factorizations(forward) + 1
 
 
+@pytest.mark.slow
 def test_what_is_free_is_named():
     model = lever()
     wheel = lg.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), position=(1.0, 0.0, 0.0))
@@ -276,6 +277,7 @@ def test_a_column_does_not_jump_to_a_branch_that_is_unstable(points):
     np.testing.assert_allclose(found[[0, 2]], tip(moment)[2:], atol=5e-3)
 
 
+@pytest.mark.slow  # `test_out_of_reach` is in the quick run
 def test_lengths_that_cannot_be_closed_are_out_of_reach():
     """Not something that moves freely, as K is singular where the triangle closes. The path is lost there."""
     rods = {

@@ -53,6 +53,7 @@ def test_the_reference_knows_its_error():
     assert 0 < twice.error < 0.1 * extrapolated.error  # another (ωh)²
 
 
+@pytest.mark.slow  # `test_values_and_gradients_are_those_of_the_closed_form` is in the quick run
 def test_errors_are_those_of_the_closed_form(table):
     value, gradient = exact_with_gradient()
     coarse, fine, explicit = rows = table.rows[:3]

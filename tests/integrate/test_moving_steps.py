@@ -52,6 +52,7 @@ def gradient(integrator, method, num_steps):
     return lg.differentiate(WORK, build, P, t1=T1, num_steps=num_steps, integrator=integrator, method=method).gradient
 
 
+@pytest.mark.slow  # `test_steps_move_with_the_ends_of_their_pieces` is in the quick run
 @pytest.mark.parametrize(
     "method",
     [lg.DirectDifferentiation(), pytest.param(lg.AdjointVariable(), marks=pytest.mark.slow)],

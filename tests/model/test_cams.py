@@ -122,6 +122,7 @@ def test_gears_that_are_not_round():
     np.testing.assert_allclose(energy, energy[0], rtol=0.6 * (2 * 30.0 / steps) ** 2)
 
 
+@pytest.mark.slow  # `test_what_closes_after_a_turn` is in the quick run
 def test_a_curve_that_does_not_close_has_failed_at_half_a_turn():
     model, _ = gears(lg.Polynomial((0.0, 1.0, 0.2)))
     with pytest.raises(lg.SimulationError, match="half a turn"):

@@ -143,6 +143,7 @@ def test_a_gif_has_the_colours_of_stress(swinging, tmp_path):
     assert counts[None] == [0, 0]
 
 
+@pytest.mark.slow
 def test_a_rig_is_swept_through(rig, tmp_path):
     data = Page(plotting.animate(rig, tmp_path / "a.html")).data
     assert (data["label"], data["unit"], data["digits"]) == ("travel", "m", 2)
@@ -157,6 +158,7 @@ def test_a_rig_is_swept_through(rig, tmp_path):
     np.testing.assert_allclose(wheel[:, 1], centre[1], atol=1e-5)  # its axis is along y
 
 
+@pytest.mark.slow
 def test_a_driven_angle_has_its_unit(tmp_path):
     model = four_bar()
     motor = {"motor": lg.RotationDriver(None, "crank", axis=(0.0, 0.0, 1.0))}

@@ -43,6 +43,7 @@ def in_part(first, *others):
     return [*((case, True) for case in first), *(pytest.param(c, False, marks=pytest.mark.slow) for c in others)]
 
 
+@pytest.mark.slow  # README has its gradient in the quick run
 @pytest.mark.parametrize(
     "name",
     [

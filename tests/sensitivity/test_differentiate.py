@@ -287,6 +287,7 @@ LATE = lg.Criterion(terminal=lambda s, p: jnp.log(s.body("stone").position[2])) 
 SLOPE = {"t1": 0.1, "num_steps": 8}
 
 
+@pytest.mark.slow  # `test_a_failed_simulation_raises_or_says_so` is in the quick run
 @pytest.mark.parametrize("method", some_quick([lg.DirectDifferentiation(), lg.AdjointVariable()]))
 def test_what_is_not_finite_is_said_with_its_place(method):
     """The motion is as it should be; a gradient of NaN would go into the design without a word."""
