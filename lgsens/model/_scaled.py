@@ -61,6 +61,9 @@ class ScaledLoad(AbstractClosedFormLoad):
     def fixed(self, kind, bodies="ab"):
         return self.of.fixed(kind, bodies)
 
+    def branch(self, a, b):
+        return self.of.branch(a, b)
+
     def force(self, a, b, va, vb, t):
         return self.factor * self.of.force(a, b, va, vb, t)
 
@@ -96,6 +99,9 @@ class ScaledDynamicLoad(AbstractDynamicLoad):
 
     def fixed(self, kind, bodies="ab"):
         return self.of.fixed(kind, bodies)
+
+    def branch(self, a, b):
+        return self.of.branch(a, b)
 
     def force(self, a, b, va, vb, t, z):
         return self.factor * self.of.force(a, b, va, vb, t, z)

@@ -245,7 +245,7 @@ class AbstractRun(AbstractMotion):
 
     def to_csv(self, path: str | os.PathLike) -> None:
         """Write a table with a line for each time and a column for each number, "top.position.x [m]", in full
-        precision: what `to_xarray` has, without any package.
+        precision: what `to_xarray` has, without any package; nan from where a motion failed.
 
         Arguments:
             path: of the file, which is overwritten.

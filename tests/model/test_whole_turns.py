@@ -7,6 +7,7 @@ import pytest
 from helpers import says, some_quick
 
 import lgsens as lg
+from lgsens.model._scaled import ScaledForce
 
 Z = (0.0, 0.0, 1.0)
 INERTIA, STIFFNESS, WOUND = 0.02, 0.3, 6 * np.pi  # kg m², N m/rad, rad
@@ -168,6 +169,7 @@ SPRINGS = {
     "rotational": lambda k: lg.RotationalSpringDamper(None, "rotor", stiffness=k),
     "torsion": lambda k: lg.TorsionSpringDamper(None, "rotor", axis=Z, stiffness=k),
     "coordinate": lambda k: lg.CoordinateForce(hinge(), stiffness=k),
+    "scaled": lambda k: ScaledForce(lg.TorsionSpringDamper(None, "rotor", axis=Z, stiffness=2.0 * k), factor=0.5),
 }
 
 AXES = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # the first along z
