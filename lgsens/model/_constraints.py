@@ -11,7 +11,7 @@ An element holds numbers only (no names): elements of one type are stacked and e
 import abc
 import dataclasses
 from collections.abc import Iterable, Set
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -38,22 +38,16 @@ from lgsens.model._signals import Prescribed, at_time, number_of
 class AbstractRows(AbstractElement):
     """Equations between the frames of two bodies, of one level."""
 
-    @property
-    @abc.abstractmethod
-    def num_rows(self) -> int:
-        """Number of scalar equations."""
+    num_rows: ClassVar[Any] = property(abc.abstractmethod(lambda self: ...))
+    """Number of scalar equations, an attribute of the class or a property."""
 
-    @property
-    def relative(self) -> bool:
-        """Whether Φ depends on nothing but t and the pose of one body as seen from the other, as in a joint: it then
-        takes as many directions from either body while the other one is held, which the linear solver makes use of."""
-        return False
+    relative: ClassVar[Any] = False
+    """Whether Φ depends on nothing but t and the pose of one body as seen from the other, as in a joint: it then takes
+    as many directions from either body while the other one is held, which the linear solver makes use of."""
 
-    @property
-    def coupled(self) -> tuple[tuple[int, ...], ...]:
-        """Disjoint sets of the coordinates [x_a, θ_a, x_b, θ_b], 0 … 11: the stiffness D_q(Bᵀλ) is zero but for the
-        square block of each, and these alone are added to K_t."""
-        return (ALL,)
+    coupled: ClassVar[Any] = (ALL,)
+    """Disjoint sets of the coordinates [x_a, θ_a, x_b, θ_b], 0 … 11: the stiffness D_q(Bᵀλ) is zero but for the square
+    block of each, and these alone are added to K_t."""
 
     @property
     def turning(self) -> bool:
@@ -112,17 +106,9 @@ class Coincidence(AbstractClosedFormConstraint):
     point_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "a"))
     point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
 
-    @property
-    def num_rows(self):
-        return 3
-
-    @property
-    def relative(self):
-        return True
-
-    @property
-    def coupled(self):
-        return (TURNING_A, TURNING_B)
+    num_rows = 3
+    relative = True
+    coupled = (TURNING_A, TURNING_B)
 
     def violable(self, free):
         # x_b + R_b X_b − x_a − R_a X_a changes along the axis of a rotation by translation only
@@ -152,17 +138,9 @@ class Orthogonality(AbstractClosedFormConstraint):
     axis_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
     axis_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
 
-    @property
-    def num_rows(self):
-        return 1
-
-    @property
-    def relative(self):
-        return True
-
-    @property
-    def acts_on(self):
-        return TURNING_A + TURNING_B
+    num_rows = 1
+    relative = True
+    acts_on = TURNING_A + TURNING_B
 
     @property
     def coupled(self):
@@ -213,14 +191,8 @@ class InPlane(AbstractClosedFormConstraint):
     point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
     axis_a: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "a"))
 
-    @property
-    def num_rows(self):
-        return 1
-
-    @property
-    def relative(self):
-        return True
-
+    num_rows = 1
+    relative = True
     drawn = None
 
     def value(self, a, b, t):
@@ -256,10 +228,7 @@ class ConstraintSum(AbstractClosedFormConstraint):
     prescribed: Prescribed | None = None
 
     drawn = None
-
-    @property
-    def num_rows(self):
-        return 1
+    num_rows = 1
 
     @property
     def relative(self):
@@ -311,14 +280,8 @@ class Distance(AbstractClosedFormConstraint):
     point_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("point", "b"))
     length: Prescribed
 
-    @property
-    def num_rows(self):
-        return 1
-
-    @property
-    def relative(self):
-        return True
-
+    num_rows = 1
+    relative = True
     drawn = "link"
 
     @property

@@ -41,10 +41,7 @@ class Coupled(AbstractClosedFormConstraint):
     teeth: int = eqx.field(static=True)
 
     drawn = None
-
-    @property
-    def num_rows(self):
-        return 1
+    num_rows = 1
 
     def _coordinates(self, frames):
         """s₁ and s₂, angles but for whole turns."""

@@ -35,13 +35,8 @@ class Angle(AbstractClosedFormConstraint):
     first_b: Float[Array, "3"] = eqx.field(metadata=body_fixed("axis", "b"))
     prescribed: Prescribed
 
-    @property
-    def num_rows(self):
-        return 1
-
-    @property
-    def acts_on(self):
-        return TURNING_A + TURNING_B
+    num_rows = 1
+    acts_on = TURNING_A + TURNING_B
 
     @property
     def driven(self):

@@ -45,11 +45,9 @@ class AbstractElement(eqx.Module):
 
     drawn: ClassVar[Any] = "joint"
 
-    @property
-    def acts_on(self) -> tuple[int, ...]:
-        """The coordinates 0 … 11, [x_a, θ_a, x_b, θ_b], that it acts on: B has no other columns, and the generalized
-        force no other entries. Of a constraint, which then depends on no others, all of them or the six rotations."""
-        return ALL
+    acts_on: ClassVar[Any] = ALL
+    """The coordinates 0 … 11, [x_a, θ_a, x_b, θ_b], that it acts on: B has no other columns, and the generalized force
+    no other entries. Of a constraint, which then depends on no others, all of them or the six rotations."""
 
     @property
     def driven(self) -> Float[Array, ""] | None:

@@ -139,9 +139,7 @@ class Weight(AbstractClosedFormLoad):
     mass: Float[Array, ""]
     acceleration: Float[Array, "3"]
 
-    @property
-    def acts_on(self):
-        return TRANSLATING_B
+    acts_on = TRANSLATING_B
 
     def force(self, a, b, va, vb, t):
         return embedded(self.mass * self.acceleration, TRANSLATION_B)

@@ -55,10 +55,7 @@ class ContactHeight(AbstractConstraint):
 
     contact: _Contact
 
-    @property
-    def num_rows(self):
-        return 1
-
+    num_rows = 1
     drawn = None
 
     def fixed(self, kind, bodies="ab"):
@@ -77,10 +74,7 @@ class Slip(AbstractVelocityConstraint):
 
     contact: _Contact
     drawn = None
-
-    @property
-    def num_rows(self):
-        return 2
+    num_rows = 2
 
     def rate(self, a, b, va, vb, t):
         at = self.contact

@@ -6,8 +6,9 @@ import jax
 from jaxtyping import Array, Float
 
 from lgsens._validate import number_field
+from lgsens.model._elements import AbstractElement
 from lgsens.model._forces import AbstractForce, Attached
-from lgsens.model._loads import AbstractClosedFormLoad, AbstractDynamicLoad, AbstractLoad, LoadTangents
+from lgsens.model._loads import AbstractClosedFormLoad, AbstractDynamicLoad, LoadTangents
 from lgsens.model._stack import load_tangents
 
 
@@ -40,29 +41,25 @@ class ScaledForce(AbstractForce):
         return tuple(Attached(scaled(load), a, b) for load, a, b in self.of.loads(bodies))
 
 
-class ScaledLoad(AbstractClosedFormLoad):
-    """factor · Q."""
+class _OfAnother(AbstractElement):
+    """What a load times a number has of the load."""
 
-    of: AbstractLoad
+    of: Any
     factor: Float[Array, ""]
 
-    @property
-    def balanced(self):
-        return self.of.balanced
-
-    @property
-    def drawn(self):
-        return self.of.drawn
-
-    @property
-    def acts_on(self):
-        return self.of.acts_on
+    balanced = property(lambda self: self.of.balanced)
+    drawn = property(lambda self: self.of.drawn)
+    acts_on = property(lambda self: self.of.acts_on)
 
     def fixed(self, kind, bodies="ab"):
         return self.of.fixed(kind, bodies)
 
-    def branch(self, a, b):
-        return self.of.branch(a, b)
+    def branch(self, a, b, *others):
+        return self.of.branch(a, b, *others)
+
+
+class ScaledLoad(_OfAnother, AbstractClosedFormLoad):
+    """factor · Q."""
 
     def force(self, a, b, va, vb, t):
         return self.factor * self.of.force(a, b, va, vb, t)
@@ -75,33 +72,11 @@ class ScaledLoad(AbstractClosedFormLoad):
         return LoadTangents(*jax.tree.map(lambda part: self.factor * part, tuple(parts)))
 
 
-class ScaledDynamicLoad(AbstractDynamicLoad):
+class ScaledDynamicLoad(_OfAnother, AbstractDynamicLoad):
     """factor · Q, and ż = g."""
 
-    of: AbstractDynamicLoad
-    factor: Float[Array, ""]
-
-    @property
-    def states(self):
-        return self.of.states
-
-    @property
-    def reads(self):
-        return self.of.reads
-
-    @property
-    def balanced(self):
-        return self.of.balanced
-
-    @property
-    def acts_on(self):
-        return self.of.acts_on
-
-    def fixed(self, kind, bodies="ab"):
-        return self.of.fixed(kind, bodies)
-
-    def branch(self, a, b):
-        return self.of.branch(a, b)
+    states = property(lambda self: self.of.states)
+    reads = property(lambda self: self.of.reads)
 
     def force(self, a, b, va, vb, t, z):
         return self.factor * self.of.force(a, b, va, vb, t, z)

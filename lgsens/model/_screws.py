@@ -44,14 +44,8 @@ class Advance(AbstractClosedFormConstraint):
     per: float = eqx.field(static=True)
 
     drawn = None
-
-    @property
-    def num_rows(self):
-        return 1
-
-    @property
-    def relative(self):
-        return True
+    num_rows = 1
+    relative = True
 
     def _line(self) -> InPlane:
         return InPlane(self.point_a, self.point_b, self.axis_a)

@@ -37,10 +37,7 @@ class Gearing(AbstractConstraint):
     teeth: int = eqx.field(static=True)
 
     drawn = None
-
-    @property
-    def num_rows(self):
-        return 1
+    num_rows = 1
 
     @property
     def relative(self):
@@ -67,10 +64,7 @@ class FrictionGearing(AbstractVelocityConstraint):
 
     gears: Gearing
     drawn = None
-
-    @property
-    def num_rows(self):
-        return 1
+    num_rows = 1
 
     def fixed(self, kind, bodies="ab"):
         return self.gears.fixed(kind, bodies)

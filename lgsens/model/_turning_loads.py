@@ -92,10 +92,7 @@ class TorsionLoad(AbstractLoad):
 
     balanced = True
     drawn = None
-
-    @property
-    def acts_on(self):
-        return TURNING_A + TURNING_B
+    acts_on = TURNING_A + TURNING_B
 
     def value(self, a, b):
         """θ and ∂θ/∂q: with β = Cβ₀, C = R_aᵀR_b, and g = ∂θ/∂β, δβ = β × δθ_a + C (δθ_b × β₀)."""
@@ -146,10 +143,7 @@ class RotationLoad(AbstractClosedFormLoad):
 
     balanced = True
     drawn = None
-
-    @property
-    def acts_on(self):
-        return TURNING_A + TURNING_B
+    acts_on = TURNING_A + TURNING_B
 
     def _turned(self, a, b, va, vb):
         """Sᵀ, φ, SᵀT_aᵀΩ_a, ω and φ̇."""
@@ -209,10 +203,7 @@ class BallLoad(AbstractLoad):
 
     balanced = True
     drawn = None
-
-    @property
-    def acts_on(self):
-        return TURNING_A + TURNING_B
+    acts_on = TURNING_A + TURNING_B
 
     def branch(self, a, b):
         phi = rotation_between(a, self.triad_a, b, self.triad_b)
@@ -294,10 +285,7 @@ class FixedMoment(AbstractClosedFormLoad):
     signal: AbstractSignal
 
     drawn = None
-
-    @property
-    def acts_on(self):
-        return TURNING_B
+    acts_on = TURNING_B
 
     def force(self, a, b, va, vb, t):
         return self.signal(t) * embedded(b.local_axis(self.moment), ROTATION_B)

@@ -58,10 +58,7 @@ class ContactHeight(AbstractConstraint):
     displacement: Float[Array, ""]
 
     drawn = "tyre"
-
-    @property
-    def num_rows(self):
-        return 1
+    num_rows = 1
 
     @property
     def driven(self):
