@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._brief import brief
@@ -99,12 +100,17 @@ def joint_motions(
     wrenches = joint_wrenches(system, names, q, v, vdot, lam, t)
     whole, *motion = system.of_parts(q, v, vdot)
     moving = lambda body: whole.motion(whole.body_names.index(body), *motion)
-    at = lambda name, of: None if name is None else of(name)
+    axes = jnp.asarray(np.eye(3, dtype=lam.dtype))
+    still, upright = jnp.zeros((*t.shape, 3), lam.dtype), jnp.broadcast_to(axes, (*t.shape, 3, 3))
+    ground, at_rest = Frame(still[0], axes), (still, upright, *[still] * 4)
+    at = lambda name, of, ground: ground if name is None else of(name)
     found = {}
     for name, wrench in wrenches.items():
         joint = system.joints[name]
-        references, motions = ([at(end, of) for end in (joint.a, joint.b)] for of in (system.reference_frame, moving))
-        one = _joint_motion(joint.coordinates, joint.frames, references, motions, wrench, t)
+        references = [at(end, system.reference_frame, ground) for end in (joint.a, joint.b)]
+        motions = [at(end, moving, at_rest) for end in (joint.a, joint.b)]
+        centre = Frame(references[1].position, axes)
+        one = _joint_motion(joint.coordinates, joint.frames or (centre, centre), references, motions, wrench, t)
         in_order = lambda of, joint=joint: {s.name: of[s.name] for s in joint.coordinates}  # which `jit` forgets
         changed = {of: in_order(getattr(one, of)) for of in ("coordinates", "rates", "accelerations")}
         found[name] = one._replace(**changed)
@@ -114,25 +120,20 @@ def joint_motions(
 @partial(jax.jit, static_argnums=0)
 def _joint_motion(
     of: tuple[Coordinate, ...],
-    frames: tuple[Frame, Frame] | None,
-    references: Sequence[Frame | None],
-    motions: Sequence[tuple[Array, ...] | None],
+    frames: tuple[Frame, Frame],
+    references: Sequence[Frame],
+    motions: Sequence[tuple[Array, ...]],
     wrench: Float[Array, "n 6"],
     t: Float[Array, " n"],
 ) -> JointMotion:
     """The motion of a joint with these coordinates; one program for all alike.
 
     Arguments:
-        references, motions: of a and b, the frame in the reference configuration and the motion; None of the ground.
+        frames, references, motions: of a and b, that of the joint, their own in the reference configuration, and x, R,
+            ẋ, Ω, ẍ, Ω̇.
         wrench: the force on b, and its moment about the inertial origin.
     """
-    n, dtype = t.shape[0], wrench.dtype
-    still, upright = jnp.zeros((n, 3), dtype), jnp.broadcast_to(jnp.eye(3, dtype=dtype), (n, 3, 3))
-    ground = Frame(still[0], upright[0])
-    references = [ground if known is None else known for known in references]
-    motions = [(still, upright, *[still] * 4) if known is None else known for known in motions]
-    centre = Frame(references[1].position, ground.orientation)
-    found = relative_motion(of, frames or (centre, centre), references, motions)
+    found = relative_motion(of, frames, references, motions)
     columns = lambda values: {s.name: values[:, i] for i, s in enumerate(of)}
     coordinates, rates = columns(found.values), columns(found.rates)
     for s in of:
