@@ -81,7 +81,7 @@ def roughness(trajectory: Trajectory, told: Float[Array, " n"] | None = None) ->
     size = jnp.max(jnp.abs(a), axis=(0, 2))
     h = (trajectory.t[-1] - trajectory.t[0]) / (trajectory.t.shape[0] - 1)
     seen = jnp.maximum(size, _ROUND_OFF * jnp.finfo(size.dtype).eps / h**2)  # a uniform motion has none but that
-    begin = jnp.max(jnp.abs(a[1] - a[0]) / seen[None].T)
+    begin = jnp.max(jnp.abs(a[1] - a[0]) / seen[:, None])
     turns = jnp.any(jnp.max(jnp.abs(jnp.diff(a, 2, axis=0)), axis=2) > _AS_LARGE * seen[None], axis=1)
     none = jnp.zeros((2, a.shape[0], 0), bool)
     others = _beside_none(told, a.shape[0])
