@@ -77,6 +77,8 @@ def test_bad_input(vary, keep, message):
     [
         (["--keep", "toe=0.1"], "--keep is of an axle, with --vary"),
         (["--vary", "spring.stiffness=0.3", "--keep-toe", "0.1"], "--keep-toe is of a corner; of an axle"),
+        (["--vary", "spring.stiffness=0.3", "--parameters", "hardpoints"], "--parameters is of a corner; of an axle"),
+        (["--vary", "spring.stiffness=0.3", "--traction-share", "1.5"], "must be between 0 and 1, got 1.5"),
         (["--vary", "spring.stiffnes=0.3"], "'spring.stiffnes' matches no number of the axle"),
         (["--vary", "spring.stiffness=0.3", "--keep", "tow=0.1"], "'tow'"),
         (["--vary", "spring.stiffness"], "must be NAME=NUMBER or NAME=LOWER:UPPER, got 'spring.stiffness'"),

@@ -577,6 +577,11 @@ MISTAKES = {
             "does not twist as the car rolls",
         ),
     ),
+    "share of more than all": (
+        "multi_link",
+        {"vehicle": {"traction_share": 1.2}},
+        ("key 'vehicle.traction_share'", "0 and 1", "1.2"),
+    ),
     "stop on one": (
         "semi_trailing_arm",
         {"bump_stop.knuckle": [0.3, 0.8, 0.1]},
@@ -596,6 +601,22 @@ def test_what_no_axle_is(mistake, tmp_path):
     path = tmp_path / "mine.json"
     path.write_text(json.dumps(changed(document(name), changes)), encoding="utf-8")
     with pytest.raises(ValueError, match=says("Hardpoint file", "mine.json", *parts)):
+        Axle.load(path)
+
+
+def test_an_axle_that_is_not_driven(load):
+    axle = load(document("multi_link") | {"vehicle": {"traction_share": 0.0}})
+    assert axle.vehicle["traction_share"] == 0.0
+
+
+def test_how_files_are_encoded(tmp_path):
+    """With a byte-order mark, as some editors write it; in UTF-16 the message says what to do."""
+    path = tmp_path / "mine.toml"
+    text = (DATA / "mcpherson.toml").read_text(encoding="utf-8")
+    path.write_text(text, encoding="utf-8-sig")
+    assert Axle.load(path).left.links.keys() == Axle.load("mcpherson").left.links.keys()
+    path.write_text(text, encoding="utf-16")
+    with pytest.raises(ValueError, match=says("mine.toml", "cannot be read", "save it as UTF-8")):
         Axle.load(path)
 
 

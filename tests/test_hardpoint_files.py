@@ -28,7 +28,7 @@ def line(pattern):
 FILES = {
     "missing number": (r"^stiffness = 150000.*$", "", ("key 'tyre.stiffness'", "is missing", FORMAT)),
     "missing point": (r"^bearing = .*$", "", ("key 'wheel.bearing'", "is missing", FORMAT)),
-    "missing table": (r"^\[damper\]$", "[dampr]", ("key 'damper'", "is missing", FORMAT)),
+    "missing table": (r"^\[damper\]$", "[dampr]", ("key 'damper'", "is missing (is 'dampr' meant for it?)", FORMAT)),
     "missing point of a link": (
         r"^chassis = \[-8.8.*$",
         "",

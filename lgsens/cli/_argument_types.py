@@ -13,6 +13,9 @@ def _read(kind: Callable[[str], Any], text: str, what: str) -> Any:
         raise argparse.ArgumentTypeError(f"must be {what}, got {text!r}") from error
 
 
+DEFAULT_PARAMETERS = "k,c"  # of a corner, a key of `PARAMETERS`
+
+
 def positive(text: str) -> float:
     value = _read(float, text, "a number")
     if not (value > 0 and math.isfinite(value)):
@@ -24,6 +27,13 @@ def relative(text: str) -> float:
     value = positive(text)
     if value >= 1.0:
         raise argparse.ArgumentTypeError(f"must be less than 1, got {text}; it is relative")
+    return value
+
+
+def share(text: str) -> float:
+    value = _read(float, text, "a number")
+    if not 0.0 <= value <= 1.0:
+        raise argparse.ArgumentTypeError(f"must be between 0 and 1, got {text}")
     return value
 
 

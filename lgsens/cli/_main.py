@@ -15,7 +15,7 @@ import jax
 
 from lgsens._xla import compilation_cache
 from lgsens.cli import _curves, _doctor, _import, _kc, _optimize, _paper, _top, _tradeoff
-from lgsens.cli._argument_types import count, named, positive, relative, way
+from lgsens.cli._argument_types import DEFAULT_PARAMETERS, count, named, positive, relative, share, way
 from lgsens.cli._report import INTERRUPTED, UNFINISHED, interrupted, version
 from lgsens.examples import DEFAULT, PARAMETERS, shipped
 from lgsens.model import ISO_8608
@@ -67,7 +67,7 @@ class _Parser(argparse.ArgumentParser):
             metavar = "M" if "[m]" in meaning else "SHARE"
             self.add_argument(
                 f"--{name}",
-                type=way if name == "rack" else positive,
+                type=way if name == "rack" else positive if metavar == "M" else share,
                 metavar=metavar,
                 help=f"{of}{meaning} (default: {default})",
             )
@@ -94,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     optimize.resume()
     optimize.option(
         "--parameters",
-        "k,c",
+        DEFAULT_PARAMETERS,
         f"what to change, of stiffness k, damping c and chassis hardpoints: {' or '.join(PARAMETERS)}",
         choices=list(PARAMETERS),
         metavar="WHAT",

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens import plotting
+from lgsens.cli._argument_types import DEFAULT_PARAMETERS
 from lgsens.cli._kc import vehicle_options
 from lgsens.cli._report import asking_for, suspension_file
 from lgsens.cli._search import BUMP, Goal, Search, band_row, closing_rows, point_row, run_length, stages, table_lines
@@ -37,6 +38,8 @@ class AxleJob(NamedTuple):
         for name in ("road", "speed", "limit"):
             if getattr(arguments, name):
                 raise ValueError(f"--{name} is of a corner; an axle, with --vary, is designed over the bump alone")
+        if arguments.parameters != DEFAULT_PARAMETERS:
+            raise ValueError("--parameters is of a corner; of an axle, what is free is what --vary names")
         for name in ("camber", "toe"):
             if getattr(arguments, f"keep_{name}"):
                 raise ValueError(f"--keep-{name} is of a corner; of an axle, with --vary, it is --keep {name}=DEG")

@@ -142,7 +142,7 @@ def axle_members(root: Reader, kilogram: float, corner: Any) -> dict[str, Any]:
         table.only(("axle", *OF_VEHICLE, *SHARES))
         found["rear"] = "axle" not in table or table.choice("axle", ["front", "rear"]) == "rear"
         found["vehicle"] = {key: table.metres(key, most) for key, most in OF_VEHICLE.items() if key in table}
-        found["vehicle"] |= {key: table.number(key) for key in SHARES if key in table}
+        found["vehicle"] |= {key: table.share(key) for key in SHARES if key in table}
     return found
 
 

@@ -1,5 +1,6 @@
 """Reads hardpoint files, and says which key is missing or wrong."""
 
+import difflib
 import json
 import math
 import tomllib
@@ -60,7 +61,8 @@ class Reader:
 
     def _get(self, key: str, holds: Callable[[Any], bool], what: str) -> Any:
         if key not in self._table:
-            raise self.fail(key, f"is missing; {FORMAT}")
+            like = difflib.get_close_matches(key, self._table, n=1, cutoff=0.75)
+            raise self.fail(key, f"is missing{f' (is {like[0]!r} meant for it?)' if like else ''}; {FORMAT}")
         value = self._table[key]
         if not holds(value):
             raise self.fail(key, f"must be {what}, got {value!r}.")
@@ -89,6 +91,11 @@ class Reader:
         if positive:
             self._get(key, lambda value: value > 0, "positive")
         return as_float(value * scale, (), key)
+
+    def share(self, key: str) -> Array:
+        """A part of a whole, which may be none or all of it."""
+        self._get(key, lambda value: _is_number(value) and 0.0 <= value <= 1.0, "between 0 and 1")
+        return self.number(key, positive=False)
 
     def metres(self, key: str, most: float, positive: bool = True) -> Array:
         """A length in metres, which the unit of the file's points is not for; at most so much."""
@@ -247,8 +254,12 @@ def read(path: str | Path | None) -> tuple[dict, str]:
     else:
         name = str(path)
         try:
-            text = Path(path).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
+            text = Path(path).read_text(
+                encoding="utf-8-sig"
+            )  # with a byte-order mark, as Windows writes it, or without
+        except UnicodeDecodeError as error:
+            raise ValueError(f"Hardpoint file {name!r} cannot be read: {error}; save it as UTF-8.") from error
+        except OSError as error:
             raise ValueError(
                 f"Hardpoint file {name!r} cannot be read: {error}; those that ship with lgsens are {shipped()}."
             ) from error

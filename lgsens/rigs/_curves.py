@@ -41,9 +41,9 @@ the velocity of the wheel centre, d = ±ω/|ω| upward and c + ω × v/|ω|² is
     trail (caster offset)  (X − P)·X_T             positive with X in front of P
 
 Steering. The ratio is the turn of the steering wheel per mean steer angle. Ackermann compares with wheels whose axes
-meet on the line of the other axle, cot δ_o − cot δ_i = b/l for the outer and inner one: the share (cot δ_o −
-cot δ_i) l/b is 1 there and 0 for parallel steering, with angles from the middle of the sweep (without static toe). It
-is not determined, NaN, within half a degree of straight ahead.
+meet on the line of the other axle, cot δ_o − cot δ_i = b/l for the outer and inner one, b from contact to contact as
+they are then: the share (cot δ_o − cot δ_i) l/b is 1 there and 0 for parallel steering, with angles from the middle of
+the sweep (without static toe). It is not determined, NaN, within half a degree of straight ahead.
 
 Sources: ISO 8855:2011 (axes, angles, offsets, roll centre); Gillespie (1992), chapter 7 (anti-features, Ackermann);
 Reimpell, Stoll & Betzler (2001), chapter 3 (steering axis, roll centre, rates).
