@@ -53,6 +53,7 @@ def car():
     return leaning(QuarterCar.load())
 
 
+@pytest.mark.slow  # `test_positions_agree_with_the_closure` is in the quick run
 def test_curves_agree_with_the_closure(car):
     found, closure = car.curves(TRAVEL), Leaning(CAMBER, TOE)
     expected = np.array([closure.curves(s) for s in TRAVEL]).T

@@ -67,6 +67,7 @@ def test_errors_are_those_of_the_closed_form(table):
     assert explicit.error < 1e-4 * fine.error
 
 
+@pytest.mark.slow
 def test_settings_that_differ_in_numbers_share_their_programs(table, compiled):
     """Other steps, tolerances and damping, extrapolated or not: what the table has compiled serves them."""
     loose = lg.GeneralizedAlpha(0.7, tolerance=1e-6)
