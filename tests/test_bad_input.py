@@ -404,7 +404,6 @@ def test_a_state_that_is_no_configuration():
         run(lost)
 
 
-@pytest.mark.slow
 def test_steps_of_a_run_that_failed():
     model = pendulum(velocity=(1.0, 0.0, 0.0))
     short = lg.simulate(model, t1=3.0, num_steps=5, integrator=lg.AdaptiveSteps(tolerance=1e-8), throw=False)

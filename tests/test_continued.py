@@ -70,7 +70,6 @@ def test_a_state_alone_does_not_know_its_step():
     assert off(run) > 10.0 * off(half())
 
 
-@pytest.mark.slow  # `test_from_any_step_and_of_a_batch` is in the quick run
 def test_in_equal_steps_it_is_one_run():
     whole = lg.simulate(pendulum(), t1=END, num_steps=80)
     rest = lg.simulate(pendulum(), t0=HALF, t1=END, state0=half().continued(), **SCHEMES["as before"])
@@ -96,7 +95,7 @@ def test_a_step_that_is_not_there():
         half().continued(41)
 
 
-@pytest.mark.slow  # `test_from_any_step_and_of_a_batch` is in the quick run
+@pytest.mark.slow  # `test_in_equal_steps_it_is_one_run` is in the quick run
 @pytest.mark.parametrize("both", some_quick([False, True]), ids=["reverse", "forward too"])
 def test_derivatives_through_it_are_exact(both):
     """By a length, and by the time at which the size of the steps changes."""

@@ -209,7 +209,6 @@ def test_gradients_of_an_equilibrium_with_a_moving_driver():
     check_gradients(state, np.array([0.1, 1.3, 3.0, BEGUN]))
 
 
-@pytest.mark.slow
 def test_redundant_driver_has_no_motion_from_equilibrium():
     model = hung(np.array([0.1, 1.3, 3.0]))
     line = {"at_a": (0.0, 0.0, 1.0), "at_b": (0.0, 0.0, 0.0), "length": 1.0}  # holds the slide where the driver does

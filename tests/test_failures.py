@@ -253,7 +253,6 @@ def test_a_masked_run_that_did_not_begin_has_no_derivative(bad, result):
     assert slope > 0.0 and found == lg.RESULTS.successful
 
 
-@pytest.mark.slow
 def test_first_failure_of_a_batch_is_raised():
     trajectories = jax.jit(jax.vmap(fail))(jnp.asarray([0.0, 30.0]))
     positions = trajectories.body("bob").position
@@ -404,7 +403,6 @@ def test_double_precision_does_not_warn():
         fail(0.0)
 
 
-@pytest.mark.slow
 def test_times_far_from_zero_are_warned_of():
     """Seconds since 1970 are known to 2e-7 s, and a driver's acceleration at steps of 10 ms to nothing."""
     driver = lg.TranslationDriver(

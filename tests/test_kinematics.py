@@ -286,11 +286,10 @@ def test_out_of_reach():
 
 
 @pytest.mark.parametrize("derivative", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev])
-@pytest.mark.parametrize(
-    "begin", some_quick([1.5, 0.0])
-)  # at 1.5 rad a crank of 0.7 m and the rocker are too far apart at once
+@pytest.mark.parametrize("begin", some_quick([1.5, 0.0]))
 def test_what_is_asked_of_positions_that_there_are_not_has_no_derivative(begin, derivative):
-    """Nor is it zero where all rows are NaN; of a batch the others have theirs, by what all of them share."""
+    """Nor is it zero where all rows are NaN: at 1.5 rad a crank of 0.7 m and the rocker are too far apart at once. Of a
+    batch the others have theirs, by what all of them share."""
     angles = jnp.asarray(begin + np.linspace(0.0, 2.0, 3))
 
     def swing(a, rocker):

@@ -347,7 +347,6 @@ def test_without_joints_nothing_is_singular(factor_every):
     assert lg.simulate(stone, t1=0.1, num_steps=10, integrator=scheme).result == 0
 
 
-@pytest.mark.slow
 def test_friction_that_sticks_is_no_singular_configuration():
     """Where a driven slider turns round, the slope of its friction adds γ h μN/w₀ = 25 kg to the 0.1 kg of the matrix.
 

@@ -138,7 +138,6 @@ def test_one_factorization_for_all_parameters():
     assert factorizations(backward) == factorizations(forward) + 1
 
 
-@pytest.mark.slow
 def test_what_is_free_is_named():
     model = lever()
     wheel = lg.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), position=(1.0, 0.0, 0.0))

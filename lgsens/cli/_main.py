@@ -57,20 +57,15 @@ class _Parser(argparse.ArgumentParser):
         """What the rig is told of the car."""
         known = "that of the file, else"
         self.add_argument("--axle", choices=["rear", "front"], help=f"{of}which it is (default: {known} rear)")
-        for name, default, meaning in (
-            ("wheelbase", f"{known} 2.7", "of the car [m], for anti-features and Ackermann"),
-            ("centre-height", f"{known} 0.55", "of the car's centre of mass [m]"),
-            ("braking-share", f"{known} 0.5", "of this axle in the braking force"),
-            ("traction-share", f"{known} 1", "of this axle in the traction"),
-            ("rack", "its travel, or 0.06", "way of the rack [m]"),
+        for name, kind, default, meaning in (
+            ("wheelbase", positive, f"{known} 2.7", "of the car [m], for anti-features and Ackermann"),
+            ("centre-height", positive, f"{known} 0.55", "of the car's centre of mass [m]"),
+            ("braking-share", share, f"{known} 0.5", "of this axle in the braking force"),
+            ("traction-share", share, f"{known} 1", "of this axle in the traction"),
+            ("rack", way, "its travel, or 0.06", "way of the rack [m]"),
         ):
-            metavar = "M" if "[m]" in meaning else "SHARE"
-            self.add_argument(
-                f"--{name}",
-                type=way if name == "rack" else positive if metavar == "M" else share,
-                metavar=metavar,
-                help=f"{of}{meaning} (default: {default})",
-            )
+            text, metavar = f"{of}{meaning} (default: {default})", "SHARE" if kind is share else "M"
+            self.add_argument(f"--{name}", type=kind, metavar=metavar, help=text)
 
     def quiet(self, nothing: str) -> None:
         """`--quiet`."""

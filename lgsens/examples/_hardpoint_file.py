@@ -254,9 +254,7 @@ def read(path: str | Path | None) -> tuple[dict, str]:
     else:
         name = str(path)
         try:
-            text = Path(path).read_text(
-                encoding="utf-8-sig"
-            )  # with a byte-order mark, as Windows writes it, or without
+            text = Path(path).read_text(encoding="utf-8-sig")  # with a byte-order mark or without
         except UnicodeDecodeError as error:
             raise ValueError(f"Hardpoint file {name!r} cannot be read: {error}; save it as UTF-8.") from error
         except OSError as error:

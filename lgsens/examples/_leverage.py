@@ -18,7 +18,7 @@ from lgsens._validate import is_concrete
 from lgsens.examples._suspension_parts import PLANAR, Connection, Link, Strut, itself
 
 RATIOS = (0.1, 3.0)  # motion ratios that cars have; racing cars' rockers reach some 0.4 to 1.5
-LEAST_OF_BAR = 0.05  # travel of the end of a drop link along it, per wheel travel: on control arms 0.3 to 0.6
+LEAST_OF_BAR = 0.05  # travel of the end of a drop link along it, per wheel travel: with less a bar does next to nothing
 LEAST_ANGLE = math.radians(10.0)  # of a link to the plane of its universal joint's arms, where it would be singular
 SINGULAR = 1e8  # condition of the rows, at least
 

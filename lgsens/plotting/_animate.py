@@ -17,7 +17,7 @@ from lgsens.plotting._mechanism import draw, frame, view_of
 from lgsens.plotting._shapes import Shapes, corners, placed, shapes
 from lgsens.plotting._stress import ColourBeams, Stress, beam_stress, colour_bar, in_page
 from lgsens.plotting._style import ROAD, ROLES, figure
-from lgsens.simulation import Saved, Trajectory, one_motion
+from lgsens.simulation import Saved, Trajectory, require_one_motion
 
 SWEEP = 4.0  # seconds that a sweep through the positions of a kinematic analysis takes
 PER_SECOND = 30  # frames
@@ -120,7 +120,7 @@ def film(motion: Trajectory | Kinematics, speed: float, max_frames: int, colour_
     scene = scene_of(motion.system)
     if scene is None:
         raise ValueError(f"{wanted}that of a {type(motion.system).__name__}, which has no bodies.")
-    one_motion(motion, "motion")
+    require_one_motion(motion, "motion")
     if int(motion.result) != 0:
         raise ValueError("`motion` failed (its `result` is not 0), so it has no positions to draw from some frame on.")
     if isinstance(motion, Kinematics) and motion.values:

@@ -12,7 +12,7 @@ from lgsens.model import Model, MultibodySystem
 from lgsens.plotting._shapes import Shapes, corners, placed, shapes, stretched
 from lgsens.plotting._stress import ColourBeams, beam_stress, colour_bar
 from lgsens.plotting._style import COLOURS, ROLES, figure, legend_below
-from lgsens.simulation import AbstractRun, one_motion
+from lgsens.simulation import AbstractRun, require_one_motion
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -88,7 +88,8 @@ def _last(model: Model | AbstractRun) -> tuple[MultibodySystem, Any, Any, Any, A
     """The system of a scene, and q, v, λ and t with an axis of length 1: at rest in the reference configuration, or
     what a motion ends with."""
     if isinstance(model, AbstractRun):
-        system, states, t = one_motion(model, "models")
+        require_one_motion(model, "models")
+        system, states, t = model.of_bodies()
         if not finite(last := jax.tree.map(lambda leaf: leaf[-1:], (states.q, states.v, states.lam, t))):
             raise ValueError("`models`: a motion failed (its `result` is not 0), so it ends without positions to draw.")
         return system, *last

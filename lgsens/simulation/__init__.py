@@ -34,7 +34,7 @@ from lgsens.simulation._start import (
     initial_state as initial_state,
     on_joints as on_joints,
 )
-from lgsens.simulation._tables import one_motion as one_motion
+from lgsens.simulation._tables import require_one_motion as require_one_motion
 from lgsens.simulation._to_accuracy import Compared as Compared, aligned as aligned, to_accuracy as to_accuracy
 from lgsens.simulation._trajectory import (
     AbstractMotion as AbstractMotion,

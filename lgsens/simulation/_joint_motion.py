@@ -1,16 +1,13 @@
 """The motion of a joint: its relative coordinates, and the force and moment that it transmits."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._brief import brief
-from lgsens.model import Coordinate, Frame, MultibodySystem, continued, joint_wrenches, relative_motion
+from lgsens.model import AbstractJoint, Frame, MultibodySystem, continued, joint_wrenches, relative_motion
 
 
 class JointMotion(NamedTuple):
@@ -100,43 +97,34 @@ def joint_motions(
     wrenches = joint_wrenches(system, names, q, v, vdot, lam, t)
     whole, *motion = system.of_parts(q, v, vdot)
     moving = lambda body: whole.motion(whole.body_names.index(body), *motion)
-    axes = jnp.asarray(np.eye(3, dtype=lam.dtype))
-    still, upright = jnp.zeros((*t.shape, 3), lam.dtype), jnp.broadcast_to(axes, (*t.shape, 3, 3))
-    ground, at_rest = Frame(still[0], axes), (still, upright, *[still] * 4)
-    at = lambda name, of, ground: ground if name is None else of(name)
-    found = {}
-    for name, wrench in wrenches.items():
-        joint = system.joints[name]
-        references = [at(end, system.reference_frame, ground) for end in (joint.a, joint.b)]
-        motions = [at(end, moving, at_rest) for end in (joint.a, joint.b)]
-        centre = Frame(references[1].position, axes)
-        one = _joint_motion(joint.coordinates, joint.frames or (centre, centre), references, motions, wrench, t)
-        in_order = lambda of, joint=joint: {s.name: of[s.name] for s in joint.coordinates}  # which `jit` forgets
-        changed = {of: in_order(getattr(one, of)) for of in ("coordinates", "rates", "accelerations")}
-        found[name] = one._replace(**changed)
-    return found
+    known, reference = system.joints, system.reference_frame
+    return {name: _joint_motion(known[name], moving, reference, wrench, t) for name, wrench in wrenches.items()}
 
 
-@partial(jax.jit, static_argnums=0)
 def _joint_motion(
-    of: tuple[Coordinate, ...],
-    frames: tuple[Frame, Frame],
-    references: Sequence[Frame],
-    motions: Sequence[tuple[Array, ...]],
+    joint: AbstractJoint,
+    body: Callable[[str], tuple[Array, ...]],
+    reference: Callable[[str], Frame],
     wrench: Float[Array, "n 6"],
     t: Float[Array, " n"],
 ) -> JointMotion:
-    """The motion of a joint with these coordinates; one program for all alike.
+    """The motion of a joint.
 
     Arguments:
-        frames, references, motions: of a and b, that of the joint, their own in the reference configuration, and x, R,
-            ẋ, Ω, ẍ, Ω̇.
+        body, reference: the motion of a body by its name, and its frame in the reference configuration.
         wrench: the force on b, and its moment about the inertial origin.
     """
-    found = relative_motion(of, frames, references, motions)
-    columns = lambda values: {s.name: values[:, i] for i, s in enumerate(of)}
+    n, dtype = t.shape[0], wrench.dtype
+    still, upright = jnp.zeros((n, 3), dtype), jnp.broadcast_to(jnp.eye(3, dtype=dtype), (n, 3, 3))
+    ground = Frame(still[0], upright[0])
+    references = [ground if name is None else reference(name) for name in (joint.a, joint.b)]
+    motions = [(still, upright, *[still] * 4) if name is None else body(name) for name in (joint.a, joint.b)]
+    centre = Frame(references[1].position, ground.orientation)
+    frames = joint.frames or (centre, centre)
+    found = relative_motion(joint.coordinates, frames, references, motions)
+    columns = lambda of: {s.name: of[:, i] for i, s in enumerate(joint.coordinates)}
     coordinates, rates = columns(found.values), columns(found.rates)
-    for s in of:
+    for s in joint.coordinates:
         if s.periodic:
             coordinates[s.name] = continued(coordinates[s.name], rates[s.name], t)
     force = wrench[:, :3]

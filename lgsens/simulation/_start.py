@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from lgsens._validate import as_float, is_concrete
+from lgsens._validate import all_finite, as_float, is_concrete
 from lgsens._xla import alike
 from lgsens.dynamics import (
     RESULTS,
@@ -113,13 +113,13 @@ def check_state0(
     if not is_concrete(known):
         _as_state(system, state0, name)
         return
-    off = jax.tree.map(np.asarray, _off_jit(known[0], known[1], known[2], exactly))
-    time = f"t0 = {float(known[2]):.6g} s"
-    if not finite(known[1]):
+    if not all_finite(known[1]):
         raise ValueError(
             f"`{name}` is not finite, as states are from the step on at which a run fails: `result` says of that one "
             "whether and why it did."
         )
+    off = jax.tree.map(np.asarray, _off_jit(known[0], known[1], known[2], exactly))
+    time = f"t0 = {float(known[2]):.6g} s"
     if not off.known:
         raise ValueError(
             f"`{name}` is no configuration: the orientation of a body is not a rotation matrix, as a mean of several "

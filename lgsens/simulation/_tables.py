@@ -42,9 +42,9 @@ class Quantity(NamedTuple):
             yield "".join(f".{label}" for label in labels), self.values[(slice(None), *index)]
 
 
-def one_motion(run: Any, what: str) -> tuple[Any, Any, Any]:
-    """`run.of_bodies()` of a motion that is written or drawn; `what` asks, for messages."""
-    system, states, t = run.of_bodies()
+def require_one_motion(run: Any, what: str) -> None:
+    """Raise `ValueError` for a motion that is traced or a batch, where one is written or drawn; `what` asks."""
+    states, t = run._kinematics()
     if not is_concrete(t, states):
         raise ValueError(f"`{what}`: the motion is traced; return it from `jit`, `grad` or `vmap`, and ask there.")
     if t.ndim != 1:
@@ -52,12 +52,12 @@ def one_motion(run: Any, what: str) -> tuple[Any, Any, Any]:
             f"`{what}`: this is a batch of motions, of shape {t.shape[:-1]}; ask each of them: "
             "jax.tree.map(lambda leaf: leaf[i], trajectories)."
         )
-    return system, states, t
 
 
 def quantities(run: Any, what: str) -> dict[str, Quantity]:
     """Everything of a motion by name, "top.position"; `what` asks, for messages."""
-    system = one_motion(run, what)[0]
+    require_one_motion(run, what)
+    system = run.of_bodies()[0]
     whole = system.whole
     found: dict[str, Quantity] = {}
     vector: Axes = {"axis": _AXES}

@@ -251,7 +251,6 @@ def test_error_control_sees_what_comes(name):
             assert np.abs(np.asarray(run.t) - edge).min() < 1e-12
 
 
-@pytest.mark.slow
 def test_tables_of_many_samples_are_left_to_the_error_control():
     n = MANY + 10
     road = lg.SampledRoad(np.linspace(0.0, 1.0, n), 1e-3 * np.sin(np.linspace(0.0, 6.0, n)))

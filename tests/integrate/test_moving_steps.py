@@ -255,7 +255,6 @@ def test_pieces_of_equal_steps_are_two_in_the_rule_of_fourth_order():
     np.testing.assert_allclose(slope, jax.grad(exact)(0.5), rtol=1e-11)
 
 
-@pytest.mark.slow
 def test_steps_of_one_scene_in_another():
     """With as many breaks steps end at those; with others, they are of the given sizes."""
     first = lg.Ramp(end=1.0, t_start=0.2, duration=0.3)
