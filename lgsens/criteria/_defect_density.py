@@ -16,7 +16,7 @@ Hutchinson, Communications in Statistics 19 (1990) 433 (norms from random direct
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -33,6 +33,25 @@ from lgsens.simulation import Trajectory
 _DIRECTIONS = 8
 
 
+class Densities(NamedTuple):
+    """Errors that add up over the n steps of a run, and what c criteria would be without them.
+
+    Attributes:
+        rows: relative to each criterion; the first is η_n/|Ψ|, the squares of the k others add up to that of dη_n/dp
+            over |dΨ/dp|.
+        values: Ψ + Σ_n η_n.
+        slopes: their products with the directions.
+        directions: d_k.
+        trajectory: the run.
+    """
+
+    rows: Float[Array, "c 1+k n"]
+    values: Float[Array, " c"]
+    slopes: Float[Array, "c k"]
+    directions: Float[Array, "k p"]
+    trajectory: Trajectory
+
+
 @eqx.filter_jit
 def defect_densities(
     criteria: tuple[Criterion, ...],
@@ -43,11 +62,8 @@ def defect_densities(
     t1,
     num_steps: int,
     scheme: AbstractScheme,
-) -> tuple[Float[Array, "c k n"], Trajectory]:
-    """Rows of errors that add up over the n steps, relative to each of c criteria, and the run in equal steps.
-
-    The first of the k rows is η_n/|Ψ|; the squares of the others add up to that of dη_n/dp over |dΨ/dp|.
-    """
+) -> Densities:
+    """Of a run in equal steps."""
     # in this program, so that what is refused is so before anything is compiled
     motion = unpacked(known_motion(build, start, p, t0, t1, num_steps, scheme))
     known = motion.known
@@ -90,7 +106,9 @@ def defect_densities(
     relative = lambda rows, to: rows / jnp.where(to == 0.0, 1.0, to)  # NaN where a value or a gradient is
     of_values = relative(eta, jnp.abs(values)[:, None])[:, None]
     of_gradients = relative(jnp.moveaxis(d_eta, 0, 1), norms[:, None, None])
-    return jnp.concatenate([of_values, of_gradients], axis=1), trajectory
+    rows = jnp.concatenate([of_values, of_gradients], axis=1)
+    slopes = jnp.moveaxis(d_values + jnp.sum(d_eta, axis=2), 0, 1)
+    return Densities(rows, values + jnp.sum(eta, axis=1), slopes, along, trajectory)
 
 
 def _missed_by_rule(criterion: Criterion, trajectory: Trajectory, p) -> Float[Array, " n"]:

@@ -7,7 +7,7 @@ of a scheme of order two being h³ times functions of time,
 
 **Regardless of signs** the largest bound, ∫ |c| h² dt with |c|² = Σ_k c_k², is least for a given number of steps where
 h ∝ |c|^{−1/3}: every step adds as much. |c| is taken as its largest value nearby, and no step is longer than about
-three of the pilot's, which resolves the motion also where no criterion looks.
+so many of the pilot's, which resolves the motion also where no criterion looks.
 
 **With signs.** Defects oscillate with the motion, and most of them cancel, in steps whose sizes follow |c| by chance.
 The steps are laid in up to 32 plateaus of equal ones (a change of size costs a factorization), and the logarithms x of
@@ -29,9 +29,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-LONGEST = 3  # steps of the pilot
 _PLATEAUS = 32
-_LEAST = 3  # steps in each
+_LEAST = 2  # steps in each
 _NEARBY = 1 / 60  # of the run
 _HELD = 0.1  # μ
 _ITERATIONS = 30
@@ -45,18 +44,19 @@ class Placed(NamedTuple):
     bounds: Float[Array, " r"]
 
 
-def placed_steps(rows: Float[Array, "r n"], num_steps: int) -> Placed:
-    """The sizes of so many steps; where no row says anything, or one is not finite, equal ones."""
+def placed_steps(rows: Float[Array, "r n"], num_steps: int, longest: int) -> Placed:
+    """The sizes of so many steps, none longer than so many of the pilot's; where no row says anything, or one is not
+    finite, equal ones."""
     plateaus = min(_PLATEAUS, 2 ** int(np.log2(max(num_steps / _LEAST, 1))))  # few programs
     counts = np.full(plateaus, num_steps // plateaus)
     counts[: num_steps % plateaus] += 1
     steps = jnp.asarray(counts, rows.dtype)
-    lengths, errors, bounds = _plateaus(rows, steps)
+    lengths, errors, bounds = _plateaus(rows, steps, longest)
     return Placed(jnp.repeat(lengths / steps, counts, total_repeat_length=num_steps), errors, bounds)
 
 
 @eqx.filter_jit
-def _plateaus(rows: Float[Array, "r n"], counts: Float[Array, " j"]):
+def _plateaus(rows: Float[Array, "r n"], counts: Float[Array, " j"], longest: int):
     """The lengths of plateaus with so many steps each, as fractions of the run, the errors and their bounds."""
     n, num_steps = rows.shape[1], jnp.sum(counts)
     edges = jnp.linspace(0.0, 1.0, n + 1, dtype=rows.dtype)
@@ -66,7 +66,7 @@ def _plateaus(rows: Float[Array, "r n"], counts: Float[Array, " j"]):
     size = jnp.pad(jnp.linalg.norm(rows, axis=0), width, mode="edge")
     weight = jnp.cbrt(jnp.max(jnp.stack([size[k : k + n] for k in range(2 * width + 1)]), axis=0))
     for _ in range(4):  # what is lifted raises the mean
-        weight = jnp.maximum(weight, jnp.minimum(n / (LONGEST * num_steps), 1.0) * jnp.mean(weight))
+        weight = jnp.maximum(weight, jnp.minimum(n / (longest * num_steps), 1.0) * jnp.mean(weight))
     weight = jnp.where(jnp.all(weight > 0.0), weight, 1.0)  # NaN is not
     ends = until(weight)
     first = jnp.diff(jnp.interp(until(counts) / num_steps, ends / ends[-1], edges))

@@ -6,18 +6,23 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from lgsens._brief import brief
 from lgsens._validate import as_count, as_parameters, is_concrete
 from lgsens.criteria._criterion import Criterion
-from lgsens.criteria._defect_density import defect_densities
-from lgsens.criteria._placed_steps import LONGEST, Placed, placed_steps
-from lgsens.dynamics import State
+from lgsens.criteria._defect_density import Densities, defect_densities
+from lgsens.criteria._differentiate import differentiate
+from lgsens.criteria._placed_steps import Placed, placed_steps
+from lgsens.dynamics import RESULTS, State
 from lgsens.integrate import AbstractScheme, GeneralizedAlpha, GivenSteps
 from lgsens.simulation import interval, raise_if_failed
 
 _LEAST_STEPS = 8
+_LONGEST = 3  # steps of the pilot
+_LONG = ((8, 1.0), (_LONGEST, 2.0), (1, np.inf))  # and times the tolerance that a run in such steps may be away
+_KNOWN = 0.1  # of the errors of the pilot, to which these are known
 _UNRESOLVED = 0.5  # relative error of a pilot run whose estimates are worth nothing
 _UNCANCELLED = 0.03  # of what adds up regardless of signs: these are known to leading order, of the pilot's motion
 _MOST = 100_000
@@ -73,13 +78,16 @@ def steps_for(
         integrator: the scheme, of order 2 with `defects`: `GeneralizedAlpha` of index 3, without forces that depend on
             multipliers.
 
-    From the pilot run, its adjoint variables and eight derivatives of what they say of its defects; no other run. The
-    steps are those for the numbers p: they serve designs nearby, as smoothly as equal ones, and derivatives on them are
-    exact. None is longer than about three of the pilot's, where no criterion looks. The errors are estimates to leading
-    order, with 3 % of what adds up regardless of signs on top. `AdaptiveSteps` has steps for the motion.
+    From the pilot run, its adjoint variables and eight derivatives of what they say of its defects. The steps are those
+    for the numbers p: they serve designs nearby, as smoothly as equal ones, and derivatives on them are exact. The
+    errors are estimates to leading order, with 3 % of what adds up regardless of signs on top. With a `tolerance` steps
+    may be eight of the pilot's where no criterion looks: `differentiate` on them, which compiles what is called next
+    anyway, says whether Ψ and dΨ/dp are within it of what the pilot says without its errors. If not, or if the run
+    fails, none is longer than three, and one if that is twice as far away. `AdaptiveSteps` has steps for the motion.
 
-    With `num_steps` it may be inside of `jit` and `vmap`, which gives each design its own steps; those are constants
-    for derivatives. If the pilot fails there, the steps are equal ones.
+    With `num_steps` no step is longer than about three of the pilot's, and nothing else is run. It may be inside of
+    `jit` and `vmap` then, which gives each design its own steps; those are constants for derivatives. If the pilot
+    fails there, the steps are equal ones.
 
     Raises `ValueError` for criteria that are no `Criterion`, both or none of `tolerance` and `num_steps`, a pilot of
     fewer than eight steps or one that does not resolve what is asked for, another scheme, and a tolerance that takes
@@ -98,10 +106,10 @@ def steps_for(
             "Give either `tolerance`, the relative error of values and gradients that is wanted, or `num_steps`, how "
             f"many steps there are to be; got tolerance={tolerance!r}, num_steps={num_steps!r}."
         )
-    if num_steps is not None and as_count(num_steps, "num_steps", " (it is static)") < _fewest(pilot):
+    if num_steps is not None and as_count(num_steps, "num_steps", " (it is static)") < _fewest(pilot, _LONGEST):
         raise ValueError(
-            f"`num_steps` = {num_steps} is too few beside a pilot of {pilot} steps: none may be longer than {LONGEST} "
-            f"of those; give at least {_fewest(pilot)}, or a pilot of fewer steps if that resolves the motion."
+            f"`num_steps` = {num_steps} is too few beside a pilot of {pilot} steps: none may be longer than {_LONGEST} "
+            f"of those; give at least {_fewest(pilot, _LONGEST)}, or a pilot of fewer steps if that resolves it all."
         )
     if tolerance is not None and not (isinstance(tolerance, float | int) and 0.0 < tolerance < 1.0):
         raise ValueError(f"`tolerance` must be a number between 0 and 1, got {tolerance!r}.")
@@ -112,20 +120,39 @@ def steps_for(
         )
     t0, t1 = interval(t0, t1)
     p, t0, t1 = jax.lax.stop_gradient((as_parameters(p), t0, t1))  # and below what `build` has from elsewhere
-    rows, trajectory = jax.lax.stop_gradient(
-        defect_densities(tuple(leaves), build, state0, p, t0, t1, pilot, integrator)
-    )
-    if is_concrete(rows, trajectory.result):
-        raise_if_failed(trajectory)
-        _check_resolved(rows, pilot)
+    found = jax.lax.stop_gradient(defect_densities(tuple(leaves), build, state0, p, t0, t1, pilot, integrator))
+    if is_concrete(found.rows, found.trajectory.result):
+        raise_if_failed(found.trajectory)
+        _check_resolved(found.rows, pilot)
     elif tolerance is not None:
         raise ValueError("`tolerance`: inside of `jit` and `vmap` the number of steps must be known; give `num_steps`.")
-    flat = rows.reshape(-1, pilot)
-    if tolerance is not None:
-        num_steps = _enough(flat, rows.shape[0], float(tolerance), pilot)
-    placed = placed_steps(flat, as_count(num_steps, "num_steps"))
-    of_values, of_gradients = (structure.unflatten(list(part)) for part in _expected(placed, len(leaves)))
-    return PlacedSteps(GivenSteps(placed.fractions, integrator, fixed=True), of_values, of_gradients)
+    run = lambda steps: differentiate(
+        criteria, build, p, t0=t0, t1=t1, num_steps=steps.num_steps, integrator=steps, state0=state0, throw=False
+    )
+    given = lambda placed: GivenSteps(placed.fractions, integrator, fixed=True)
+    rows, count = found.rows.reshape(-1, pilot), len(leaves)
+    for longest, factor in _LONG if tolerance is not None else ((_LONGEST, np.inf),):
+        number = num_steps if tolerance is None else _enough(rows, count, float(tolerance), pilot, longest)
+        placed = placed_steps(rows, as_count(number, "num_steps"), longest)
+        if factor == np.inf:
+            break
+        one = run(given(placed))
+        each = (structure.flatten_up_to(part) for part in one[:2])
+        if int(one.result) == RESULTS.successful and _confirmed(found, factor * tolerance, *each):
+            break
+    of_values, of_gradients = (structure.unflatten(list(part)) for part in _expected(placed, count))
+    return PlacedSteps(given(placed), of_values, of_gradients)
+
+
+def _confirmed(pilot: Densities, most: float, values, gradients) -> bool:
+    """Whether those of another run are so near to what the pilot says without its errors, as far as it knows."""
+    slopes = np.stack([ravel_pytree(each)[0] for each in gradients]) @ np.asarray(pilot.directions).T
+    size = lambda rows: np.linalg.norm(rows, axis=1)
+    relative = lambda away, whole: size(away) / np.where(size(whole) == 0.0, 1.0, size(whole))
+    value, slope, rows = (np.asarray(part) for part in (pilot.values[:, None], pilot.slopes, np.sum(pilot.rows, 2)))
+    away = relative(np.stack(values)[:, None] - value, value), relative(slopes - slope, slope)
+    known = np.abs(rows[:, 0]), size(rows[:, 1:])
+    return all(np.all(found <= most + _KNOWN * own) for found, own in zip(away, known))  # NaN is not
 
 
 def _expected(placed: Placed, count: int) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
@@ -147,13 +174,14 @@ def _check_resolved(rows, pilot: int) -> None:
         )
 
 
-def _enough(rows, count: int, tolerance: float, pilot: int) -> int:
+def _enough(rows, count: int, tolerance: float, pilot: int, longest: int) -> int:
     """A number of steps whose expected errors have the tolerance, and not one that is 5 % less, by bisection."""
 
     def reached(num_steps: int) -> bool:
-        return max(float(jnp.max(part)) for part in _expected(placed_steps(rows, num_steps), count)) <= tolerance
+        expected = _expected(placed_steps(rows, num_steps, longest), count)
+        return max(float(jnp.max(part)) for part in expected) <= tolerance
 
-    fewest = most = _fewest(pilot)
+    fewest = most = _fewest(pilot, longest)
     while not reached(most):
         fewest, most = most, 2 * most
         if most > _MOST:
@@ -167,5 +195,5 @@ def _enough(rows, count: int, tolerance: float, pilot: int) -> int:
     return most
 
 
-def _fewest(pilot: int) -> int:
-    return max(-(-pilot // LONGEST), _LEAST_STEPS)
+def _fewest(pilot: int, longest: int) -> int:
+    return max(-(-pilot // longest), _LEAST_STEPS)

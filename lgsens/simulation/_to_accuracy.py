@@ -57,11 +57,13 @@ class Compared(NamedTuple):
         distance: of a result from a finer one, relative as the accuracy is.
         extrapolated: of two or three results, each in twice as many steps as the one before.
         runs: the most that are extrapolated, 3 at most; 1: none are.
+        best: whether of results that are accurate enough that with the least error is taken, not the first.
     """
 
     distance: Callable[[Any, Any], float]
     extrapolated: Callable[[Sequence[Any]], Any]
     runs: int = 3
+    best: bool = False
 
 
 def to_accuracy(
@@ -113,10 +115,12 @@ def _reached(results, tried, compared: Compared, accuracy: float, integrator) ->
     if len(results) < 3 or len(distances) < 2:
         return None
     levels = _levels(results, distances, compared, integrator.scheme.convergence_order)
-    for runs, (result, error) in enumerate(levels, 1):
-        if error <= accuracy:
-            return result, Reached(accuracy, float(error), tried[-1][0], runs, integrator, tuple(tried))
-    return None
+    enough = ((error, runs, result) for runs, (result, error) in enumerate(levels, 1) if error <= accuracy)
+    one = min(enough, key=lambda one: one[0], default=None) if compared.best else next(enough, None)
+    if one is None:
+        return None
+    error, runs, result = one
+    return result, Reached(accuracy, float(error), tried[-1][0], runs, integrator, tuple(tried))
 
 
 def _levels(results, distances, compared: Compared, order: int) -> Iterator[tuple[Any, float]]:

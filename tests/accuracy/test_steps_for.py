@@ -6,10 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import says
+from jax.flatten_util import ravel_pytree
 from oscillator import CRITERION, T1, P, V, build, exact
 
 import lgsens as lg
-from lgsens.criteria._defect_density import defect_densities
+from lgsens.criteria._defect_density import Densities, defect_densities
+from lgsens.criteria._steps_for import _confirmed
+from lgsens.examples import PROBLEMS
 
 CENTRE, WIDTH = 0.3, 0.05
 EARLY = lg.Criterion(integrand=lambda s, p: window(s.t) * (s.body("mass").position[2] - 1.0) ** 2)
@@ -70,7 +73,7 @@ def test_densities_add_up_to_the_errors_of_a_certificate():
     """Signed: η_n by adjoint variables, and by the corrected run as a whole."""
     numbers = jax.tree.map(jnp.asarray, P)
     begin, end = jnp.zeros(()), jnp.asarray(T1)
-    rows, _ = defect_densities((EARLY,), build, None, numbers, begin, end, PILOT, lg.GeneralizedAlpha())
+    rows = defect_densities((EARLY,), build, None, numbers, begin, end, PILOT, lg.GeneralizedAlpha()).rows
     one = lg.certify(EARLY, build, P, t1=T1, num_steps=PILOT)
     of_value, of_gradient = one.relative
     assert np.sign(rows[0, 0].sum()) == np.sign(one.value_error)
@@ -85,6 +88,43 @@ def test_a_tolerance_is_reached(early):
     assert max(relative_errors(found.integrator, found.num_steps)) <= 3e-4
     fewer = lg.steps_for(EARLY, build, P, num_steps=int(0.8 * found.num_steps), **SCENE)
     assert max(float(fewer.value_error), float(fewer.gradient_error)) > 3e-4  # so many were needed
+
+
+def test_a_run_that_is_elsewhere_does_not_confirm_its_steps():
+    """Two criteria, of two parameters, on a pilot whose own errors are 1e-3 of values and gradients."""
+    rows = jnp.full((2, 3, PILOT), 1e-3 / PILOT)
+    values, slopes = jnp.asarray([2.0, -3.0]), jnp.asarray([[1.0, 0.5], [0.3, 4.0]])
+    pilot = Densities(rows, values, slopes, jnp.eye(2), None)
+    confirmed = lambda values, slopes: _confirmed(pilot, 3e-3, list(values), [{"a": a, "b": b} for a, b in slopes])
+    allowed = 3e-3 + 0.1 * 1e-3 * np.asarray([1.0, np.sqrt(2.0)])  # gradients by norms
+    assert confirmed(values, slopes)
+    for factor, holds in ((0.99, True), (1.01, False)):
+        off = values.at[1].multiply(1.0 + factor * allowed[0])
+        assert confirmed(off, slopes) == holds
+        turned = slopes.at[0].add(factor * allowed[1] * jnp.asarray([-0.5, 1.0]))  # as long as itself
+        assert confirmed(values, turned) == holds
+    assert not confirmed(values.at[0].set(jnp.nan), slopes)
+    assert not confirmed(values, slopes.at[1, 1].set(jnp.nan))
+
+
+@pytest.mark.slow  # of quick ones, whether steps are confirmed
+@pytest.mark.parametrize(
+    ("name", "least", "most"), [("simple_pendulum_A01", 1.0, 1.5), ("slider_crank_sundials", 6.0, 10.0)]
+)
+def test_steps_behind_a_criterion_are_as_long_as_the_motion_lets_them(name, least, most):
+    """A criterion that looks at the begin. Newton's iteration fails in steps of three of the pilot's on the pendulum;
+    the crank takes eight."""
+    problem = PROBLEMS[name]
+    p = jax.tree.map(lambda value: jnp.asarray(value, float), problem.parameters)
+    look = lambda s, p: jnp.exp(-(((s.t / problem.t1 - 0.1) / 0.03) ** 2)) * jnp.sum(s.state.v**2)
+    criterion, scheme = lg.Criterion(integrand=look), lg.GeneralizedAlpha(problem.rho_inf)
+    pilot = problem.num_steps // 2
+    steps = lg.steps_for(criterion, problem.build, p, t1=problem.t1, pilot=pilot, tolerance=1e-3, integrator=scheme)
+    assert least <= float(steps.integrator.fractions.max()) * pilot <= most
+    of = lambda n, how: lg.differentiate(criterion, problem.build, p, t1=problem.t1, num_steps=n, integrator=how)[:2]
+    for found, true in zip(of(steps.num_steps, steps.integrator), of(16 * problem.num_steps, scheme)):
+        found, true = (np.asarray(ravel_pytree(part)[0]) for part in (found, true))
+        assert np.linalg.norm(found - true) <= 1e-3 * np.linalg.norm(true)
 
 
 @pytest.mark.slow  # programs of two criteria, and of a batch

@@ -13,6 +13,7 @@ from jax.flatten_util import ravel_pytree
 from oscillator import CRITERION, T1, P, build, exact
 
 import lgsens as lg
+from lgsens.criteria import differentiate_to
 from lgsens.dynamics import RESULTS
 from lgsens.examples import PROBLEMS
 from lgsens.simulation import Compared, to_accuracy
@@ -32,33 +33,22 @@ def sequence(error, runs=3):
     return run, Compared(distance, extrapolated, runs)
 
 
+ERRORS = {
+    "h²": lambda n: 30.0 / n**2,
+    "h² and h³": lambda n: 30.0 / n**2 + 4e3 / n**3,
+    "h² and h⁴": lambda n: -30.0 / n**2 + 1e5 / n**4,
+    "h² and h⁴, little h³": lambda n: -30.0 / n**2 + 2.0 / n**3 + 1e5 / n**4,
+    "h² and h⁴ of a size that changes": lambda n: -30.0 / n**2 + 1e5 / n**4 * (1.0 + 0.3 * np.sin(n)),
+    "an edge between times": lambda n: 30.0 / n**2 + 6.0 * (0.37 * n % 1.0) / n**2,
+    "h": lambda n: 2.0 / n + 30.0 / n**2,
+    "another branch at first": lambda n: (1.0 if n < 100 else 0.0) + 30.0 / n**2,
+    "coarse runs are accidents": lambda n: 0.3 * np.sin(n) if n < 1000 else 30.0 / n**2,
+}
+
+
 @pytest.mark.parametrize("runs", [1, 2, 3])
 @pytest.mark.parametrize("accuracy", [1e-2, 1e-4, 1e-6, 1e-9])
-@pytest.mark.parametrize(
-    "error",
-    [
-        lambda n: 30.0 / n**2,
-        lambda n: 30.0 / n**2 + 4e3 / n**3,
-        lambda n: -30.0 / n**2 + 1e5 / n**4,
-        lambda n: -30.0 / n**2 + 2.0 / n**3 + 1e5 / n**4,
-        lambda n: -30.0 / n**2 + 1e5 / n**4 * (1.0 + 0.3 * np.sin(n)),
-        lambda n: 30.0 / n**2 + 6.0 * (0.37 * n % 1.0) / n**2,
-        lambda n: 2.0 / n + 30.0 / n**2,
-        lambda n: (1.0 if n < 100 else 0.0) + 30.0 / n**2,
-        lambda n: 0.3 * np.sin(n) if n < 1000 else 30.0 / n**2,
-    ],
-    ids=[
-        "h²",
-        "h² and h³",
-        "h² and h⁴",
-        "h² and h⁴, little h³",
-        "h² and h⁴ of a size that changes",
-        "an edge between times",
-        "h",
-        "another branch at first",
-        "coarse runs are accidents",
-    ],
-)
+@pytest.mark.parametrize("error", ERRORS.values(), ids=ERRORS)
 def test_never_worse_than_asked(error, accuracy, runs):
     try:
         found, reached = to_accuracy(*sequence(error, runs), accuracy, lg.GeneralizedAlpha())
@@ -69,6 +59,32 @@ def test_never_worse_than_asked(error, accuracy, runs):
     assert abs(found.value - 1.0) <= accuracy
     assert reached.error <= accuracy
     assert reached.error > 0.4 * abs(found.value - 1.0) - 1e-15  # of two runs in three the ratio is not yet 4
+
+
+@pytest.mark.parametrize("accuracy", [1e-2, 1e-4, 1e-6, 1e-8])
+@pytest.mark.parametrize("error", ERRORS.values(), ids=ERRORS)
+def test_the_cheapest_setting_has_what_is_asked_too(error, accuracy):
+    def run(n, throw):
+        value = np.asarray(1.0 + error(n))
+        return lg.Sensitivities(value, value, lg.AdjointVariable(), RESULTS.successful)
+
+    try:
+        found = differentiate_to(run, accuracy, lg.GeneralizedAlpha(), None, extrapolate=True)
+    except lg.SimulationError:
+        assert abs(error(2**17)) > accuracy / 4.0
+        return
+    assert abs(found.value - 1.0) <= accuracy
+    assert found.reached.error > 0.4 * abs(found.value - 1.0) - 1e-15  # as above
+    first = to_accuracy(*sequence(error), accuracy, lg.GeneralizedAlpha())[1]
+    assert sum(found.reached.numbers) <= sum(first.numbers)
+
+
+def test_five_eighths_of_the_steps_are_taken_where_they_do():
+    error = lambda n: -30.0 / n**2 + 2e5 / n**4 + 40.0 / n**3  # of which three runs leave the last
+    run = lambda n, throw: lg.Sensitivities(*2 * [np.asarray(1.0 + error(n))], None, RESULTS.successful)
+    found = differentiate_to(run, 2e-7, lg.GeneralizedAlpha(), None, extrapolate=True)
+    assert found.reached.numbers == (160, 320, 640)
+    assert abs(found.value - 1.0) <= found.reached.error <= 2e-7
 
 
 def test_no_more_steps_than_the_order_of_extrapolated_runs_says():
