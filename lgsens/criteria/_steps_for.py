@@ -126,22 +126,21 @@ def steps_for(
         _check_resolved(found.rows, pilot)
     elif tolerance is not None:
         raise ValueError("`tolerance`: inside of `jit` and `vmap` the number of steps must be known; give `num_steps`.")
-    run = lambda steps: differentiate(
-        criteria, build, p, t0=t0, t1=t1, num_steps=steps.num_steps, integrator=steps, state0=state0, throw=False
-    )
-    given = lambda placed: GivenSteps(placed.fractions, integrator, fixed=True)
+    settings: Any = {"t0": t0, "t1": t1, "state0": state0, "throw": False}
+    tried = ((_LONGEST, np.inf),) if tolerance is None else tuple((steps, k * tolerance) for steps, k in _LONG)
     rows, count = found.rows.reshape(-1, pilot), len(leaves)
-    for longest, factor in _LONG if tolerance is not None else ((_LONGEST, np.inf),):
+    for longest, away in tried:
         number = num_steps if tolerance is None else _enough(rows, count, float(tolerance), pilot, longest)
         placed = placed_steps(rows, as_count(number, "num_steps"), longest)
-        if factor == np.inf:
+        steps = GivenSteps(placed.fractions, integrator, fixed=True)
+        if away == np.inf:
             break
-        one = run(given(placed))
-        each = (structure.flatten_up_to(part) for part in one[:2])
-        if int(one.result) == RESULTS.successful and _confirmed(found, factor * tolerance, *each):
+        run = differentiate(criteria, build, p, num_steps=steps.num_steps, integrator=steps, **settings)
+        each = (structure.flatten_up_to(part) for part in run[:2])
+        if int(run.result) == RESULTS.successful and _confirmed(found, away, *each):
             break
     of_values, of_gradients = (structure.unflatten(list(part)) for part in _expected(placed, count))
-    return PlacedSteps(given(placed), of_values, of_gradients)
+    return PlacedSteps(steps, of_values, of_gradients)
 
 
 def _confirmed(pilot: Densities, most: float, values, gradients) -> bool:
