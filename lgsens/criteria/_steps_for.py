@@ -21,7 +21,7 @@ from lgsens.simulation import interval, raise_if_failed
 
 _LEAST_STEPS = 8
 _LONGEST = 3  # steps of the pilot
-_LONG = ((8, 1.0), (_LONGEST, 2.0), (1, np.inf))  # and times the tolerance that a run in such steps may be away
+_LONG = ((8, 1.0), (_LONGEST, np.inf), (1, np.inf))  # and times the tolerance that a run in such steps may be away
 _KNOWN = 0.1  # of the errors of the pilot, to which these are known
 _UNRESOLVED = 0.5  # relative error of a pilot run whose estimates are worth nothing
 _UNCANCELLED = 0.03  # of what adds up regardless of signs: these are known to leading order, of the pilot's motion
@@ -83,7 +83,7 @@ def steps_for(
     errors are estimates to leading order, with 3 % of what adds up regardless of signs on top. With a `tolerance` steps
     may be eight of the pilot's where no criterion looks: `differentiate` on them, which compiles what is called next
     anyway, says whether Ψ and dΨ/dp are within it of what the pilot says without its errors. If not, or if the run
-    fails, none is longer than three, and one if that is twice as far away. `AdaptiveSteps` has steps for the motion.
+    fails, none is longer than three, and one if that fails too. `AdaptiveSteps` has steps for the motion.
 
     With `num_steps` no step is longer than about three of the pilot's, and nothing else is run. It may be inside of
     `jit` and `vmap` then, which gives each design its own steps; those are constants for derivatives. If the pilot
@@ -133,7 +133,7 @@ def steps_for(
         number = num_steps if tolerance is None else _enough(rows, count, float(tolerance), pilot, longest)
         placed = placed_steps(rows, as_count(number, "num_steps"), longest)
         steps = GivenSteps(placed.fractions, integrator, fixed=True)
-        if away == np.inf:
+        if tolerance is None or longest == tried[-1][0]:
             break
         run = differentiate(criteria, build, p, num_steps=steps.num_steps, integrator=steps, **settings)
         each = (structure.flatten_up_to(part) for part in run[:2])
