@@ -7,7 +7,7 @@ of a scheme of order two being h³ times functions of time,
 
 **Regardless of signs** the largest bound, ∫ |c| h² dt with |c|² = Σ_k c_k², is least for a given number of steps where
 h ∝ |c|^{−1/3}: every step adds as much. |c| is taken as its largest value nearby, and no step is longer than about
-so many of the pilot's, which resolves the motion also where no criterion looks.
+`longest` of the pilot's, which resolves the motion also where no criterion looks.
 
 **With signs.** Defects oscillate with the motion, and most of them cancel, in steps whose sizes follow |c| by chance.
 The steps are laid in up to 32 plateaus of equal ones (a change of size costs a factorization), and the logarithms x of
@@ -45,8 +45,8 @@ class Placed(NamedTuple):
 
 
 def placed_steps(rows: Float[Array, "r n"], num_steps: int, longest: int) -> Placed:
-    """The sizes of so many steps, none longer than so many of the pilot's; where no row says anything, or one is not
-    finite, equal ones."""
+    """The sizes of so many steps, none longer than about `longest` of the pilot's; where no row says anything, or one
+    is not finite, equal ones."""
     plateaus = min(_PLATEAUS, 2 ** int(np.log2(max(num_steps / _LEAST, 1))))  # few programs
     counts = np.full(plateaus, num_steps // plateaus)
     counts[: num_steps % plateaus] += 1
