@@ -159,6 +159,7 @@ def test_out_of_reach():
     assert np.isfinite(found.states.lam[:2]).all() and np.isnan(found.states.lam[2]).all()
 
 
+@pytest.mark.slow  # that of positions that there are not is in the quick run, in test_kinematics.py
 def test_out_of_reach_there_is_no_derivative():
     """Of a sum with NaN: it had that of the others."""
     driver = lg.TranslationDriver(None, "bar", at=(1.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))

@@ -85,6 +85,7 @@ def energy_of_top(p):
     return observe
 
 
+@pytest.mark.slow  # criteria of its motion and their gradients are in the quick run
 @pytest.mark.parametrize("case", SPINNING)
 def test_motion_of_the_spinning_top(case):
     name = f"spinning_top_brulls.{case}"
