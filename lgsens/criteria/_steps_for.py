@@ -21,7 +21,7 @@ from lgsens.simulation import interval, raise_if_failed
 
 _LEAST_STEPS = 8
 _LONGEST = 3  # steps of the pilot
-_LONG = ((8, 1.0), (_LONGEST, np.inf), (1, np.inf))  # and times the tolerance that a run in such steps may be away
+_TRIED = (8, _LONGEST, 1)  # with a tolerance: longer than `_LONGEST` must be confirmed, others must not fail
 _KNOWN = 0.1  # of the errors of the pilot, to which these are known
 _UNRESOLVED = 0.5  # relative error of a pilot run whose estimates are worth nothing
 _UNCANCELLED = 0.03  # of what adds up regardless of signs: these are known to leading order, of the pilot's motion
@@ -127,16 +127,16 @@ def steps_for(
     elif tolerance is not None:
         raise ValueError("`tolerance`: inside of `jit` and `vmap` the number of steps must be known; give `num_steps`.")
     settings: Any = {"t0": t0, "t1": t1, "state0": state0, "throw": False}
-    tried = ((_LONGEST, np.inf),) if tolerance is None else tuple((steps, k * tolerance) for steps, k in _LONG)
     rows, count = found.rows.reshape(-1, pilot), len(leaves)
-    for longest, away in tried:
+    for longest in (_LONGEST,) if tolerance is None else _TRIED:
         number = num_steps if tolerance is None else _enough(rows, count, float(tolerance), pilot, longest)
         placed = placed_steps(rows, as_count(number, "num_steps"), longest)
         steps = GivenSteps(placed.fractions, integrator, fixed=True)
-        if tolerance is None or longest == tried[-1][0]:
+        if tolerance is None or longest == _TRIED[-1]:
             break
         run = differentiate(criteria, build, p, num_steps=steps.num_steps, integrator=steps, **settings)
         each = (structure.flatten_up_to(part) for part in run[:2])
+        away = tolerance if longest > _LONGEST else np.inf
         if int(run.result) == RESULTS.successful and _confirmed(found, away, *each):
             break
     of_values, of_gradients = (structure.unflatten(list(part)) for part in _expected(placed, count))
