@@ -104,18 +104,18 @@ class AbstractAlphaBegin(AbstractAlpha):
             return None
         return lax.stop_gradient(breaking.times.astype(system.mass_matrix().dtype))
 
-    def renewed(self, system, state, node, ratio, factors=None):
+    def renewed(self, system, state, node, factors=None):
         """What the constraints that break ask for behind a break, in place of what they asked for before.
 
         Let c(q, v, t) = B v + Φ_t of the constraints that follow what breaks. Along their directions everything is
         known, c = 0, ċ = 0 and c̈ = 0, and with it what v, v̇ and a have in a smooth motion (see `start`; what is c there
         is γ here). So the state begins anew in these directions with what belongs to the motion behind, and goes on in
         all others: it is moved by the least x, y and z, in the metric of M, that leave the other constraints as they
-        are, with
+        are, as a step of this size begins with them (`resized`), with
 
-            v_n* = v_n + x,                          B x = −c + h² B γ,
-            v̇_n* = v̇_n + y,                          B y = −ċ,
-            a_n* = v̇_n* + r (a_n − v̇_n) + z,         B z = Δ h B v̈ − r B (a_n − v̇_n),
+            v_n* = v_n + x,                      B x = −c + h² B γ,
+            v̇_n* = v̇_n + y,                      B y = −ċ,
+            a_n* = v̇_n* + a_n − v̇_n + z,         B z = Δ h B v̈ − B (a_n − v̇_n),
 
         B v̈ = −c̈ at v̈ = 0. Without it v and a keep h² Δγ and Δ h Δv̈ too much, Δv̈ by which v̈ jumps; they fade like
         n (−ρ∞)ⁿ, and until then forces of drivers are off by O(h).
@@ -135,12 +135,12 @@ class AbstractAlphaBegin(AbstractAlpha):
         offsets = [
             -along(v) - level(in_time) + h**2 * (self.jerk_share * jerk + along(turning)),
             -level(c_dot),
-            self.delta * h * jerk - ratio * along(carried),
+            self.delta * h * jerk - along(carried),
         ]
         x, y, z = jax.vmap(lambda rows: kkt.solve(jnp.zeros_like(v), rows)[0])(jnp.stack(offsets))
         vdot = vdot + y
         v = v if self.stabilized else v + x
-        return dataclasses.replace(state, v=v, vdot=vdot, a=vdot + ratio * carried + z)
+        return dataclasses.replace(state, v=v, vdot=vdot, a=vdot + carried + z)
 
     @staticmethod
     def resized_acceleration(vdot, a, ratio):

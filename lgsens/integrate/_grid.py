@@ -62,7 +62,7 @@ class Resizes(Protocol):
 
     def resizing_factors(self, system: AbstractSystem, state: State, t) -> Any: ...
 
-    def renewed(self, system: AbstractSystem, state: State, node: Node, ratio, factors: Any = None) -> State: ...
+    def renewed(self, system: AbstractSystem, state: State, node: Node, factors: Any = None) -> State: ...
 
 
 def renewed(restarts: Float[Array, " k"] | None, node: Node, ratio) -> Bool[Array, ""]:
@@ -109,7 +109,7 @@ class AbstractGrid(eqx.Module):
         found = self.sized(scheme, system, place, state, factors)
         if self.restarts is None:
             return found
-        anew = scheme.renewed(system, state, self.node(place), self.ratio(place), factors)
+        anew = scheme.renewed(system, found, self.node(place), factors)
         return jax.tree.map(lambda one, other: jnp.where(self.renews(place), one, other), anew, found)
 
     def begun(self, scheme: Resizes, system: AbstractSystem, place: Any, state: State, factors: Any = None) -> State:

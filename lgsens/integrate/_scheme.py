@@ -175,8 +175,8 @@ class AbstractScheme(AbstractIntegrator):
         """The times of breaks of the system after which a step begins anew; None: it has nothing to renew."""
         return None
 
-    def renewed(self, system: AbstractSystem, state: State, node: Node, ratio, factors: Any = None) -> State:
-        """A state as the first step after a break begins with it, r times as long as the one that led there."""
+    def renewed(self, system: AbstractSystem, state: State, node: Node, factors: Any = None) -> State:
+        """A state as the first step after a break begins with it, from one that belongs to its size."""
         return state
 
     def step_error(self, system: AbstractSystem, begun: State, state: State, memory: Memory, node: Node) -> Array:

@@ -209,7 +209,7 @@ def _controlled_steps(
             begun = selected(changes, resized.at(system, ratio), state)
             if restarts is not None:
                 anew = renewed(restarts, node, ratio)
-                renew = lambda begun: alike(selected(anew, scheme.renewed(system, state, node, ratio), begun), begun)
+                renew = lambda begun: alike(selected(anew, scheme.renewed(system, begun, node), begun), begun)
                 begun = lax.cond(in_any_lane(trial.trying & anew), renew, lambda begun: begun, begun)
             done, stats = walk.take(start, begun, node, trial.trying)
             error = relative(scheme.step_error(system, begun, done.state, done.memory, node), h)

@@ -18,8 +18,9 @@ from jaxtyping import Array, Bool
 from lgsens.linear._linear_solve import LinearEquations, linear_solve
 
 
-def lost(failed: Bool[Array, " n"], rows: Any) -> Any:
-    """Rows of floats, NaN where they have failed: one by one, so that what nobody asks for has no derivative."""
+def lost(failed: Bool[Array, "*n"], rows: Any) -> Any:
+    """Rows of floats, or a single one, NaN where they have failed: one by one, so that what nobody asks for has no
+    derivative."""
     return jax.tree.map(lambda leaf: linear_solve(_LOST, failed, leaf), rows)
 
 
@@ -40,7 +41,7 @@ def asked(failed: Bool[Array, " n"], rows: Any) -> Any:
 
 
 def _along(failed, leaf):
-    return jnp.expand_dims(failed, range(1, leaf.ndim))
+    return failed.reshape(failed.shape + (1,) * (leaf.ndim - failed.ndim))
 
 
 def _lost(failed, leaf):

@@ -25,7 +25,7 @@ from lgsens.dynamics import (
     prescribed_velocity,
 )
 from lgsens.integrate import AbstractScheme, Start
-from lgsens.linear import Matrix
+from lgsens.linear import Matrix, lost
 from lgsens.model import Model, MultibodySystem
 from lgsens.simulation._errors import primal_value, throw_if_failed
 
@@ -240,10 +240,9 @@ def begin(
         result = jnp.where(off.on_joints, RESULTS.successful, RESULTS.off_joints)
         result = jnp.where(valid, result, RESULTS.invalid_numbers).astype(jnp.int32)
         usable = result == RESULTS.successful
-        start = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), start)
-        return Begin(start, state0.v, result, off.positions, jacobian)
+        return Begin(lost(~usable, start), state0.v, result, off.positions, jacobian)
     initial = _initial(system, t0) if initial is None else initial
     usable = initial.result == RESULTS.successful
-    start = jax.tree.map(lambda leaf: jnp.where(usable, leaf, jnp.nan), scheme.start(system, initial, t0))
+    start = lost(~usable, scheme.start(system, initial, t0))
     assert initial.kkt is not None  # an equilibrium, which may have none, is a `state0`
     return Begin(start, initial.state.v, initial.result, initial.violation, initial.kkt.jacobian)
