@@ -106,6 +106,18 @@ def test_three_runs_remove_the_fourth_order_too():
     assert "in 256, 512 and 1024 steps, extrapolated" in str(reached)
 
 
+def test_round_off_of_single_precision_may_hide_that_errors_fall():
+    """The best run is one of the first, and others, whose changes grow, are no reason to refuse it."""
+    error = lambda n: 1.0 / n**2 + 3e-8 * n**2 * np.cos(n)
+    with jax.enable_x64(False):
+        found, reached = to_accuracy(*sequence(error), 1e-2, lg.GeneralizedAlpha())
+        assert abs(found.value - 1.0) < reached.error <= 1e-2 and reached.runs == 1
+        with pytest.raises(lg.SimulationError, match=says("0.0001 is not reached in 8192 steps", "single precision")):
+            to_accuracy(*sequence(error), 1e-4, lg.GeneralizedAlpha())
+    with pytest.raises(lg.SimulationError, match=says("0.01 is not reached in 131072 steps")):  # it is not round-off
+        to_accuracy(*sequence(error), 1e-2, lg.GeneralizedAlpha())
+
+
 def test_coarse_runs_that_fail_are_no_answer():
     run, *rest = sequence(lambda n: 1.0 / n**2)
     asked = []
