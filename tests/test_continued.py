@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from differences import central
-from helpers import some_quick
+from helpers import says, some_quick
 
 import lgsens as lg
 
@@ -115,3 +115,32 @@ def test_derivatives_through_it_are_exact(both):
         np.testing.assert_allclose(gradient, forward, rtol=1e-9)  # other order of round-off
     slopes = [central(lambda s, e=e: reverse(p + s * e)[0], 1e-3) for e in np.eye(2)]
     np.testing.assert_allclose(gradient, slopes, rtol=1e-7)  # δ⁶ × seventh derivative, round-off of forces over δ
+
+
+def discs(joints, inertia=3.0):
+    inertias = {"a": (2.0,) * 3, "b": inertia * jnp.ones(3)}
+    return lg.Model({name: lg.RigidBody(1.0, values, free="rz") for name, values in inertias.items()}, joints)
+
+
+def test_a_driver_is_released_and_a_clutch_is_closed():
+    """A disc is driven to A sin 2πt, let go at 0.6 s, and at once joined to another one, which is at rest."""
+    signal = lg.Harmonic(amplitude=0.3, frequency=1.0)
+    driver = lambda a, b, value: {"driver": lg.RotationDriver(a, b, axis=(0.0, 0.0, 1.0), value=value)}
+    end = lg.simulate(discs(driver(None, "a", signal)), t1=0.6, num_steps=60).state(-1)
+    free = lg.initial_state(discs({}), t0=0.6, state=end)
+    # that of the driver is off by O(h²), (2πh)² = 4e-3 of it and less
+    rate = 0.6 * np.pi * np.cos(1.2 * np.pi)
+    np.testing.assert_allclose(free.v, [rate, 0.0], rtol=1e-3)
+    assert free.lam.shape == (0,)
+
+    def closed(inertia):
+        both = discs(driver("b", "a", signal(0.6)), inertia)
+        return lg.initial_state(both, t0=0.6, state=free).v
+
+    kept = 2.0 / 5.0  # 2/(2 + inertia)
+    np.testing.assert_allclose(closed(3.0), kept * free.v[0] * np.ones(2), rtol=1e-12)
+    np.testing.assert_allclose(jax.jacrev(closed)(3.0), -kept / 5.0 * free.v[0] * np.ones(2), rtol=1e-12)
+    with pytest.raises(ValueError, match=says("`state` must be one state of this model", "same bodies")):
+        lg.initial_state(discs({}), state=half().state(-1))
+    with pytest.raises(ValueError, match=says("`state` must be a State, as `trajectory.state(-1)` is")):
+        lg.initial_state(discs({}), state=half())

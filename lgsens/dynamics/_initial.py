@@ -1,6 +1,6 @@
 """Consistent initial state, eqs. (18)–(19), and the accelerations and multipliers that go with it."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -135,14 +135,14 @@ def jerk(system: AbstractSystem, q, v, vdot, lam, t) -> Float[Array, " k"]:
     return -jnp.linalg.solve(matrix, missing)[: v.shape[0]]
 
 
-def assemble(system: AbstractSystem, t):
-    """The configuration closest to the reference that satisfies Φ(q, t) = 0, and its last violation; the reference and
-    NaN where none is found.
+def assemble(system: AbstractSystem, t, begin: tuple[Any, Array] | None = None):
+    """The configuration closest to the reference, or to that of `begin`, that satisfies Φ(q, t) = 0, and its last
+    violation; the reference and NaN where none is found.
 
     q = q_ref exp((N μ)~) with N = M⁻¹B(q_ref)ᵀ: the motion that an impulse along the constraint directions
     would give. The m_p equations Φ = 0 determine μ; the implicit function theorem, its derivative.
     """
-    q_ref, v_ref = system.reference()
+    q_ref, v_ref = system.reference() if begin is None else begin
     if system.assembled or len(system.constraint_names) == system.num_velocity_rows:
         return q_ref, system.constraint(q_ref, t)
     group, mass = system.group, system.mass_matrix()
@@ -216,15 +216,16 @@ def is_redundant(system: AbstractSystem, jacobian: Matrix) -> Bool[Array, ""]:
     return ~(factors.largest_inverse() < jnp.finfo(dtype).eps ** -0.8)  # NaN is redundant
 
 
-def initial_state(system: AbstractSystem, t) -> Initial:
-    """q, v, v̇, λ consistent with the constraints at position, velocity and acceleration level; a = v̇.
+def initial_state(system: AbstractSystem, t, begin: tuple[Any, Array] | None = None) -> Initial:
+    """q, v, v̇, λ consistent with the constraints at position, velocity and acceleration level; a = v̇. From `begin`,
+    q and v, or the reference.
 
     Velocities are projected with the metric of kinetic energy (`consistent_velocity`): what an impulse through the
     joints leaves of v_ref, and what the rates of drivers add.
     """
-    q, violation = assemble(system, t)
+    q, violation = assemble(system, t, begin)
     violation = violation_of_all(system, q, t, violation)
-    _, v_ref = system.reference()
+    _, v_ref = system.reference() if begin is None else begin
     kkt = ConstrainedMass.of(system, q, t)
     v = system.settled(q, consistent_velocity(system, q, v_ref, t, kkt), t)
     vdot, lam = accelerations(system, q, v, t, kkt)

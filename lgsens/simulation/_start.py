@@ -38,7 +38,7 @@ def as_system(model: Model | AbstractSystem) -> AbstractSystem:
     raise ValueError(f"`model` must be a Model or an AbstractSystem, got {type(model).__name__}.")
 
 
-def initial_state(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) -> State:
+def initial_state(model: Model | AbstractSystem, *, t0=0.0, state: State | None = None, throw: bool = True) -> State:
     """The consistent initial state of a model: q, v, v̇, λ, and a = v̇ (paper eqs. 18–19).
 
     The reference configuration is assembled if a joint asks for it (a `DistanceJoint` with a length), velocities
@@ -49,12 +49,23 @@ def initial_state(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) 
     Arguments:
         model: the scene, or an `AbstractSystem`.
         t0: initial time [s], shape ().
+        state: one whose configuration and velocities are taken in place of those of the reference configuration: where
+            a run of the same bodies with other joints, drivers or forces ended, as `trajectory.state(-1)`. A driver is
+            released by a model without it; a joint that is closed takes velocities as an impulse through it would.
         throw: raise if the mechanism cannot be assembled or has redundant constraints.
 
-    Differentiable, by the implicit function theorem. Raises `ValueError` as said under `throw`; inside `jit` the state
-    is NaN.
+    Differentiable, by the implicit function theorem. Raises `ValueError` as said under `throw` and for a `state` of
+    other bodies; inside `jit` the state is NaN.
     """
-    return _found_state(_initial_jit, model, t0, throw)
+    if state is None:
+        return _found_state(_initial_jit, model, t0, throw)
+    system = as_system(model)
+    q, v = system.reference()
+    if not isinstance(state, State):
+        raise ValueError(f"`state` must be a State, as `trajectory.state(-1)` is, got {type(state).__name__}.")
+    _require_shapes("state", (state.q, state.v), (q, v), "It must be of a model with the same bodies and coordinates.")
+    begin = jax.tree.map(lambda leaf: jnp.asarray(leaf, v.dtype), (state.q, state.v))
+    return _found_state(_initial_jit, system, t0, throw, begin)
 
 
 def equilibrium(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) -> State:
@@ -77,8 +88,8 @@ def equilibrium(model: Model | AbstractSystem, *, t0=0.0, throw: bool = True) ->
 
 
 @eqx.filter_jit
-def _initial_jit(system, t0) -> Initial:
-    return _initial(system, t0)._replace(kkt=None)
+def _initial_jit(system, t0, *begin) -> Initial:
+    return _initial(system, t0, *begin)._replace(kkt=None)
 
 
 @eqx.filter_jit
@@ -86,9 +97,9 @@ def _equilibrium_jit(system, t0) -> Initial:
     return _equilibrium(system, t0)
 
 
-def _found_state(find: Callable[..., Initial], model: Model | AbstractSystem, t0, throw: bool) -> State:
+def _found_state(find: Callable[..., Initial], model: Model | AbstractSystem, t0, throw: bool, *begin) -> State:
     system, t0 = as_system(model), as_float(t0, (), "`t0`")
-    initial = find(system, t0)
+    initial = find(system, t0, *begin)
     if not throw or (is_concrete(initial.result) and int(initial.result) == RESULTS.successful):
         return initial.state
     details: dict[str, Any] = {"violation": initial.violation}
@@ -199,21 +210,29 @@ def _as_state(system: AbstractSystem, state0: Any, name: str = "state0") -> Stat
         )
     q, v = system.reference()
     lam = jax.ShapeDtypeStruct((len(system.constraint_names),), v.dtype)
-    shapes = lambda *parts: [[jnp.shape(leaf) for leaf in jax.tree.leaves(part)] for part in parts]
-    given = shapes(state0.q, state0.v, state0.vdot, state0.lam, state0.a)
-    needed = shapes(q, v, v, lam, v)
+    advice = (
+        "Take it from `initial_state(model)` or `trajectory.state(i)` of the same model; of the same bodies with other "
+        "joints from `initial_state(model, t0=…, state=trajectory.state(i))`; for a batch of states "
+        "jax.vmap(lambda state0: simulate(model, state0=state0, …))(states)."
+    )
+    given = state0.q, state0.v, state0.vdot, state0.lam, state0.a
+    _require_shapes(name, given, (q, v, v, lam, v), advice)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, v.dtype), state0)
+
+
+def _require_shapes(name: str, given: tuple, needed: tuple, advice: str) -> None:
+    """`ValueError` if q, v, … of a state have other shapes than a system's."""
+    shapes = lambda parts: [[jnp.shape(leaf) for leaf in jax.tree.leaves(part)] for part in parts]
     wrong = [
-        f"{name} has {', '.join(map(str, found))} and must have {', '.join(map(str, right))}"
-        for name, found, right in zip(("q", "v", "vdot", "lam", "a"), given, needed)
+        f"{what} has {', '.join(map(str, found))} and must have {', '.join(map(str, right))}"
+        for what, found, right in zip(("q", "v", "vdot", "lam", "a"), shapes(given), shapes(needed))
         if found != right
     ]
     if wrong:
         raise ValueError(
             f"`{name}` must be one state of this model; its shapes are others: {'; '.join(wrong)} (bodies, then states "
-            "of force elements). Take it from `initial_state(model)` or `trajectory.state(i)` of the same model; for a "
-            "batch of states jax.vmap(lambda state0: simulate(model, state0=state0, …))(states)."
+            f"of force elements). {advice}"
         )
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, v.dtype), state0)
 
 
 class Begin(NamedTuple):
