@@ -43,7 +43,10 @@ def _describe(result: int, details: dict[str, Any], names: tuple[str, ...]) -> s
     if not details:
         return code.message
     if code is RESULTS.redundant_constraints:
-        return f"{code.message} Joints involved: {redundant_names(details['jacobian'], names)}."
+        involved = redundant_names(details["jacobian"], names)
+        rods = all(names.count(name) == 1 for name in involved)
+        more = " Each is one equation: if no two are the same, the configuration is singular; begin beside it."
+        return f"{code.message} Joints involved: {involved}.{more if rods else ''}"
     step, num_steps = int(details.get("step", 0)), int(details.get("num_steps", 0))
     place, time = f"step {step} of {num_steps}", f"t = {details.get('time', 0.0):.6g} s"
     violation, worst = np.abs(details.get("violation", ())), ""
