@@ -315,6 +315,20 @@ MISTAKES = {
         {"wheel.centre": [-0.04, -0.91, -0.026], "wheel.bearing": [-0.04, -0.91, -0.026]},
         ("key 'wheel.centre'", "is at y = -0.91 m", "on the other side of the car", "turn the sign"),
     ),
+    "arm on the other side": (
+        "double_wishbone",
+        {
+            "links.upper_wishbone.chassis": [[-0.1, -0.4, 0.3], [0.1, -0.4, 0.3]],
+            "links.upper_wishbone.knuckle": [0.0, -0.7, 0.3],
+        },
+        ("key 'links.upper_wishbone'", "all its points on the other side", "turn the sign of their y"),
+    ),
+    "radius in millimetres": ("double_wishbone", {"link_section.radius": 10.0}, ("is in metres", "did you mean 0.01?")),
+    "gap in millimetres": (
+        "push_rod",
+        {"bump_stop": {"gap": 30.0, "stiffness": 1e5, "rounding": 1e-3}},
+        ("did you mean 0.03?",),
+    ),
     "point in millimetres": (
         "double_wishbone",
         {"links.tie_rod.chassis": [118.0, 412.0, 51.0]},

@@ -122,6 +122,9 @@ def _chosen(asked: str | None, sweeps: dict[str, rigs.Sweep], axle: Axle) -> lis
     known = [name for name, one in rigs.CHARACTERISTICS.items() if one.sweep in sweeps]
     names = [] if not asked else known if asked == "all" else _list(asked)
     for name in names:
+        if name in rigs.CHARACTERISTICS and name not in known:
+            sweep = rigs.CHARACTERISTICS[name].sweep
+            raise ValueError(f"argument --gradient: {name!r} is of the sweep {sweep!r}, which --sweeps leaves out")
         if name not in known:
             raise ValueError(f"argument --gradient: {suggestion(name, known)}, or all of them: all")
     if names and not axle.hardpoint_names:

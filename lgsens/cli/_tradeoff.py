@@ -120,6 +120,11 @@ def from_file(path: Path) -> Scene:
     """The scene of a Python file. Raises `ValueError` naming the file and what is wrong with it."""
     if not path.is_file():
         raise ValueError(f"{str(path)!r} is neither a file nor one of {sorted(SCENES)}")
+    if path.suffix != ".py":
+        raise ValueError(
+            f"file {str(path)!r} must be a Python file, ….py, that builds a scene; for a suspension's file there are "
+            "`lgsens doctor` and `lgsens optimize`"
+        )
     try:
         found: Mapping[str, Any] = runpy.run_path(str(path))
     except Exception as error:  # whatever a user's file may raise

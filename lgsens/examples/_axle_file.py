@@ -44,7 +44,9 @@ def stop(table: Reader, key: str, bodies: tuple[str, ...], damper: Strut, carrie
     ends = carried(table, key, ends, carriers)
     rates = {name: table.number(name) for name in ("stiffness", "rounding")}
     progression = table.number("progression") if "progression" in table else None
-    return Stop(ends, table.number("gap", positive=False), **rates, progression=progression, rebound=key != "bump_stop")
+    return Stop(
+        ends, table.metres("gap", 0.5, positive=False), **rates, progression=progression, rebound=key != "bump_stop"
+    )
 
 
 def mounts(

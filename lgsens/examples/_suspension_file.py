@@ -184,7 +184,7 @@ def members(document: dict, path: str) -> dict[str, Any]:
         **({"spring": None} | struts),
         "leaf_spring": leaf,
         "tyre_stiffness": root.table("tyre").number("stiffness"),
-        "link_radius": root.table("link_section").number("radius") if bars else None,
+        "link_radius": root.table("link_section").metres("radius", 0.2) if bars else None,
         "bump_height": bump.metres("height", 1.0, positive=False),
         "bump_duration": bump.number("duration"),
         "stops": stops,
@@ -214,7 +214,8 @@ def _wheel(root: Reader, part: Part) -> Wheel:
 def _check_points(
     root: Reader, wheel: Wheel, links: Mapping[str, Link], joints: Mapping[str, Connection], struts: Mapping[str, Any]
 ) -> None:
-    """Raise `ValueError` for points in another unit than the wheel's, and for a wheel on the other side of the car."""
+    """Raise `ValueError` for points in another unit than the wheel's, and for a wheel, or links, on the other side of
+    the car."""
     stacked = lambda points: np.concatenate([np.atleast_2d(point) for point in points])
     held = {f"links.{name}": stacked(link.ends.values()) for name, link in links.items()}
     held |= {f"joints.{name}": stacked([joint.at]) for name, joint in joints.items()}
@@ -229,12 +230,20 @@ def _check_points(
                 f"suspension is further than {MOST_OFF_WHEEL:g} m; is it in another unit than 'units.length' says?",
             )
     across = float(stacked(held.values())[:, 1].mean())
-    if across * np.sign(centre[1]) < -0.3 * abs(centre[1]):  # a hinge may lie a little beyond the middle of the car
+    beyond = lambda y: np.max(y * np.sign(centre[1])) < -0.3 * abs(centre[1])  # a hinge may be, but for a little
+    if beyond(across):
         raise root.table("wheel").fail(
             "centre",
             f"is at y = {centre[1]:.4g} m, and links and joints are at {across:.4g} m in the mean, on the other side "
             "of the car; turn the sign of its y, and of its bearing's.",
         )
+    for key, points in held.items():
+        if beyond(points[:, 1]):
+            raise root.fail(
+                key,
+                f"has all its points on the other side of the car, at y = {points[:, 1].round(6).tolist()} m, and the "
+                f"wheel's centre is at {centre[1]:.4g} m; turn the sign of their y.",
+            )
 
 
 def _leaf_spring(root: Reader, kilogram: float) -> LeafPack | None:

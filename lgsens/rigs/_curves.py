@@ -32,8 +32,9 @@ inertia adds, h_c/l of all of it, of which this axle has a share p:
 
 Steering axis. No ball joints are assumed: it is the axis of the screw by which a wheel moves when the rack moves and
 both springs keep their lengths, so that the suspension does not travel: the response to the rack and such parts of the
-responses to both pads that ℓ′ = 0. Of a rigid suspension with ball joints it is their line. With ω its direction and v
-the velocity of the wheel centre, d = ±ω/|ω| upward and c + ω × v/|ω|² is on it; X is where it meets the road:
+responses to both pads that ℓ′ = 0. Of a rigid suspension with ball joints it is their line, if turning about
+that leaves the spring's length as it is: not with the offset seat of a strut. With ω its direction and v the velocity
+of the wheel centre, d = ±ω/|ω| upward and c + ω × v/|ω|² is on it; X is where it meets the road:
 
     caster                 atan2(−d_x, d_z)        positive with its top rearward
     kingpin inclination    atan2(−σ d_y, d_z)      positive with its top inward

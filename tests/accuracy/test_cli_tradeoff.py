@@ -160,3 +160,9 @@ def test_the_quarter_car_as_committed():
     size = max(map(abs, p[2:17]))
     gradient = [damping * p[1], *(slope * size for slope in hardpoints), stiffness * p[0]]  # by name
     check_against("quarter_car", found["value"], np.array(gradient))
+
+
+def test_the_file_of_a_suspension_is_no_scene(tmp_path, capsys):
+    (tmp_path / "car.toml").write_text("name = 1", encoding="utf-8")
+    status, _, error = run(capsys, tmp_path / "car.toml", "--out", tmp_path / "out")
+    assert status == 2 and "must be a Python file" in error and "lgsens optimize" in error
