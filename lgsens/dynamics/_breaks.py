@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._validate import as_float
@@ -29,12 +28,10 @@ class Breaking(NamedTuple):
 
     Attributes:
         times: when they do [s], shape (k,).
-        rows: which rows of all constraints these are, shape (m,), static.
         constraint: Φ(q, t) of them, zeros in the other rows of position level.
     """
 
     times: Float[Array, " k"]
-    rows: np.ndarray
     constraint: Callable[[Any, Any], Float[Array, " m_p"]]
 
 

@@ -164,6 +164,10 @@ class ConstrainedMass(eqx.Module):
             return kkt_solve(self.mass, self.jacobian, force, rate)
         return linear_solve(_WITH_FACTORS, self, (force, rate))
 
+    def least(self, rates: Float[Array, "n m"]) -> Float[Array, "n k"]:
+        """For each row the least x, in the metric of M, with J x = rate."""
+        return jax.vmap(lambda rate: self.solve(jnp.zeros(self.jacobian.shape[1], rate.dtype), rate)[0])(rates)
+
     def product(self, unknown):
         """The two rows for x and μ."""
         return kkt_product(self.mass, self.jacobian, *unknown)

@@ -7,7 +7,14 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from lgsens.dynamics import ConstrainedMass, consistent_velocity, constraint_jerk, given_way, of_position_level
+from lgsens.dynamics import (
+    ConstrainedMass,
+    consistent_velocity,
+    constraint_jerk,
+    given_way,
+    of_position_level,
+    prescribed_velocity,
+)
 from lgsens.integrate._alpha import AbstractAlpha
 from lgsens.integrate._grid import Start
 
@@ -48,12 +55,14 @@ class AbstractAlphaBegin(AbstractAlpha):
 
         N v̈ is what the constraints ask for: the least with J v̈ + d(J v̇ + γ)/dt = 0, the latter at fixed v̈ = 0.
         """
-        q, v, vdot = state.q, state.v, state.vdot
-        turning = self.missed_increment(system, v, vdot, jnp.zeros_like(v))
-        asked = -constraint_jerk(system, q, v, vdot, t)
-        kkt = ConstrainedMass.of(system, q, t) if kkt is None else kkt
-        off = of_position_level(system, self.jerk_share * asked + kkt.jacobian @ turning)
-        return jax.vmap(lambda row: kkt.solve(jnp.zeros_like(v), row)[0])(jnp.stack([self.delta * asked, off]))
+        kkt = ConstrainedMass.of(system, state.q, t) if kkt is None else kkt
+        return kkt.least(jnp.stack(self._asked(system, state, t, kkt.jacobian)))
+
+    def _asked(self, system, state, t, jacobian):
+        """B of both `offsets`: Δ B v̈ and B c."""
+        asked = -constraint_jerk(system, state.q, state.v, state.vdot, t)
+        turning = self.missed_increment(system, state.v, state.vdot, jnp.zeros_like(state.v))
+        return self.delta * asked, of_position_level(system, self.jerk_share * asked + jacobian @ turning)
 
     def resumed(self, system, given, t0):
         given = super().resumed(system, given, t0)
@@ -105,40 +114,34 @@ class AbstractAlphaBegin(AbstractAlpha):
         return lax.stop_gradient(breaking.times.astype(system.mass_matrix().dtype))
 
     def renewed(self, system, state, node, factors=None):
-        """What the constraints that break ask for behind a break, in place of what they asked for before.
+        """What the constraints ask for behind a break, in place of what they asked for before.
 
-        Let c(q, v, t) = B v + Φ_t of the constraints that follow what breaks. Along their directions everything is
-        known, c = 0, ċ = 0 and c̈ = 0, and with it what v, v̇ and a have in a smooth motion (see `start`; what is c there
-        is γ here). So the state begins anew in these directions with what belongs to the motion behind, and goes on in
-        all others: it is moved by the least x, y and z, in the metric of M, that leave the other constraints as they
-        are, as a step of this size begins with them (`resized`), with
+        Let c(q, v, t) = B v + Φ_t of the constraints of position level. Along their directions everything is known,
+        c = 0, ċ = 0 and c̈ = 0, and with it what v, v̇ and a have in a smooth motion (see `start`; what is c there is γ
+        here). So the state begins anew in these directions with what belongs to the motion behind, and goes on in all
+        others, as a step of this size begins with them (`resized`): it is moved by the least x, y and z, in the metric
+        of M, with
 
             v_n* = v_n + x,                      B x = −c + h² B γ,
-            v̇_n* = v̇_n + y,                      B y = −ċ,
+            v̇_n* = v̇_n + y,                      B y = −ċ, but 0 of constraints that do not break,
             a_n* = v̇_n* + a_n − v̇_n + z,         B z = Δ h B v̈ − B (a_n − v̇_n),
 
-        B v̈ = −c̈ at v̈ = 0. Without it v and a keep h² Δγ and Δ h Δv̈ too much, Δv̈ by which v̈ jumps; they fade like
-        n (−ρ∞)ⁿ, and until then forces of drivers are off by O(h).
+        B v̈ = −c̈ at v̈ = 0, and γ, of v̇*: where v̇ jumps, c̈ of a joint that does not break does, too, by products of v
+        and v̇. Without it v and a keep h² Δγ and Δ h Δv̈ too much, Δv̈ by which v̈ jumps; they fade like n (−ρ∞)ⁿ, and
+        until then forces of drivers and joints are off by O(h).
         """
         q, v, vdot, h, t = state.q, state.v, state.vdot, node.h, node.behind
         breaking, carried = system.breaking, state.a - vdot
         assert breaking is not None  # or there are no `restarts`
-        turning = self.missed_increment(system, v, vdot, jnp.zeros_like(v))
         moving, one = system.group.to_ambient, jnp.ones_like(t)
         rate = lambda q, v, t: jax.jvp(breaking.constraint, (q, t), (moving(q, v), one))[1]
-        second = lambda q, v, t: jax.jvp(rate, (q, v, t), (moving(q, v), vdot, one))[1]
-        c_dot, c_ddot = jax.jvp(second, (q, v, t), (moving(q, v), vdot, one))
-        in_time = jax.jvp(lambda t: breaking.constraint(q, t), (node.begin,), (one,))[1]
-        level = lambda rows: jnp.concatenate([rows, jnp.zeros(system.num_velocity_rows, rows.dtype)])
+        c_dot = jax.jvp(rate, (q, v, t), (moving(q, v), vdot, one))[1]
         kkt = ConstrainedMass.of(system, q, node.begin, factors)
-        along, jerk = lambda x: jnp.where(breaking.rows, kkt.jacobian @ x, 0.0), -level(c_ddot)
-        offsets = [
-            -along(v) - level(in_time) + h**2 * (self.jerk_share * jerk + along(turning)),
-            -level(c_dot),
-            self.delta * h * jerk - along(carried),
-        ]
-        x, y, z = jax.vmap(lambda rows: kkt.solve(jnp.zeros_like(v), rows)[0])(jnp.stack(offsets))
-        vdot = vdot + y
+        none = jnp.zeros(system.num_velocity_rows, v.dtype)
+        vdot = vdot + kkt.least(-jnp.concatenate([c_dot, none])[None])[0]
+        a_1, off = self._asked(system, dataclasses.replace(state, vdot=vdot), t, kkt.jacobian)
+        c = of_position_level(system, kkt.jacobian @ v + prescribed_velocity(system, q, node.begin))
+        x, z = kkt.least(jnp.stack([h**2 * off - c, h * a_1 - kkt.jacobian @ carried]))
         v = v if self.stabilized else v + x
         return dataclasses.replace(state, v=v, vdot=vdot, a=vdot + carried + z)
 

@@ -2,8 +2,6 @@
 
 from typing import Any
 
-import numpy as np
-
 from lgsens.dynamics import Breaking, breaks_of
 from lgsens.linear import added
 from lgsens.model._stack import position_values
@@ -16,12 +14,9 @@ def breaking_of(system: Any) -> Breaking | None:
     if not own:
         return None
     stacks, rows = [stack for stack, _ in own], [rows for _, rows in own]
-    broken = np.zeros(system.topology.num_constraints, bool)
-    for each in rows:
-        broken[each[each >= 0]] = True
 
     def constraint(q, t):
         values = list(zip(position_values(stacks, system._placed(q), t), rows))
         return added(values, system.topology.num_constraints - system.num_velocity_rows, system.mass.dtype)
 
-    return Breaking(breaks_of(stacks), broken, constraint)
+    return Breaking(breaks_of(stacks), constraint)
