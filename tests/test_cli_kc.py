@@ -74,6 +74,7 @@ def test_largest_derivatives_come_first():
         (["--sweeps", "steering"], "this axle has no rack"),
         (["--points", "4"], "argument --points: must be odd and at least 3, got 4"),
         (["--sweeps", "parallel", "--gradient", "bump"], "argument --gradient: 'bump' is not one of"),
+        (["--sweeps", "parallel", "--gradient", "lateral_steer"], "'lateral_steer' is of the sweep 'lateral', which"),
     ],
 )
 def test_bad_input(tmp_path, capsys, arguments, message):

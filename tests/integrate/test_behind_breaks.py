@@ -252,4 +252,4 @@ def test_joints_follow_accelerations_that_jump():
 
     coarse, fine = error(64), error(128)
     assert 3.5 < coarse / fine < 6.0  # 4 of the order, and h³; first order: 2
-    assert coarse < 0.02 * arm * 5.5**2  # of the largest; first order: 0.26
+    assert coarse < 0.01 * arm * 7.6**2  # of the largest; first order: 0.14
