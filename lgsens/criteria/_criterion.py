@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from lgsens._validate import as_float, require
+from lgsens._xla import one_program
 from lgsens.dynamics import AbstractSystem, State, breaks_of
 from lgsens.integrate import nearest_ends
 from lgsens.sensitivity import Functional
@@ -140,11 +141,8 @@ def time_integral(
         raise ValueError(f"`time_integral`: `breaks` must have shape (k,), got {breaks.shape}.")
     if order not in (2, 4):
         raise ValueError(f"`time_integral`: `order` must be 2 (trapezoidal) or 4 (Gregory), got {order!r}.")
-    h = jnp.diff(t)
-    as_factor = lambda sizes: sizes.reshape((-1,) + (1,) * (f.ndim - 1))
-    trapezoidal = jnp.sum(jnp.broadcast_to(as_factor(h), f[1:].shape) * (f[1:] + f[:-1]), axis=0) / 2
     if order == 2:
-        return trapezoidal
+        return _trapezoidal(t, f)
     if t.shape[0] < 3:
         raise ValueError(f"`time_integral`: order 4 needs at least 3 times, got {t.shape[0]}; order=2 does with fewer.")
     require(
@@ -153,6 +151,21 @@ def time_integral(
         "order=2 for others.",
         t,
     )
+    return _gregory(t, f, breaks)
+
+
+def _along_time(sizes, f):
+    return sizes.reshape((-1,) + (1,) * (f.ndim - 1))
+
+
+@one_program
+def _trapezoidal(t, f):
+    return jnp.sum(jnp.broadcast_to(_along_time(jnp.diff(t), f), f[1:].shape) * (f[1:] + f[:-1]), axis=0) / 2
+
+
+@one_program
+def _gregory(t, f, breaks):
+    h = jnp.diff(t)
     equal = _equal_to_next(jax.lax.stop_gradient(t))  # of the steps from t_n and t_{n+1}
     if breaks is not None and breaks.size:
         nearest, met = nearest_ends(*jax.lax.stop_gradient((t, breaks)), 1e-3)
@@ -160,8 +173,9 @@ def time_integral(
     begins = jnp.where(equal & ~jnp.pad(equal, (1, 0))[:-1], h[:-1], 0.0)
     ends = jnp.where(equal & ~jnp.pad(equal, (0, 1))[1:], h[1:], 0.0)
     slopes, bends = jnp.diff(f, axis=0), jnp.diff(f, 2, axis=0)
-    corrected = as_factor(begins) * (slopes[:-1] / 12.0 - bends / 24.0)
-    return trapezoidal + jnp.sum(corrected - as_factor(ends) * (slopes[1:] / 12.0 + bends / 24.0), axis=0)
+    corrected = _along_time(begins, f) * (slopes[:-1] / 12.0 - bends / 24.0)
+    corrected -= _along_time(ends, f) * (slopes[1:] / 12.0 + bends / 24.0)
+    return _trapezoidal(t, f) + jnp.sum(corrected, axis=0)
 
 
 def _equal_to_next(t):
@@ -196,7 +210,12 @@ def soft_maximum(values: Float[Array, " n"], sharpness: float | Float[Array, ""]
     values, sharpness = as_float(values, None, "`values`"), as_float(sharpness, (), "`sharpness`")
     if values.size == 0:
         raise ValueError("`soft_maximum`: `values` is empty; there is no largest value.")
-    require(lambda rho: rho > 0, f"`soft_maximum`: `sharpness` must be positive, got {sharpness}.", sharpness)
+    require(lambda rho: rho > 0, lambda: f"`soft_maximum`: `sharpness` must be positive, got {sharpness}.", sharpness)
+    return _kreisselmeier_steinhauser(values, sharpness)
+
+
+@one_program
+def _kreisselmeier_steinhauser(values, sharpness):
     return jax.nn.logsumexp(sharpness * values) / sharpness
 
 

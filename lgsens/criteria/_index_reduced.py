@@ -92,13 +92,15 @@ def integrate_index_reduced(
     p, t0, t1 = as_float(p, None, "`p`"), as_float(t0, (), "`t0`"), as_float(t1, (), "`t1`")
     if p.ndim != 1 or p.size == 0:
         raise ValueError(f"`p` must have shape (p,) with at least one parameter, got {p.shape}.")
-    require(lambda t0, t1: t1 > t0, f"`t1` must be later than `t0`, got t0 = {t0} s and t1 = {t1} s.", t0, t1)
+    require(lambda t0, t1: t1 > t0, lambda: f"`t1` must be later than `t0`, got t0 = {t0} s and t1 = {t1} s.", t0, t1)
     tolerances = as_float(rtol, (), "`rtol`"), as_float(atol, (), "`atol`")
     smallest = 8 * float(jnp.finfo(p.dtype).eps)
     require(
         lambda rtol, atol: rtol >= smallest and atol > 0,
-        f"`rtol` must be at least {smallest:.0e} in {p.dtype}, and `atol` positive; got {rtol} and {atol}. "
-        'jax.config.update("jax_enable_x64", True) gives 64 bits.',
+        lambda: (
+            f"`rtol` must be at least {smallest:.0e} in {p.dtype}, and `atol` positive; got {rtol} and {atol}. "
+            'jax.config.update("jax_enable_x64", True) gives 64 bits.'
+        ),
         *tolerances,
     )
     max_steps = as_count(max_steps, "max_steps", " (it is static)")

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from lgsens._xla import one_program
 from lgsens.dynamics import AbstractSystem, breaks_of
 from lgsens.integrate import SHORTEST
 from lgsens.model import element_forces, scene_of
@@ -129,6 +130,7 @@ def _rough(values: Float[Array, "n+1 items parts"], size: Float[Array, " items"]
     return jnp.stack([_spikes(values, size) & ~jumps, jumps])
 
 
+@one_program
 def _jumps(values: Float[Array, "n+1 items parts"], size: Float[Array, " items"]) -> Bool[Array, "n+1 items"]:
     """Where first differences stand out of those before and after.
 
@@ -142,6 +144,7 @@ def _jumps(values: Float[Array, "n+1 items parts"], size: Float[Array, " items"]
     return jnp.pad(jumps, ((4, 3), (0, 0)))  # the first one is of the step from the third to the fourth time
 
 
+@one_program
 def _spikes(values: Float[Array, "n+1 items parts"], size: Float[Array, " items"]) -> Bool[Array, "n+1 items"]:
     """Where second differences stand out of those before and after.
 

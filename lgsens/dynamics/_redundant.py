@@ -34,7 +34,6 @@ in the corner of K_c leaves ε^k of the error after k iterations (proximal point
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -43,7 +42,7 @@ import jax.scipy.linalg as jsl
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from lgsens._xla import while_loop
+from lgsens._xla import one_program, while_loop
 from lgsens.dynamics._constraints import full_jacobian
 from lgsens.dynamics._system import AbstractSystem
 
@@ -104,7 +103,7 @@ def refined(product: Callable, solve: Callable, rhs):
     return while_loop(improves, iterate, _Refined(solution, first, one, 2.0 * one, jnp.zeros((), jnp.int32))).solution
 
 
-@partial(jax.jit, inline=True)  # one program where it is not called inside another
+@one_program
 def least_norm(system: AbstractSystem, q, lam: Float[Array, " m"], t) -> Float[Array, " m"]:
     """The multipliers of least Σ d_i λ_i² with the same Bᵀλ, at one instant; λ itself if none may be redundant."""
     if system.compliance is None:

@@ -47,8 +47,8 @@ _MESSAGES = {
     ),
     RESULTS.newton_failed: (
         "Newton's iteration did not converge. Try a smaller step (more `num_steps`), more "
-        "`max_iterations` (or `iterations`) of the integrator, GeneralizedAlpha(stabilized=True) where fast rotations in "
-        "joints made velocities grow from step to step, or look for a singular configuration at this time."
+        "`max_iterations` (or `iterations`) of the integrator, GeneralizedAlpha(stabilized=True) where fast rotations "
+        "in joints made velocities grow from step to step, or look for a singular configuration at this time."
     ),
     RESULTS.equilibrium_failed: (
         "No static equilibrium was found near the reference configuration. Start closer to it, or check "

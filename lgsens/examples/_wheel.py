@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgsens._brief import brief
+from lgsens._xla import one_program
 from lgsens.examples._suspension_parts import Part
 from lgsens.model import ALL_FREE, RigidBody
 
@@ -92,6 +93,7 @@ class Wheel(Part):
     toe: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
 
     @property
+    @one_program
     def axes(self) -> Float[Array, "3 3"]:
         """X, e and u as columns, inertial frame."""
         side = jnp.where(self.centre[1] > 0, 1.0, -1.0).astype(self.centre.dtype)

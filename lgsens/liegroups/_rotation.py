@@ -1,12 +1,13 @@
 """The rotation group SO(3)."""
 
-from functools import partial, reduce
+from functools import reduce
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
+
+from lgsens._xla import one_program
 
 from ._base import AbstractLieGroup
 from ._coefficients import c1, c2, c3, horner, inverse_tangent_coefficient
@@ -39,7 +40,7 @@ def _nearer(R):
     return 0.5 * R @ (3.0 * eye - R.swapaxes(-1, -2) @ R)
 
 
-@partial(jax.jit, inline=True)  # not a loop, whose transpose JAX 0.10 compiles again wherever it is outside of `jit`
+@one_program  # not a loop, whose transpose JAX 0.10 compiles again wherever it is outside of `jit`
 def _nearest(R):
     return reduce(lambda R, _: _nearer(R), range(4), R)
 
@@ -48,12 +49,14 @@ def _components(x):
     return tuple(lax.index_in_dim(x, i, keepdims=False) for i in range(3))
 
 
+@one_program
 def cross(x: Float[Array, "3"], y: Float[Array, "3"]) -> Float[Array, "3"]:
     """The cross product `x × y = x~ y`, shape (3,)."""
     (x1, x2, x3), (y1, y2, y3) = _components(x), _components(y)
     return jnp.stack([x2 * y3 - x3 * y2, x3 * y1 - x1 * y3, x1 * y2 - x2 * y1])
 
 
+@one_program
 def skew(x: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """The skew-symmetric matrix `x~` with `x~ y = x × y` (§3.2). `x`: shape (3,)."""
     # Stacked, not summed over a constant tensor: with YNN fusions (`lgsens._xla`) XLA miscompiles `sum(constant * x)`
@@ -63,6 +66,7 @@ def skew(x: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.stack([o, -x3, x2, x3, o, -x1, -x2, x1, o]).reshape(3, 3)
 
 
+@one_program
 def unskew(X: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """The vector `x`, shape (3,), whose `x~` is the skew-symmetric part of `X`, shape (3, 3)."""
     (_, X12, X13), (X21, _, X23), (X31, X32, _) = (_components(row) for row in _components(X))
@@ -73,6 +77,7 @@ def unskew(X: Float[Array, "3 3"]) -> Float[Array, "3"]:
 # it has operations; in float32 it may be rounded to TF32 on a GPU, and a rotation would not stay one.
 
 
+@one_program
 def _matmul(A, B):
     return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)
 
@@ -81,16 +86,19 @@ def _dot(x, y):
     return jnp.sum(x * y)
 
 
+@one_program
 def turn(rotation: Float[Array, "3 3"], x: Float[Array, "3"]) -> Float[Array, "3"]:
     """`R x`, shape (3,), for any matrix R."""
     return jnp.sum(rotation * x[None, :], axis=1)
 
 
+@one_program
 def turn_back(rotation: Float[Array, "3 3"], x: Float[Array, "3"]) -> Float[Array, "3"]:
     """`R^T x`, shape (3,), for any matrix R."""
     return jnp.sum(rotation * x[:, None], axis=0)
 
 
+@one_program
 def _quaternion(R):
     # The row of 4 p pᵀ with the largest diagonal entry (≥ 1, Shepperd 1978) is p up to a factor, free of
     # cancellation; normalizing it needs no other branch.

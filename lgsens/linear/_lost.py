@@ -15,15 +15,18 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool
 
+from lgsens._xla import one_program
 from lgsens.linear._linear_solve import LinearEquations, linear_solve
 
 
+@one_program
 def lost(failed: Bool[Array, "*n"], rows: Any) -> Any:
     """Rows of floats, or a single one, NaN where they have failed: one by one, so that what nobody asks for has no
     derivative."""
     return jax.tree.map(lambda leaf: linear_solve(_LOST, failed, leaf), rows)
 
 
+@one_program
 def sound(failed: Bool[Array, " n"], rows: Any, home: Any) -> Any:
     """Rows to compute with: in place of those that have failed the last one before the first of them, or `home`."""
     first = jnp.where(jnp.any(failed), jnp.argmax(failed), failed.size)

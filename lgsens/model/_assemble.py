@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lgsens._validate import is_concrete
+from lgsens._validate import array_of, is_concrete
 from lgsens.liegroups import Pose
 from lgsens.model._body import RigidBody
 from lgsens.model._checks import outside_of_freedom
@@ -143,7 +143,7 @@ def _assemble(
         frames = joined([body.frame for body in ordered])
     mass = stacked([body.mass for body in ordered])
     pieces = [part for body in ordered for part in body.free_velocity]
-    velocity = jnp.asarray(np.concatenate(pieces)) if is_concrete(pieces) else jnp.concatenate(pieces)
+    velocity = array_of(np.concatenate(pieces)) if is_concrete(pieces) else jnp.concatenate(pieces)
     outside = outside_of_freedom(bodies.values(), [(joint, bodies_of(joint)) for joint in joints.values()])
     velocity = velocity if outside is False else jnp.where(outside, jnp.nan, velocity)
     if more := len(free) - len(ordered):

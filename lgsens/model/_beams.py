@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lgsens._brief import as_called
-from lgsens._validate import as_count, as_float, is_concrete, point_field, require
+from lgsens._validate import array_of, as_count, as_float, is_concrete, point_field, require
 from lgsens.model._beam_load import element
 from lgsens.model._beam_sections import BeamSection
 from lgsens.model._body import RigidBody
@@ -135,7 +135,7 @@ class Beam(eqx.Module):
         chords = points[1:] - points[:-1]
         require(
             lambda chords: np.all(np.linalg.norm(chords, axis=1) > 0),
-            f"Beam: `points` {points} has two after each other that coincide.",
+            lambda: f"Beam: `points` {points} has two after each other that coincide.",
             chords,
         )
         if up.shape not in ((3,), points.shape):
@@ -143,12 +143,12 @@ class Beam(eqx.Module):
         axes = _triads(_tangents(chords), up)
         require(
             lambda axes: np.all(np.isfinite(axes)) and np.all(np.abs(np.linalg.det(axes) - 1.0) < 1e-6),
-            f"Beam: `up` {up} lies along the beam; give a direction across it.",
+            lambda: f"Beam: `up` {up} lies along the beam; give a direction across it.",
             axes,
         )
         self.name, self.section = name, section
         with jax.ensure_compile_time_eval():
-            self.points, self.axes = jnp.asarray(points), jnp.asarray(axes)
+            self.points, self.axes = array_of(points), array_of(axes)
 
     @property
     def nodes(self) -> tuple[str, ...]:

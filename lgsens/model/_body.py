@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from lgsens._brief import as_called
 from lgsens._validate import as_float, require, shaped
+from lgsens._xla import one_program
 from lgsens.model._checks import far_from_rotation
 from lgsens.model._frames import Frame
 from lgsens.model._free import (
@@ -136,9 +137,11 @@ class RigidBody(eqx.Module):
             name = self.free[-1]
             require(
                 lambda orientation: is_along(orientation[:, axis], axis),
-                f"RigidBody: `free` has the one rotation {name!r}, so the body's {name[1]} axis must lie along the "
-                f"inertial {name[1]} axis, got `orientation` {self.orientation}; choose other body axes, or free all "
-                "rotations and add a RevoluteJoint.",
+                lambda: (
+                    f"RigidBody: `free` has the one rotation {name!r}, so the body's {name[1]} axis must lie along the "
+                    f"inertial {name[1]} axis, got `orientation` {self.orientation}; choose other body axes, or free "
+                    "all rotations and add a RevoluteJoint."
+                ),
                 self.orientation,
             )
         if self.pivot is not None and (not self.free or self.free[0] in "xyz"):
@@ -152,8 +155,10 @@ class RigidBody(eqx.Module):
         rest = "" if self.pivot is None else " (that of the centre of mass follows from the rotation about `pivot`)"
         require(
             lambda given: vanish_but_for(given[None], [self.coordinates]),
-            f"RigidBody: `velocity` {self.velocity} and `angular_velocity` {self.angular_velocity} must vanish but for "
-            f"the degrees of freedom `free` = {self.free!r}; {remedy}, or leave out their velocity{rest}.",
+            lambda: (
+                f"RigidBody: `velocity` {self.velocity} and `angular_velocity` {self.angular_velocity} must vanish but "
+                f"for the degrees of freedom `free` = {self.free!r}; {remedy}, or leave out their velocity{rest}."
+            ),
             self.velocities,
         )
 
@@ -172,7 +177,7 @@ class RigidBody(eqx.Module):
         """The velocities of the coordinates that the body has, in pieces."""
         if self.free == ALL_FREE:
             return self.velocity, self.angular_velocity
-        return (self.velocities[np.asarray(self.coordinates, int)],)
+        return (jnp.take(self.velocities, np.asarray(self.coordinates, int), mode="clip"),)
 
     @property
     def frame(self) -> Frame:
@@ -213,6 +218,7 @@ class RigidBody(eqx.Module):
         )
 
 
+@one_program
 def lumped(
     masses: Float[Array, " n"], places: Float[Array, "n 3"]
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
@@ -222,6 +228,7 @@ def lumped(
     return mass, position, jnp.sum(masses[:, None, None] * jax.vmap(parallel_axis)(places - position[None]), axis=0)
 
 
+@one_program
 def parallel_axis(arm: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """|c|² I − c cᵀ: the inertia of a unit mass at c."""
     return jnp.dot(arm, arm) * jnp.eye(3, dtype=arm.dtype) - jnp.outer(arm, arm)

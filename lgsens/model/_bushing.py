@@ -85,7 +85,7 @@ class Bushing(AbstractConnection):
                 )
         require(
             lambda axes: np.linalg.norm(np.cross(*axes)) > 1e-6 * np.prod(np.linalg.norm(axes, axis=1)),
-            f"Bushing: `axes` {self.axes} lie along each other or are zero; give two directions.",
+            lambda: f"Bushing: `axes` {self.axes} lie along each other or are zero; give two directions.",
             np.eye(2, 3) if self.axes is None else self.axes,
         )
 

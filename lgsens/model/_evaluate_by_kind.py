@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from lgsens._validate import is_concrete
+from lgsens._validate import array_of, is_concrete
 
 
 class StackRow(NamedTuple):
@@ -26,7 +26,7 @@ class StackRow(NamedTuple):
 def stacked(leaves: Sequence[Any]):
     """`jnp.stack`, which would compile a program for each number of leaves: numbers that are known go through NumPy."""
     if is_concrete(*leaves):
-        return jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves]))
+        return array_of(np.stack([np.asarray(leaf) for leaf in leaves]))
     if all(leaf is leaves[0] for leaf in leaves):  # gravity, say: its derivative is one sum
         return jnp.broadcast_to(leaves[0], (len(leaves), *leaves[0].shape))
     return jnp.stack(leaves)
@@ -37,7 +37,7 @@ def unstacked(rows) -> list[Array]:
     if not is_concrete(rows):
         return list(rows)
     with jax.ensure_compile_time_eval():
-        return [jnp.asarray(row) for row in np.asarray(rows)]
+        return [array_of(row) for row in np.asarray(rows)]
 
 
 def joined(members: Sequence[Any]) -> Any:
@@ -53,11 +53,11 @@ def joined(members: Sequence[Any]) -> Any:
     starts = dict(zip(map(id, sources), np.cumsum([0, *lengths])))
     index = np.asarray([starts[id(row.of)] + row.index for row in members])
 
-    def chosen(*leaves):
+    def chosen(*leaves):  # by `take`, which is one program outside of `jit`; an index would be six
         if is_concrete(*leaves):
-            return jnp.asarray(np.concatenate([np.asarray(leaf) for leaf in leaves])[index])
+            return array_of(np.concatenate([np.asarray(leaf) for leaf in leaves])[index])
         whole = leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
-        return whole if np.array_equal(index, np.arange(whole.shape[0])) else whole[index]
+        return whole if np.array_equal(index, np.arange(whole.shape[0])) else jnp.take(whole, index, 0, mode="clip")
 
     return jax.tree.map(chosen, *sources)
 

@@ -10,9 +10,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens._validate import array_of
+from lgsens._xla import one_program
 from lgsens.liegroups import Pose, R3xSO3, cross, skew, turn, turn_back
 
 BODY_DIM = 6
@@ -82,6 +85,7 @@ def motion_at(arm, position, orientation, twist, rate):
     return position + to_inertial(arm), velocity + to_inertial(swing), acceleration
 
 
+@one_program
 def normals(axis: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
     """The unit vector along `axis` and two unit vectors that complete it to a right-handed triad.
 
@@ -97,7 +101,7 @@ def normals(axis: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3
 
 def ground_frame(dtype) -> Frame:
     """The inertial frame itself."""
-    return Frame(jnp.zeros(3, dtype), jnp.eye(3, dtype=dtype))
+    return Frame(array_of(np.zeros(3, dtype)), array_of(np.eye(3, dtype=dtype)))
 
 
 def separation(a: Frame, b: Frame, point_a, point_b) -> tuple[Float[Array, "3"], Float[Array, "3 12"]]:

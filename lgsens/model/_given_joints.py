@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from lgsens._validate import is_concrete
+from lgsens._validate import array_of, is_concrete
 from lgsens.model._evaluate_by_kind import StackRow
 from lgsens.model._joints import AbstractJoint
 
@@ -55,7 +55,7 @@ class GivenJoints(eqx.Module):
 
     def __getitem__(self, name: str) -> AbstractJoint:
         place = [own for own, _ in self.structures].index(name)
-        row = lambda leaf: jnp.asarray(np.asarray(leaf)[place]) if is_concrete(leaf) else leaf[place]
+        row = lambda leaf: array_of(np.asarray(leaf)[place]) if is_concrete(leaf) else leaf[place]
         return jax.tree.unflatten(self.structures[place][1].of, map(row, self.numbers))
 
 

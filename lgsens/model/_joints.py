@@ -191,8 +191,10 @@ class UniversalJoint(AbstractJoint):
     def __check_init__(self):
         require(
             lambda a, b: np.linalg.norm(np.cross(a, b)) > 1e-6 * np.linalg.norm(a) * np.linalg.norm(b),
-            f"UniversalJoint: `axis_a` {self.axis_a} and `axis_b` {self.axis_b} are parallel; "
-            "the arms of the cross must be orthogonal.",
+            lambda: (
+                f"UniversalJoint: `axis_a` {self.axis_a} and `axis_b` {self.axis_b} are parallel; "
+                "the arms of the cross must be orthogonal."
+            ),
             self.axis_a,
             self.axis_b,
         )
@@ -215,9 +217,11 @@ class UniversalJoint(AbstractJoint):
     def violable_about(self, name, free, axis):
         require(
             lambda a, b: is_along(a, axis) or is_along(b, axis),
-            f"Joint {name!r}: one of its arms, `axis_a` {self.axis_a} or `axis_b` {self.axis_b}, must be that of "
-            f"{ROTATIONS[axis]!r}, the only rotation that {self.a!r} and {self.b!r} have; turn it, or free all "
-            "rotations of one of them.",
+            lambda: (
+                f"Joint {name!r}: one of its arms, `axis_a` {self.axis_a} or `axis_b` {self.axis_b}, must be that of "
+                f"{ROTATIONS[axis]!r}, the only rotation that {self.a!r} and {self.b!r} have; turn it, or free all "
+                "rotations of one of them."
+            ),
             self.axis_a,
             self.axis_b,
         )
@@ -279,15 +283,17 @@ class DistanceJoint(AbstractJoint):
     def __check_init__(self):
         require(
             lambda a, b: np.linalg.norm(b - a) > 0,
-            f"DistanceJoint: `at_a` and `at_b` coincide at {self.at_a}, so the rod has no direction; "
-            "use a SphericalJoint, or move one end.",
+            lambda: (
+                f"DistanceJoint: `at_a` and `at_b` coincide at {self.at_a}, so the rod has no direction; "
+                "use a SphericalJoint, or move one end."
+            ),
             self.at_a,
             self.at_b,
         )
         if eqx.is_array(self.length):
             require(
                 lambda length: length > 0,
-                f"DistanceJoint: `length` must be positive, got {self.length} m.",
+                lambda: f"DistanceJoint: `length` must be positive, got {self.length} m.",
                 self.length,
             )
 

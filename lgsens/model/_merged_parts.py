@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lgsens._xla import one_program
 from lgsens.dynamics import AbstractSystem, full_jacobian
 from lgsens.liegroups import Pose
 from lgsens.model._frames import BODY_DIM, ROTATION, Frame, motion_at
@@ -69,7 +70,7 @@ class Parts(eqx.Module, Generic[System]):
         """All merged joints."""
         return tuple(name for own in self.fixed for name in own)
 
-    @partial(jax.jit, static_argnums=1, inline=True)  # one program where it is not called inside another
+    @partial(one_program, static_argnums=1)
     def with_fixed(self, joint: str, q, v, vdot, lam, t):
         """λ of the parts with μ of a fixed joint, and of those of the same body, in their rows; at one instant."""
         names = np.asarray(self.system.constraint_names)

@@ -7,11 +7,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from lgsens._brief import listed, roster
-from lgsens._validate import is_concrete
+from lgsens._validate import array_of, is_concrete
 from lgsens.liegroups import nearest_rotation
 from lgsens.linear import AbstractLinearSolver, BlockSparse
 from lgsens.model._assemble import assemble, assemble_merged
@@ -196,7 +195,7 @@ class Model(eqx.Module):
         found = orientations(self.bodies)
         rotations = nearest_rotation(np.stack(found) if is_concrete(found) else stacked(found))
         bodies = eqx.tree_at(orientations, dict(self.bodies), unstacked(rotations))
-        frames = Frame(stacked([bodies[name].frame.position for name in names]), jnp.asarray(rotations))
+        frames = Frame(stacked([bodies[name].frame.position for name in names]), array_of(rotations))
         if self._groups is None:
             system = assemble(bodies, frames, self.joints, self.forces)
         else:

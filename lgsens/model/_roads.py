@@ -38,7 +38,7 @@ def road_roughness(roughness) -> Float[Array, ""]:
 
 def _positive(name: str, value) -> Float[Array, ""]:
     value = as_float(value, (), f"`{name}`")
-    require(lambda value: 0.0 < value < jnp.inf, f"`{name}` must be positive, got {value}.", value)
+    require(lambda value: 0.0 < value < jnp.inf, lambda: f"`{name}` must be positive, got {value}.", value)
     return value
 
 
@@ -84,7 +84,7 @@ class BumpRoad(AbstractSignal):
     def __check_init__(self):
         require(
             lambda duration: duration > 0,
-            f"BumpRoad: `duration` must be positive, got {self.duration} s.",
+            lambda: f"BumpRoad: `duration` must be positive, got {self.duration} s.",
             self.duration,
         )
 

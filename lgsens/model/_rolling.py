@@ -142,11 +142,15 @@ class Rolling(AbstractJoint):
         self.axis, self.normal = as_float(axis, (3,), "Rolling: `axis`"), as_float(normal, (3,), "Rolling: `normal`")
         self.radius = as_float(radius, (), "Rolling: `radius`")
         self.point = None if point is None else as_float(point, (3,), "Rolling: `point`")
-        require(lambda radius: radius > 0, f"Rolling: `radius` must be positive, got {self.radius} m.", self.radius)
+        require(
+            lambda radius: radius > 0, lambda: f"Rolling: `radius` must be positive, got {self.radius} m.", self.radius
+        )
         require(
             lambda n, e: np.linalg.norm(np.cross(n, e)) > 1e-6 * np.linalg.norm(n) * np.linalg.norm(e) > 0,
-            f"Rolling: `axis` {self.axis} and `normal` {self.normal} are parallel or zero: the wheel lies flat and has "
-            "no lowest point; turn one of them.",
+            lambda: (
+                f"Rolling: `axis` {self.axis} and `normal` {self.normal} are parallel or zero: the wheel lies flat and "
+                "has no lowest point; turn one of them."
+            ),
             self.normal,
             self.axis,
         )
@@ -186,8 +190,10 @@ class Rolling(AbstractJoint):
         """Of a wheel that turns about one inertial axis: its height; forward and sideways."""
         require(
             lambda axle: is_along(axle, axis),
-            f"Joint {name!r}: `axis` {self.axis} must be that of {ROTATIONS[axis]!r}, the only rotation that "
-            f"{self.b!r} has; turn the axle, or free all rotations.",
+            lambda: (
+                f"Joint {name!r}: `axis` {self.axis} must be that of {ROTATIONS[axis]!r}, the only rotation that "
+                f"{self.b!r} has; turn the axle, or free all rotations."
+            ),
             self.axis,
         )
         line = [i for i, translation in enumerate(TRANSLATIONS) if i != axis and translation in free]
@@ -195,8 +201,10 @@ class Rolling(AbstractJoint):
         if not lifts and line:
             require(
                 lambda normal: is_along(normal, 3 - axis - line[0]),
-                f"Joint {name!r}: {self.b!r} moves along {TRANSLATIONS[line[0]]!r} only, out of the plane with the "
-                f"`normal` {self.normal}; free another translation.",
+                lambda: (
+                    f"Joint {name!r}: {self.b!r} moves along {TRANSLATIONS[line[0]]!r} only, out of the plane with the "
+                    f"`normal` {self.normal}; free another translation."
+                ),
                 self.normal,
             )
         return [(lifts,), (True, TRANSLATIONS[axis] in free)]

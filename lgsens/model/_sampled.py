@@ -98,8 +98,10 @@ def _check_period(values: Float[Array, " n"]) -> None:
     require(
         # of single precision; what is not finite is said where a scene is looked at
         lambda values: not abs(values[-1] - values[0]) > 1e-6 * np.ptp(values),
-        "Sampled: `values` of one period end as they begin, so that it closes; got "
-        f"{values[0]} and {values[-1]}. Add a sample at the end of the period, with the first value.",
+        lambda: (
+            "Sampled: `values` of one period end as they begin, so that it closes; got "
+            f"{values[0]} and {values[-1]}. Add a sample at the end of the period, with the first value."
+        ),
         values,
     )
 

@@ -130,7 +130,9 @@ class Ramp(AbstractSignal):
 
     def __check_init__(self):
         require(
-            lambda duration: duration > 0, f"Ramp: `duration` must be positive, got {self.duration} s.", self.duration
+            lambda duration: duration > 0,
+            lambda: f"Ramp: `duration` must be positive, got {self.duration} s.",
+            self.duration,
         )
 
     @property

@@ -8,6 +8,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from lgsens._xla import one_program
 from lgsens.liegroups import Pose, Poses
 from lgsens.linear import added
 from lgsens.model._frames import BODY_DIM, ROTATION
@@ -55,11 +56,13 @@ def _length(system: System) -> Float[Array, ""]:
     return jnp.where(length > 1e-4 * size, length, size)
 
 
+@one_program
 def distance(system: System, q: Pose) -> Float[Array, ""]:
     """The largest coordinate of a centre of mass in lengths of the scene, at least 1."""
     return jnp.maximum(jnp.max(jnp.abs(system._placed(q).position[: len(system.body_names)])) / _length(system), 1.0)
 
 
+@one_program
 def coordinate_scale(system: System) -> Float[Array, " k"]:
     """The length of the scene for translations, 1 for rotations, what loads say for their states."""
     length = _length(system)

@@ -44,9 +44,11 @@ class AbstractAlongLine(AbstractJoint):
             return self
         require(
             lambda line: abs(line[axis]) <= np.sqrt(np.finfo(line.dtype).eps) * np.abs(line).max(),
-            f"{type(self).__name__} between {self.a!r} and {self.b!r}: `axis` {self.axis} leaves the plane of their "
-            f"motion, normal to {TRANSLATIONS[axis]}; turn it into the plane, or free more of them. What a line normal "
-            "to the plane does there, a RevoluteJoint or a SphericalJoint does.",
+            lambda: (
+                f"{type(self).__name__} between {self.a!r} and {self.b!r}: `axis` {self.axis} leaves the plane of "
+                f"their motion, normal to {TRANSLATIONS[axis]}; turn it into the plane, or free more of them. What a "
+                "line normal to the plane does there, a RevoluteJoint or a SphericalJoint does."
+            ),
             self.axis,
         )
         return found(self.a, self.b, at=self.at, axis=self.axis, normal=axis)

@@ -150,7 +150,7 @@ class Stack(eqx.Module, Generic[Element]):
         """The stack of some of its elements."""
         own = lambda of: tuple(of[i] for i in which)
         a, b = (None if side is None else own(side) for side in (self.a, self.b))
-        elements = jax.tree.map(lambda leaf: leaf[np.asarray(which)], self.elements)
+        elements = jax.tree.map(lambda leaf: jnp.take(leaf, np.asarray(which), 0, mode="clip"), self.elements)
         carriers, joints = tuple(map(own, self.carriers)), own(self.joints) if self.joints else ()
         return Stack(elements, a, b, own(self.owners), own(self.kept), own(self.places), carriers, joints)
 

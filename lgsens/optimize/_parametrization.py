@@ -30,7 +30,7 @@ def _number(name: str, *, positive: bool = False, **default: Any) -> Any:
     def convert(value):
         array = as_float(value, None, f"`{name}`")
         if positive:
-            require(lambda a: np.all(a > 0), f"`{name}` must be positive, got {value}.", array)
+            require(lambda a: np.all(a > 0), lambda: f"`{name}` must be positive, got {value}.", array)
         return array
 
     return eqx.field(converter=convert, **default)

@@ -98,7 +98,7 @@ def _checked(p: PyTree, tolerances: PyTree) -> tuple[PyTree, PyTree]:
         t = as_float(t, None, name)
         if t.shape not in ((), leaf.shape):
             raise ValueError(f"{name} must have shape () or {leaf.shape}, got {t.shape}.")
-        require(lambda t: np.all(t >= 0.0), f"{name} must be at least 0, got {t}.", t)
+        require(lambda t: np.all(t >= 0.0), lambda: f"{name} must be at least 0, got {t}.", t)
         return jnp.broadcast_to(t, leaf.shape)
 
     return p, jax.tree_util.tree_map_with_path(one, tolerances, p)

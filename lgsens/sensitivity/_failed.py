@@ -13,8 +13,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
+from lgsens._xla import one_program
 from lgsens.dynamics import AbstractSystem, State
 from lgsens.linear import asked, lost, sound
 
@@ -28,10 +29,7 @@ class Sound(NamedTuple):
 
     @classmethod
     def of(cls, states: State, system: AbstractSystem) -> "Sound":
-        known = jnp.all(jnp.isfinite(states.v), axis=1) & jnp.all(jnp.isfinite(states.a), axis=1)
-        zero = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]), states)
-        home = eqx.tree_at(lambda state: (state.q, state.v), zero, lax.stop_gradient(system.reference()))
-        return cls(sound(~known, states, home), ~known)
+        return cls(*_sound(states, *lax.stop_gradient(system.reference())))
 
     def lost(self, rows: Any) -> Any:
         """Rows of floats, NaN where the run has failed: what nobody asks for has no derivative."""
@@ -40,3 +38,11 @@ class Sound(NamedTuple):
     def asked(self, rows: Any) -> Any:
         """The transpose: cotangents, NaN where the run has failed and they are not zero."""
         return asked(self.failed, rows)
+
+
+@one_program
+def _sound(states: State, q: Any, v: Float[Array, " k"]) -> tuple[State, Bool[Array, " n+1"]]:
+    known = jnp.all(jnp.isfinite(states.v), axis=1) & jnp.all(jnp.isfinite(states.a), axis=1)
+    zero = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]), states)
+    home = eqx.tree_at(lambda state: (state.q, state.v), zero, (q, v))
+    return sound(~known, states, home), ~known
